@@ -1,10 +1,10 @@
-"""The normal force of a pair, compiled as a number and as a power series in time.
+"""Normal force of a pair: functions for one value, and for its power series in time.
 
     additive laws     F = K d^n + C psi(d) d',  psi = 1 (Kelvin-Voigt) or u^2 (3 - 2 u), u = min(d / ramp, 1)
     all other laws    F = K d^n (1 + lambda d')
 
-These laws replace eq. 6 of the paper, which is lost. `contact_laws` gives lambda. The solver decides whether a pair is
-in contact, and sets the force to zero where the law would pull.
+These laws replace eq. 6 of the paper, which is lost. `contact_laws` computes lambda from the restitution. The solver
+determines whether a pair is in contact. It sets the force to zero where the law would pull.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ def free_force(
     viscous: float,
     ramp: float,
 ) -> float:
-    """Return the law's F in N for the penetration d in m and its rate d' in m/s. F is negative where it would pull.
+    """Return the contact law's force F in N for the penetration d in m and its rate d' in m/s.
 
-    `damping_factor` is lambda in s/m and `viscous` is C in N s/m; one of them is zero. `ramp` in m is zero for a law
-    without a ramp.
+    F is negative where the law would pull. `damping_factor` is lambda in s/m and `viscous` is C in N s/m; one of them
+    is zero. `ramp` in m is zero for a law without a ramp.
     """
     elastic = stiffness * (penetration if exponent == 1.0 else max(penetration, 0.0) ** exponent)
     if ramp > 0.0 and penetration < ramp:
@@ -50,7 +50,7 @@ def normal_force(
     viscous: float,
     ramp: float,
 ) -> float:
-    """Return the contact force in N: F of `free_force`, but 0 without penetration and where it would pull."""
+    """Return the contact force in N. It is `free_force`, or 0 without penetration or where the law would pull."""
     if penetration <= 0.0:
         return 0.0
     return max(0.0, free_force(penetration, rate, stiffness, exponent, damping_factor, viscous, ramp))
@@ -58,9 +58,9 @@ def normal_force(
 
 @kernel(fast=True, inline="code")
 def ramp_terms(square: NDArray[np.float64], cube: NDArray[np.float64], k: int, ramp: float) -> Any:
-    """Return coefficient k of the series u^2 (3 - 2 u), u = d / ramp, of the eight columns.
+    """Return coefficient k of the power series u^2 (3 - 2 u) with u = d / ramp, for the eight columns.
 
-    `square` and `cube` hold the coefficients of d^2 and d^3.
+    `square` and `cube` contain the coefficients of d^2 and d^3.
     """
     return row(square, k) * (3.0 / (ramp * ramp)) - row(cube, k) * (2.0 / (ramp * ramp * ramp))
 
@@ -69,11 +69,11 @@ def ramp_terms(square: NDArray[np.float64], cube: NDArray[np.float64], k: int, r
 def power_term(
     base: NDArray[np.float64], power: NDArray[np.float64], lane: int, k: int, exponent: float, shift: int
 ) -> float:
-    """Return coefficient k of base(t)^exponent for one column. `base` and `power` are series of shape (n, 8).
+    """Return coefficient k of base(t)^exponent for one column. `base` and `power` are power series of shape (n, 8).
 
-    Row k of a series has the coefficients of order k. The recurrence is b_0 k P_k = sum_j (exponent j - (k - j)) b_j
-    P_{k-j} (Knuth, TAOCP 2, sec. 4.7). If the lowest order of the base is t^shift, the recurrence is applied to base /
-    t^shift, and the power starts with t^(shift exponent).
+    Row k of a series contains the coefficients of order k. The recurrence is
+    b_0 k P_k = sum_j (exponent j - (k - j)) b_j P_{k-j} (Knuth, TAOCP 2, sec. 4.7). If the lowest order of the base is
+    t^shift, the recurrence is applied to base / t^shift, and the power starts with t^(shift exponent).
     """
     offset = int(shift * exponent)
     if k < offset:
@@ -89,8 +89,8 @@ def power_term(
 
 @kernel(fast=True, inline="code")
 def power_terms(base: NDArray[np.float64], power: NDArray[np.float64], k: int, exponent: float) -> Any:
-    """Return coefficient k >= 1 of base^exponent times base[0], for the eight columns and without a shift."""
-    # the newest orders come last, so the processor can compute most of the sum before they are known
+    """Return P_k base[0] for the eight columns, where P_k is coefficient k >= 1 of base^exponent (no shift)."""
+    # the terms of the newest orders are added last, so the processor can start the sum before they are available
     even, odd = splat(0.0), splat(0.0)
     weight = (exponent + 1.0) * (k - 1) - k
     for j in range(k - 1, 2, -2):
@@ -107,9 +107,9 @@ def power_terms(base: NDArray[np.float64], power: NDArray[np.float64], k: int, e
 
 @kernel(fast=True, inline="code")
 def root_terms(newest: Any, root: NDArray[np.float64], k: int) -> Any:
-    """Return coefficient k >= 1 of the square roots r of eight series b, times 2 r_0. `newest` holds the b_k.
+    """Return 2 r_0 r_k for k >= 1, where r is the square root of a series b, for eight series. `newest` contains b_k.
 
-    The recurrence is 2 r_0 r_k = b_k - sum_{j=1}^{k-1} r_j r_{k-j}. The terms j and k - j are equal, so each pair is
+    The recurrence is 2 r_0 r_k = b_k - sum_{j=1}^{k-1} r_j r_{k-j}. The terms j and k - j are equal, so each product is
     computed once.
     """
     rest, products = newest, splat(0.0)

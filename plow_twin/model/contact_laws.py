@@ -1,10 +1,11 @@
 """Contact laws, each with its equation and its source.
 
-Most laws have the form F = K d^n (1 + lambda d') with the penetration d and its rate d', positive inward. They differ
-in the damping number D = lambda v0 that they derive from the restitution e, where v0 is the speed at first touch. The
-additive laws add C d' to K d^n, from the first touch (Kelvin-Voigt) or over a ramp. A new law needs an entry in
-`_LAWS`, or a call of `add_law` from outside the package. The solver reads only the options of a law and its damping
-number.
+Most laws have the form F = K d^n (1 + lambda d'), where d is the penetration and its rate d' is positive inward. These
+laws differ in the damping number D = lambda v0, a function of the restitution e, where v0 is the speed at first touch.
+The additive laws add C d' to K d^n, either from the first touch (Kelvin-Voigt) or over a ramp.
+
+A new law is an entry of `_LAWS`, or a call of `add_law` from outside the package. The solver reads only the damping
+number and the options of a law.
 """
 
 from __future__ import annotations
@@ -17,18 +18,18 @@ from typing import Final
 
 from plow_twin.errors import ArgumentError
 
-#: Below this value of 1 - e, rounding dominates the residual of the exact law. D is then computed from the first two
-#: terms of its series.
+#: Value of 1 - e below which rounding dominates the residual of the exact law. Below it, D is computed from the first
+#: two terms of its series.
 _NEARLY_ELASTIC: Final = 1e-5
-#: Largest D = lambda v0. The D of some laws is infinite at a restitution of 0.
+#: Upper bound of D = lambda v0. Some laws have an infinite D at a restitution of 0.
 DAMPING_NUMBER_CAP: Final = 1e3
 
 
 def exact_damping_number(restitution: float) -> float:
-    """Return the D that gives exactly the restitution e: D (1 + e) = ln((1 + D) / (1 - D e)).
+    """Return the D that results in exactly the restitution e: D (1 + e) = ln((1 + D) / (1 - D e)).
 
-    The equation is valid for F = K d^n (1 + lambda d') with any K, any n and any mass. It is the first integral of the
-    free impact; cf. Hunt and Crossley, J. Appl. Mech. 42 (1975) 440.
+    The equation is valid for F = K d^n (1 + lambda d') with any K, n and mass. It is the first integral of the free
+    impact; cf. Hunt and Crossley, J. Appl. Mech. 42 (1975) 440.
     """
     if restitution >= 1.0:
         return 0.0
@@ -56,31 +57,31 @@ def exact_damping_number(restitution: float) -> float:
 
 @dataclass(frozen=True)
 class ContactLaw:
-    """The options of one law, and the damping that it derives from a restitution.
+    """Options of one contact law, and the damping that the law derives from a restitution.
 
     Attributes
     ----------
     title : str
         Usual name of the law.
     source : str
-        Its equation, and where it was published.
+        Equation of the law, and its publication.
     number_of : callable, optional
-        Function of the restitution e that returns the damping number D = lambda v0 [1]. A law without it takes no
-        restitution.
+        Function of the restitution e that returns the damping number D = lambda v0 [1]. Without it, a scene cannot
+        give a restitution for this law.
     takes_damping : bool
-        Whether a scene can give the damping itself.
+        Whether a scene can give the damping directly.
     exponent : float, optional
-        The only exponent that the law admits; None if it admits any.
+        The only admissible exponent; None if every exponent is admissible.
     additive : bool
-        Whether the damping is a term C d' beside K d^n instead of a factor of K d^n.
+        True for a damping term C d' that is added to K d^n, False for a damping factor of K d^n.
     ramped : bool
-        Whether C grows from 0 over the penetration `ramp_m`.
+        Whether C increases from 0 to its full value over the penetration `ramp_m`.
 
     Raises
     ------
     ArgumentError
-        The options contradict each other: a ramp without additive damping, a restitution with additive damping, or an
-        additive law without a ramp whose exponent is not 1.
+        The options contradict each other. A ramp requires additive damping. Additive damping excludes a restitution.
+        An additive law without a ramp requires the exponent 1.
     """
 
     title: str
@@ -108,7 +109,7 @@ class ContactLaw:
         return self.number_of is not None
 
     def damping_number(self, restitution: float) -> float:
-        """Return D = lambda v0 [1] of the law for a nominal restitution, at most `DAMPING_NUMBER_CAP`.
+        """Return the damping number D = lambda v0 [1] for a nominal restitution, at most `DAMPING_NUMBER_CAP`.
 
         Parameters
         ----------
@@ -118,7 +119,7 @@ class ContactLaw:
         Raises
         ------
         ArgumentError
-            The law cannot be given by a restitution, or its D(e) is not a number >= 0.
+            The law has no damping number, or D(e) is not a number >= 0.
         """
         if self.number_of is None:
             raise ArgumentError(f"{self.title} cannot be given by a restitution")
@@ -178,20 +179,20 @@ LAWS: Final[Mapping[str, ContactLaw]] = MappingProxyType(_LAWS)
 
 
 def add_law(name: str, law: ContactLaw) -> None:
-    """Add a law of your own. Scenes can then name it, and the solver runs it as fast as the built-in laws.
+    """Add a contact law under a name that scenes can use. The solver runs it as fast as the built-in laws.
 
-    Only this process knows the law. Commands and their child processes learn it by `--laws`.
+    The law is added to this process only. The option `--laws` adds the law to commands and to their child processes.
 
     Parameters
     ----------
     name : str
-        The name in scenes: letters, digits and _.
+        Name of the law in scenes: letters, digits and _.
     law : ContactLaw
 
     Raises
     ------
     ArgumentError
-        The name is taken, or it is not made of letters, digits and _.
+        The name is already used, or contains a character other than letters, digits and _.
     """
     if name in LAWS or not name.isidentifier():
         raise ArgumentError(f"contact law: got {name!r}, expected a new name of letters, digits and _")

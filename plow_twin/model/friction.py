@@ -1,8 +1,9 @@
-"""Regularised Coulomb friction of a pair, compiled, T = mu N tanh(s' / v_s), and a check for Painleve's case.
+"""Regularised Coulomb friction of a pair, T = mu N tanh(s' / v_s), and a test for Painleve's case.
 
-The corner of the frame slides along the wall of the head with the rate s' and drags the wall with it. A body that this
-friction holds creeps with v_s atanh(T / (mu N)). Source: Andersson, Soederberg and Bjoerklund, Tribol. Int. 40 (2007)
-580, eq. 5. `solve.grip` has the friction with stick, which needs further states.
+s' is the rate at which the corner of the frame slides along the wall of the head. The friction T pulls the wall along
+with the corner. Under a smaller steady load T, the corner creeps at v_s atanh(T / (mu N)) instead of sticking.
+`solve.grip` implements friction with stick, which needs additional states. Source: Andersson, Soederberg and
+Bjoerklund, Tribol. Int. 40 (2007) 580, eq. 5.
 """
 
 from __future__ import annotations
@@ -22,17 +23,20 @@ if TYPE_CHECKING:
 
 @kernel(inline="source")
 def friction_force(normal: float, slip_rate: float, coefficient: float, speed: float) -> float:
-    """Return the friction T in N with the sign of the slip rate. `slip_rate` and `speed` are in m/s."""
+    """Return the friction T in N, which has the sign of the slip rate. `slip_rate` and `speed` are in m/s."""
     return coefficient * normal * math.tanh(slip_rate / speed)
 
 
 def painleve_coefficients(scene: Scene) -> NDArray[np.float64]:
-    """Return for each pair, shape (8,), the mu above which Painleve's case is possible; inf if it is impossible.
+    """Return the friction coefficient mu of each pair, shape (8,), above which Painleve's case is possible.
 
-    In Painleve's case a sliding corner is pressed into the wall by its own friction: in d'' = -p N the factor p = 1/m +
-    a^2/I - mu |a b|/I is negative. Here a and b are the arms of N and of T about the centre of mass at q = 0. Rigid
-    bodies then have no solution or several. Compliant contact has one solution, in which N grows with the rate sqrt(-p
-    K) until the slip stops ("impact without collision"). Source: Genot and Brogliato, Eur. J. Mech. A 18 (1999) 653.
+    The value is inf for a pair where Painleve's case is impossible. In Painleve's case, its own friction presses a
+    sliding corner into the wall: in d'' = -p N, the factor p = 1/m + a^2/I - mu |a b|/I is negative. Here a and b are
+    the arms of N and of T about the centre of mass at q = 0. For rigid bodies, the motion then has no solution or
+    several.
+
+    Compliant contact has exactly one solution: N grows with the rate sqrt(-p K) until the slip stops. This growth is
+    called impact without collision. Source: Genot and Brogliato, Eur. J. Mech. A 18 (1999) 653.
     """
     c, s, (x, y) = 1.0, 0.0, scene.head.com_offset_m
     normal, along = (rows.T @ np.array([c, s, x, y]) for rows in (arm_rows(scene), slip_arm_rows(scene)))

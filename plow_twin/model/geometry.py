@@ -1,11 +1,11 @@
-"""Geometry of the guide: the place of each frame corner in head axes, its penetration, and the arm of its force.
+"""Geometry of the guide: positions of the frame's corners in head axes, penetrations, and arms of the contact forces.
 
-The state of the head is kept in *body coordinates* of its centre of mass G:
+The state of the head consists of *body coordinates* of its centre of mass G:
 
     X, Y     position of G, VX, VY its velocity, both resolved in head axes,
     omega    angular velocity,  c, s = cos(theta), sin(theta),  theta.
 
-In these coordinates every penetration and every arm is linear. Seen from the centre of the cavity, a frame corner C =
+In these coordinates every penetration and every arm is linear. Relative to the centre of the cavity, a frame corner C =
 (Cx, Cy) is at p = R(theta)^T (C - (x, y)) (paper, eq. 1, inverted), that is
 
     p_x =  c Cx + s Cy - X + rx        p_y = -s Cx + c Cy - Y + ry
@@ -13,15 +13,15 @@ In these coordinates every penetration and every arm is linear. Seen from the ce
 where (rx, ry) is the offset of G from the centre of the cavity in head axes. The penetration past a wall with outward
 normal n at distance H is n . p - H. Its rate is n . dp/dt, positive inward.
 
-A head that carries corners (`carries: corners`) is a block in a fixed cavity. Its state is kept in world axes. Its
+A head that carries corners (`carries: corners`) is a block in a fixed cavity. Its state is resolved in world axes. Its
 corner c = (cx, cy) is at
 
     p_x = X + c cx - s cy              p_y = Y + s cx + c cy
 
-so the equations are the same with other coefficients.
+so the equations have the same form with other coefficients.
 
-For a rounded corner, C is the centre of its arc, and the radius is subtracted from the distance of each wall. Friction
-acts at the touching point itself, one radius from the centre of the arc (`roll`).
+For a rounded corner, C is the centre of its arc. The radius is subtracted from the distance of each wall. Friction acts
+at the touching point, which is one radius away from C (`roll`).
 """
 
 from __future__ import annotations
@@ -39,29 +39,30 @@ if TYPE_CHECKING:
 
 #: Number of components of the state: X, Y, VX, VY, omega, c, s, theta.
 STATE_SIZE = 8
-#: 1 for pairs whose wall has its normal along x (first array) or y (second array), otherwise 0; shape (8,) each.
+#: 1 for the pairs whose wall has its normal along x (first array) or along y (second array), else 0; shape (8,) each.
 _ALONG_X, _ALONG_Y = np.abs(NORMAL_X), np.abs(NORMAL_Y)
 
 
 def corner_positions(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return Cx and Cy of each pair in m, world axes, shape (8,) each."""
+    """Return Cx and Cy of each pair's corner in m, in world axes, shape (8,) each."""
     radius = corner_radius(scene)
     return (0.5 * scene.frame.width_m - radius) * CORNER_X, (0.5 * scene.frame.height_m - radius) * CORNER_Y
 
 
 def corner_radius(scene: Scene) -> float:
-    """Return the radius of the corners in m, 0 for sharp corners."""
+    """Return the radius of the frame's corners in m, or 0 for sharp corners."""
     return scene.frame.corner_radius_m or 0.0
 
 
-#: Number of straight lines that draw the arc of a rounded corner.
+#: Number of straight lines that approximate the arc of a rounded corner.
 _ARC_SIDES = 6
 
 
 def outline(sides: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
-    """Return the closed outline of a rectangle with rounded corners about the origin, clockwise from the top left.
+    """Return a closed polygon, shape (n, 2), of a rectangle about the origin with rounded corners.
 
-    `sides`, shape (2,), are width and height, in the unit of `radius`. The outline has shape (n, 2).
+    The polygon runs clockwise from the top left. `sides` contains width and height, shape (2,), in the unit of
+    `radius`.
     """
     angles = np.linspace(math.pi, 0.5 * math.pi, _ARC_SIDES + 1 if radius > 0.0 else 1)
     points = []
@@ -74,9 +75,9 @@ def outline(sides: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
 
 
 def roll(scene: Scene) -> float:
-    """Return how far the touching point of a rounded corner moves along the wall per angle of the head [m/rad].
+    """Return the slip of a rounded corner along its wall when the head turns about the arc's centre [m/rad].
 
-    The distance is positive along the tangent of the wall (`slip_rows`). It shortens the arm of friction.
+    It is subtracted from the signed arm of friction.
     """
     return corner_radius(scene) * (1.0 if scene.head.carries == "corners" else -1.0)
 
@@ -89,7 +90,7 @@ def wall_distances(scene: Scene) -> NDArray[np.float64]:
 
 
 def _along_normal(scene: Scene) -> NDArray[np.float64]:
-    """Return the coefficients of n . p without its constant, shape (4, 8), for a head that carries walls."""
+    """Return the coefficients of n . p, shape (4, 8), for a head that carries walls: rows for c, s, X, Y."""
     corner_x, corner_y = corner_positions(scene)
     return np.array(
         [NORMAL_X * corner_x + NORMAL_Y * corner_y, NORMAL_X * corner_y - NORMAL_Y * corner_x, -NORMAL_X, -NORMAL_Y]
@@ -97,7 +98,7 @@ def _along_normal(scene: Scene) -> NDArray[np.float64]:
 
 
 def _along_tangent(scene: Scene) -> NDArray[np.float64]:
-    """Return the coefficients of t . p without its constant, shape (4, 8), for a head that carries walls."""
+    """Return the coefficients of t . p, shape (4, 8), for a head that carries walls: rows for c, s, X, Y."""
     corner_x, corner_y = corner_positions(scene)
     return np.array(
         [NORMAL_X * corner_y - NORMAL_Y * corner_x, -NORMAL_Y * corner_y - NORMAL_X * corner_x, NORMAL_Y, -NORMAL_X]
@@ -110,15 +111,15 @@ def penetration_rows(scene: Scene) -> NDArray[np.float64]:
 
 
 def penetrations_at_centre(scene: Scene) -> NDArray[np.float64]:
-    """Return the last row of `penetration_rows`, shape (8,); no other row depends on the clearance."""
+    """Return the last row of `penetration_rows`, shape (8,). It is the only row that depends on the clearance."""
     offset_x, offset_y = scene.head.com_offset_m
     return NORMAL_X * offset_x + NORMAL_Y * offset_y - (wall_distances(scene) - corner_radius(scene))
 
 
 def _of_places(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Adapt rows, made for a head that carries walls, to the head of the scene, and return them.
+    """Convert coefficients of positions from a head that carries walls to the head of the scene, and return them.
 
-    For a head that carries corners, R replaces R^T, and the position of the head has the opposite sign.
+    If the head carries corners, the rotation R replaces R^T and the position of the head has the opposite sign.
     """
     if scene.head.carries == "corners":
         rows[1:4] *= -1.0
@@ -126,9 +127,9 @@ def _of_places(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _of_arms(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Adapt rows of an arm about G, made for a head that carries walls, to the head of the scene, and return them.
+    """Convert coefficients of arms from a head that carries walls to the head of the scene, and return them.
 
-    The arm of a carried corner does not depend on the position of the head.
+    If the head carries corners, the arms do not depend on the position of the head.
     """
     if scene.head.carries == "corners":
         rows[0] *= -1.0
@@ -137,20 +138,20 @@ def _of_arms(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def arm_rows(scene: Scene) -> NDArray[np.float64]:
-    """Return the coefficients of the arm (p - r) x n of each force about G, shape (4, 8): rows for c, s, X, Y."""
+    """Return the coefficients of the arm (p - r) x n of each normal force about G, shape (4, 8): rows c, s, X, Y."""
     return _of_arms(scene, -_along_tangent(scene))
 
 
 def slip_rows(scene: Scene) -> NDArray[np.float64]:
-    """Return the coefficients of each corner's place t . p along its wall, shape (4, 8): rows for c, s, X, Y.
+    """Return the coefficients of each corner's position t . p along its wall, shape (4, 8): rows for c, s, X, Y.
 
-    The constant of t . p is left out. The tangent t is the outward normal n of the wall, turned by +90 degrees.
+    The constant term of t . p is omitted. The tangent t is the wall's outward normal n, rotated by +90 degrees.
     """
     return _of_places(scene, _along_tangent(scene))
 
 
 def slip_arm_rows(scene: Scene) -> NDArray[np.float64]:
-    """Return the coefficients of the arm (p - r) x t of each friction force about G, shape (4, 8), as `arm_rows`."""
+    """Return the coefficients of the arm (p - r) x t of each friction force about G, shape (4, 8): rows c, s, X, Y."""
     return _of_arms(scene, _along_normal(scene))
 
 
@@ -159,7 +160,7 @@ def body_state(
     v: tuple[float, float, float] | NDArray[np.float64],
     com_offset: tuple[float, float],
 ) -> NDArray[np.float64]:
-    """Convert pose and rate of the centre of the cavity, shape (3,) each, to body coordinates of G, shape (8,)."""
+    """Convert pose and rate of the cavity's centre, shape (3,) each, to body coordinates of G, shape (8,)."""
     x, y, theta = (float(value) for value in q)
     vx, vy, omega = (float(value) for value in v)
     c, s = math.cos(theta), math.sin(theta)
@@ -179,7 +180,7 @@ def body_state(
 
 
 def body_states(states: NDArray[np.float64], offset: tuple[float, float]) -> NDArray[np.float64]:
-    """Convert poses and rates, shape (s, 6), to body coordinates, shape (s, 8), as `body_state`."""
+    """Convert poses and rates of the cavity's centre, shape (s, 6), to body coordinates of G, shape (s, 8)."""
     x, y, theta, vx, vy, omega = states.T
     c, s = np.cos(theta), np.sin(theta)
     rx, ry = offset
@@ -193,7 +194,7 @@ def body_states(states: NDArray[np.float64], offset: tuple[float, float]) -> NDA
 
 
 def tumbles(scene: Scene) -> bool:
-    """Return whether the head may turn beyond 45 degrees: a square block without wear, whose corners are alike."""
+    """Return whether the head may turn beyond 45 degrees. It may if it is a square block without wear."""
     alike = scene.frame.width_m == scene.frame.height_m and scene.wear is None
     return scene.head.carries == "corners" and alike
 
@@ -205,8 +206,8 @@ def state_of(
 ) -> NDArray[np.float64]:
     """Convert pose and rate of the centre of the cavity or block, shape (3,) each, to the solver's state, shape (8,).
 
-    A head that carries walls has body coordinates. A head that carries corners has place and velocity in world axes; if
-    it tumbles, c and s are those of the angle without whole quarter turns.
+    The state of a head that carries walls consists of body coordinates. For a head that carries corners, position and
+    velocity are in world axes. If that head tumbles, c and s belong to the angle modulo quarter turns.
     """
     if scene.head.carries == "walls":
         return body_state(q, v, scene.head.com_offset_m)
@@ -218,14 +219,14 @@ def state_of(
 
 
 def states_of(scene: Scene, states: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Convert poses and rates, shape (s, 6), to the solver's states, shape (s, 8), as `state_of`."""
+    """Convert poses and rates, shape (s, 6), to the solver's states, shape (s, 8). `state_of` describes the states."""
     if scene.head.carries == "walls":
         return body_states(states, scene.head.com_offset_m)
     return np.array([state_of(scene, row[:3], row[3:]) for row in states]).reshape(-1, STATE_SIZE)
 
 
 def largest_angle(scene: Scene) -> float:
-    """Return the largest angle in rad to which the frame can turn in an unworn cavity, at most 45 degrees."""
+    """Return the largest angle in rad, up to 45 degrees, to which the frame can turn in an unworn cavity."""
     radius = corner_radius(scene)
     sides = np.array([[scene.frame.width_m], [scene.frame.height_m]])
     angles = np.linspace(0.0, 0.25 * math.pi, 4096)
@@ -237,14 +238,15 @@ def largest_angle(scene: Scene) -> float:
 
 
 def length_scale(scene: Scene) -> float:
-    """Return the length in m to which tolerances are relative: the smallest clearance that is not negligible.
+    """Return the reference length in m for tolerances: the smallest clearance that is not negligible.
 
-    A clearance below 1e-4 of the frame's diagonal is negligible. If both are, the scale is this share of the diagonal.
+    A clearance below 1e-4 of the frame's diagonal is negligible. If both clearances are negligible, the reference
+    length is 1e-4 of the diagonal.
     """
     floor = 1e-4 * math.hypot(scene.frame.width_m, scene.frame.height_m)
     return min((c for c in (scene.clearance.horizontal_m, scene.clearance.vertical_m) if c > floor), default=floor)
 
 
 def half_diagonal(scene: Scene) -> float:
-    """Return half the diagonal of the frame in m. It converts angles to lengths."""
+    """Return half the diagonal of the frame in m, a factor that converts angles to lengths."""
     return 0.5 * math.hypot(scene.frame.width_m, scene.frame.height_m)

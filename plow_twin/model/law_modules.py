@@ -1,4 +1,4 @@
-"""Python modules that define contact laws. Only the user of a command can name such a module, never a file."""
+"""Import of Python modules that define contact laws. A user names a module in a command; a file cannot name modules."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _loaded: list[str] = []
 
 
 def load_laws(names: Iterable[str]) -> None:
-    """Import modules that call `add_law`, so that this process knows their laws.
+    """Import modules that add contact laws by `add_law`.
 
     A name is the path of a file that ends in .py, or the name of an installed module.
 
     Raises
     ------
     InputError
-        A module cannot be imported, or adds no law.
+        A module cannot be imported, or it adds no law.
     """
     from plow_twin.model.contact_laws import LAWS
 
@@ -40,7 +40,7 @@ def load_laws(names: Iterable[str]) -> None:
 
 
 def loaded_laws() -> tuple[str, ...]:
-    """Return the names of the imported modules, for child processes to import them too."""
+    """Return the names of the imported modules, so that child processes can import them too."""
     return tuple(_loaded)
 
 

@@ -1,7 +1,7 @@
-"""Loads of a scene as the solver needs them: harmonics by frequency, and one list of linear pieces.
+"""Loads of a scene in the form that the solver uses: one list of harmonics and one piecewise linear wrench.
 
 The load (Fx, Fy) at the constant arm (x, y) in world axes has the moment M = x Fy - y Fx about the centre of the cavity
-in every pose (paper, section 2). Gravity is not a load.
+in every pose (paper, section 2). Gravity is treated separately.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Pieces:
-    """A piecewise linear wrench: `start + slope (t - knots[i])` on [knots[i], knots[i + 1]); the last piece has no end.
+    """A piecewise linear wrench: `start + slope (t - knots[i])` on [knots[i], knots[i + 1]).
 
-    `knots` [s], shape (n,), increases strictly. Before the first knot, the wrench is the first row of `start`. `start`
-    has shape (n, 3): Fx, Fy in N and M in N m. `slope` has the rates of `start` per second.
+    `knots` [s], shape (n,), increases strictly. `start`, shape (n, 3), contains Fx and Fy in N and M in N m at each
+    knot. `slope`, shape (n, 3), contains the rates of the wrench per second. Before the first knot, the wrench is the
+    first row of `start`. The last piece has no end.
     """
 
     knots: Array
@@ -31,7 +32,7 @@ class Pieces:
 
     @staticmethod
     def through(t: Array, wrench: Array) -> Pieces:
-        """Join samples by straight lines, and keep the last value after the last sample."""
+        """Return the wrench that connects samples by straight lines and is constant after the last sample."""
         slope = np.zeros_like(wrench)
         slope[:-1] = np.diff(wrench, axis=0) / np.diff(t)[:, None]
         return Pieces(t, wrench, slope)
@@ -48,14 +49,14 @@ class Pieces:
 class LoadSet:
     """The sum of all loads of a scene."""
 
-    #: sum of the constant wrenches: Fx, Fy in N, M in N m, shape (3,)
+    #: sum of the constant wrenches: Fx and Fy in N, M in N m, shape (3,)
     constant: Array
     #: distinct angular frequencies in rad/s, shape (h,)
     omega: Array
-    #: amplitudes of sin(omega t) and cos(omega t) in N, N, N m, shape (h, 3)
+    #: amplitudes of sin(omega t) and cos(omega t): Fx and Fy in N, M in N m, shape (h, 3)
     sine: Array
     cosine: Array
-    #: sum of the tables
+    #: sum of the tables, or None without tables
     pieces: Pieces | None
 
     def at(self, t: Array) -> Array:
@@ -72,18 +73,18 @@ class LoadSet:
 
 
 def wrench_of(force: tuple[float, float], moment: float, at: tuple[float, float]) -> Array:
-    """Return Fx, Fy and M = x Fy - y Fx + moment of a force at (x, y) = `at` with a free moment, shape (3,)."""
+    """Return Fx, Fy and M = x Fy - y Fx + moment, shape (3,), for a force that acts at (x, y) = `at`."""
     return np.array([force[0], force[1], at[0] * force[1] - at[1] * force[0] + moment])
 
 
 def load_direction(load: Harmonic | Constant) -> Array:
-    """Return the wrench of a load per N of its force, shape (3,), or per N m of its moment if it has no force."""
+    """Return the wrench of a load divided by its force, shape (3,), or by its moment if the force is zero."""
     size = float(np.hypot(*load.force_n)) or abs(load.moment_n_m) or 1.0
     return wrench_of(load.force_n, load.moment_n_m, load.at_m) / size
 
 
 def compile_loads(loads: Iterable[Load]) -> LoadSet:
-    """Sum the loads of a scene."""
+    """Return the sum of the loads of a scene."""
     constant = np.zeros(3)
     spectrum: dict[float, Array] = {}
     tables: list[Pieces] = []

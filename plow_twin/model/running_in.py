@@ -1,13 +1,14 @@
-"""Running-in: a new pad wears faster, by an excess that decreases with the wear depth h as exp(-h / h0).
+"""Running-in: the wear coefficient of a new pad is higher and decreases with the wear depth h.
 
-The wear coefficient is k_s (1 + (r - 1) exp(-h / h0)). If the depth of a pad with k_s alone is z, its depth h is
+The wear coefficient is k_s (1 + (r - 1) exp(-h / h0)). Let z be the depth to which k_s alone would have worn the pad.
+Then
 
     h = z + h0 ln(r - (r - 1) exp(-z / h0))        z = h + h0 ln((1 + (r - 1) exp(-h / h0)) / r)
 
-In the end, the pad is h0 ln r deeper than with k_s alone. Under a constant force F, z grows with the sliding distance s
-as z = k_s F s / A. The coefficient approaches k_s as exp(-s / s0) with s0 = h0 A / (k_s F), the exponential transient
-of Queener, Smith and Mitchell, Wear 8 (1965) 391. The coefficient depends only on the depth, so running-in continues
-from a saved depth and starts again with new pads.
+After running-in, h exceeds z by h0 ln r. Under a constant force F, z grows with the sliding distance s as z = k_s F s /
+A. The coefficient approaches k_s as exp(-s / s0) with s0 = h0 A / (k_s F), the exponential transient of Queener, Smith
+and Mitchell, Wear 8 (1965) 391. The coefficient depends only on the depth. Running-in therefore continues from a saved
+depth and starts again with new pads.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ def without_running_in(wear: Wear, depth: Array) -> Array:
 
 
 def with_running_in(wear: Wear, steady: Array) -> Array:
-    """Return the depth h [m] for the depth z [m] (`steady`); inverse of `without_running_in`."""
+    """Return the depth h [m] of a pad for the depth z [m] (`steady`). The function inverts `without_running_in`."""
     if wear.running_in_depth_m is None or wear.running_in_ratio == 1.0:
         return steady
     ratio, h0 = wear.running_in_ratio, wear.running_in_depth_m

@@ -1,7 +1,7 @@
 """The constants of one head in one guide, as frozen dataclasses in SI units.
 
-The field names are the keys of the scene file. The metadata of a field gives its unit, its meaning and its range. The
-checks in this module, the schema of the file and the documentation are made from the metadata.
+The field names are the keys of the scene file. The metadata of a field contains its unit, its meaning and its range.
+The checks in this module, the schema of the scene file and its documentation are derived from the metadata.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ DOF_NAMES: Final = ("x", "y", "theta")
 
 
 class Mark(Enum):
-    """Where a number comes from.
+    """Origin of a number.
 
     Attributes
     ----------
     GIVEN
-        Published, or stated by the maker of the machine.
+        Published, or stated by the manufacturer of the machine.
     RECONSTRUCTED
         Fitted to published or measured data.
     ASSUMED
-        Chosen.
+        Chosen without data.
     MEASURED
         Measured at the machine.
     """
@@ -47,13 +47,13 @@ class Mark(Enum):
 
 @dataclass(frozen=True)
 class Provenance:
-    """The mark and the source of one number of a scene.
+    """The origin of one number of a scene.
 
     Attributes
     ----------
     mark : Mark
     source : str
-        The source, in words.
+        Description of the source.
     deviation : float, optional
         Standard deviation, in the unit of the number.
     """
@@ -64,7 +64,7 @@ class Provenance:
 
 
 def _quantity(unit: str, doc: str, default: Any = ..., **bounds: float) -> Any:
-    """Declare a field for numbers with its unit, its meaning and its range (`gt`, `ge`, `lt`, `le`)."""
+    """Return a dataclass field for numbers with its unit, meaning and range (`gt`, `ge`, `lt`, `le`)."""
     metadata = {"unit": unit, "doc": doc, **bounds}
     return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
 
@@ -99,12 +99,12 @@ class Head:
 
 @dataclass(frozen=True)
 class Frame:
-    """The slide, a rectangle inside the cavity of the head. It is fixed unless the scene has a `Support`.
+    """The slide, a rectangle inside the cavity of the head. The slide is fixed unless the scene has a `Support`.
 
     Attributes
     ----------
     labels : mapping of str to str
-        Letters for corners, e.g. a: bottom_right.
+        Letters that name corners, e.g. a: bottom_right.
     """
 
     width_m: float = _quantity("m", "horizontal side", gt=0.0)
@@ -117,7 +117,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Clearance:
-    """The cavity's size minus the frame's size. With a negative clearance, both walls touch from the start."""
+    """The cavity's size minus the frame's size. A negative clearance presses the frame against both opposite walls."""
 
     horizontal_m: float = _quantity("m", "cavity width minus frame width")
     vertical_m: float = _quantity("m", "cavity height minus frame height")
@@ -125,24 +125,27 @@ class Clearance:
 
 @dataclass(frozen=True)
 class Contact:
-    """Normal contact: one law, whose parameters all pairs share.
+    """Normal contact. All pairs have the same law with the same parameters.
 
-    A scene gives either `damping` or `restitution`, or neither for a law without damping. An impact under the default
-    law has exactly the given restitution.
+    A scene gives either `damping` or `restitution`; a law without damping needs neither. Under the default law, an
+    impact has exactly the given restitution.
 
-    The restitution can decrease with the impact speed w = v (m' / m)^p. Here v is the speed of approach, m' the
-    effective mass of the head at the corner, m the mass of the head, and p the `restitution_mass_power`. If w exceeds
-    the `restitution_speed_m_s` v1, the restitution is multiplied by (w / v1)^-q with the `restitution_fall` q. Then
-    `restitution_fall_along_s_m` times the speed of the centre of mass along the wall is subtracted.
+    The restitution can decrease with the impact speed w = v (m' / m)^p:
+
+    - v is the speed of approach, m the mass of the head, m' the effective mass of the head at the corner, and p the
+      `restitution_mass_power`.
+    - If w exceeds v1 = `restitution_speed_m_s`, the restitution is multiplied by (w / v1)^-q with q =
+      `restitution_fall`.
+    - The product of `restitution_fall_along_s_m` and the speed of the centre of mass along the wall is then subtracted.
 
     References
     ----------
-    Decrease with the speed (v^-1/4 in plastic contact): Johnson, Contact Mechanics, 1985, sec. 11.5. The dependence on
-    the effective mass and on the speed along the wall was found in measured impacts (docs/measured.md).
+    Johnson, Contact Mechanics, 1985, sec. 11.5, derives the decrease with the speed (v^-1/4 in plastic contact). The
+    dependence on the effective mass and on the speed along the wall was found in measured impacts (docs/measured.md).
     """
 
     law: str = _choice("contact law", LAWS, "exact_restitution")
-    # a dataclass demands a default here; NaN is not admissible, so a scene must give the stiffness
+    # the dataclass needs a default here; NaN is not admissible, so every scene has to give the stiffness
     stiffness: float = _quantity("N/m^exponent", "K in F = K d^n (...)", math.nan, gt=0.0)
     exponent: float = _quantity("1", "n in F = K d^n (...)", 1.0, ge=1.0, le=4.0)
     damping: float | None = _quantity(
@@ -170,7 +173,7 @@ class Contact:
     )
 
 
-#: Fields of `Contact` by which the restitution depends on the impact.
+#: Fields of `Contact` that make the restitution depend on the impact.
 FALL_NAMES: Final = (
     "restitution_fall",
     "restitution_speed_m_s",
@@ -183,14 +186,14 @@ FALL_NAMES: Final = (
 class Friction:
     """Tangential friction of all pairs, by one of two laws.
 
-    Without `stick_stiffness_n_m`, friction is regularised Coulomb friction, T = mu N tanh(slip rate / regularisation
-    speed). A body that this friction holds creeps. With `stick_stiffness_n_m`, a spring and a damper hold a corner to
-    the wall up to static mu N; beyond this force the corner slips with T = mu N.
+    Without `stick_stiffness_n_m`, friction is regularised Coulomb friction: T = mu N tanh(slip rate / regularisation
+    speed). A corner then creeps under a small load instead of sticking. With `stick_stiffness_n_m`, a spring and a
+    damper connect a corner to the wall until their force exceeds static mu N. The corner then slips with T = mu N.
 
     References
     ----------
-    Andersson, Soederberg and Bjoerklund, Tribol. Int. 40 (2007) 580, eq. 5 (regularised); Cundall and Strack,
-    Geotechnique 29 (1979) 47, and Luding, Granul. Matter 10 (2008) 235, sec. 3.2 (with stick).
+    Regularised friction: Andersson, Soederberg and Bjoerklund, Tribol. Int. 40 (2007) 580, eq. 5. Friction with stick:
+    Cundall and Strack, Geotechnique 29 (1979) 47, and Luding, Granul. Matter 10 (2008) 235, sec. 3.2.
     """
 
     coefficient: float = _quantity("1", "mu", ge=0.0)
@@ -208,10 +211,10 @@ class Friction:
 
 @dataclass(frozen=True)
 class Support:
-    """Springs and dampers between the frame and the ground, which make the frame a body with mass.
+    """Springs and dampers between the frame and the ground. With a support, the frame is a movable body with mass.
 
     The frame starts at rest in its equilibrium without contact. Its displacement is measured from this equilibrium. The
-    pose q of the head remains relative to the frame.
+    pose q of the head is relative to the frame.
     """
 
     mass_kg: float = _quantity("kg", "mass of the frame and of the parts that move with it", gt=0.0)
@@ -236,7 +239,7 @@ class Gravity:
 
 @dataclass(frozen=True)
 class Harmonic:
-    """A load `amplitude * sin(omega t + phase)` with a constant point of action: M = x Fy - y Fx + moment.
+    """A load `amplitude * sin(omega t + phase)` at a constant point (x, y), with the moment M = x Fy - y Fx + moment.
 
     Attributes
     ----------
@@ -254,7 +257,7 @@ class Harmonic:
 
 @dataclass(frozen=True)
 class Constant:
-    """A load that does not change.
+    """A constant load.
 
     Attributes
     ----------
@@ -270,9 +273,9 @@ class Constant:
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A load given by samples. Before the first and after the last sample, the load is that of this sample.
+    """A load given by samples. Before the first sample and after the last sample, the load is constant.
 
-    With `hold: linear`, straight lines join the samples; with `hold: zero`, each value lasts until the next sample.
+    With `hold: linear`, straight lines connect the samples. With `hold: zero`, each value lasts until the next sample.
 
     Attributes
     ----------
@@ -296,7 +299,7 @@ Load = Harmonic | Constant | Table
 
 @dataclass(frozen=True)
 class Initial:
-    """State at t = 0: pose of the centre of the cavity relative to the centre of the frame, and its rate."""
+    """State at t = 0: pose of the cavity's centre relative to the frame's centre, and the rate of the pose."""
 
     q: tuple[float, float, float] = _quantity("m, m, rad", "x, y, theta", (0.0, 0.0, 0.0))
     v: tuple[float, float, float] = _quantity("m/s, m/s, rad/s", "rates of q", (0.0, 0.0, 0.0))
@@ -306,13 +309,13 @@ class Initial:
 class Wear:
     """Archard wear of the eight pads by the travel along the face: dh/dt = k_s F v / A.
 
-    With `sliding: total`, v is replaced by sqrt(v^2 + s'^2), where s' is the speed of the corner over its pad in the
-    plane of the section. Running-in multiplies k_s by 1 + (r - 1) exp(-h / h0) for a pad that is worn by h, with the
-    `running_in_ratio` r and the `running_in_depth_m` h0.
+    With `sliding: total`, sqrt(v^2 + s'^2) replaces v, where s' is the in-plane speed of the corner over its pad.
+    Running-in multiplies k_s by 1 + (r - 1) exp(-h / h0) with the wear depth h, r = `running_in_ratio` and h0 =
+    `running_in_depth_m`.
 
     References
     ----------
-    Archard, J. Appl. Phys. 24 (1953) 981. Running-in: Queener, Smith and Mitchell, Wear 8 (1965) 391.
+    Wear: Archard, J. Appl. Phys. 24 (1953) 981. Running-in: Queener, Smith and Mitchell, Wear 8 (1965) 391.
     """
 
     coefficient_m2_n: float = _quantity("m^2/N", "k_s = k/H", ge=0.0)
@@ -334,7 +337,7 @@ class Wear:
 
 @dataclass(frozen=True)
 class Scene:
-    """One complete scene.
+    """The parameters, loads and initial state of one machine.
 
     Attributes
     ----------
@@ -344,22 +347,22 @@ class Scene:
     contact : Contact
     gravity : Gravity
     loads : tuple of Harmonic, Constant or Table
-        Loads on the head, apart from gravity and contact.
+        Loads on the head other than gravity and contact forces.
     initial : Initial
     locked : tuple of str
-        Locked degrees of freedom: any of x, y, theta.
+        Degrees of freedom that are fixed: any of x, y, theta.
     pairs : tuple of str
         The pairs that can touch.
     wear : Wear or None
     friction : Friction or None
     support : Support or None
     marks : mapping of str to Provenance
-        Provenance of numbers by their path. Comparison by == ignores the marks.
+        Origin of each number, by the path of the number. The comparison by == ignores the marks.
 
     Raises
     ------
     SceneError
-        The scene cannot be used; the error lists every problem.
+        The scene is not valid. The error lists every problem.
     """
 
     head: Head
@@ -400,7 +403,7 @@ PARTS: Final[Mapping[str, type]] = {**SECTIONS, **OPTIONAL_PARTS}
 
 
 def check(scene: Scene) -> Iterator[Problem]:
-    """Yield every problem of a scene. Conflicts between fields are looked for only if each field is valid."""
+    """Yield every problem of a scene. Conflicts between fields are checked only if each field is valid by itself."""
     found = list(_check_fields(scene, ""))
     yield from found
     if not found:
@@ -487,21 +490,21 @@ def _check_choice(key: str, value: Any, spec: Field[Any]) -> Iterator[Problem]:
 
 
 def must_be_given(spec: Field[Any]) -> bool:
-    """Return whether a scene must give the field, because the field has no default or its default is NaN."""
+    """Return whether a scene must give the field. It must if the field has no default or if its default is NaN."""
     if spec.default is MISSING:
         return spec.default_factory is MISSING
     return isinstance(spec.default, float) and math.isnan(spec.default)
 
 
 def describe(spec: Field[Any]) -> str:
-    """Describe the admissible numbers, e.g. `a finite number > 0 [kg]`."""
+    """Return a description of the admissible numbers, e.g. `a finite number > 0 [kg]`."""
     signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
     bounds = [f"{sign} {spec.metadata[name]:g}" for name, sign in signs.items() if name in spec.metadata]
     return f"a finite number {' and '.join(bounds)}".rstrip() + f" [{spec.metadata['unit']}]"
 
 
-#: Largest damping factor lambda in 1 + lambda d' [s/m] that a scene can give. A larger factor would stop a head within
-#: sqrt(2 m / (K lambda)), a depth so small that few of its digits remain in double precision.
+#: Largest admissible damping factor lambda [s/m] in 1 + lambda d'. A larger factor would stop a head within the depth
+#: sqrt(2 m / (K lambda)), which double precision resolves with few digits.
 MOST_DAMPING_FACTOR: Final = 1e9
 
 
@@ -518,7 +521,7 @@ def _check_wear(wear: Wear, contact: Contact) -> Iterator[Problem]:
 
 
 def fastest_travel(wear: Wear | None, contact: Contact) -> float:
-    """Return the largest speed along the face in m/s, A / (k_s C) with the damping C; inf without C or without wear.
+    """Return the largest speed along the face in m/s: A / (k_s C) with the damping C, or inf without C or wear.
 
     Above this speed, a force wears the pad faster than it moves the head, so no contact can last.
     """
@@ -529,7 +532,7 @@ def fastest_travel(wear: Wear | None, contact: Contact) -> float:
 
 
 def check_travel_speed(scene: Scene, speed_m_s: float) -> None:
-    """Raise an `ArgumentError` if a twin of the scene cannot run at a speed along the face in m/s, of either sign."""
+    """Raise an `ArgumentError` if the scene does not admit a speed along the face in m/s. The speed has either sign."""
     fastest = fastest_travel(scene.wear, scene.contact)
     if not math.isfinite(speed_m_s):
         raise ArgumentError(f"speed_m_s: got {speed_m_s!r}, expected a finite speed in m/s")
@@ -628,7 +631,7 @@ def _check_loads(loads: tuple[Load, ...]) -> Iterator[Problem]:
             yield from _check_table(f"loads[{index}]", load)
 
 
-#: Shortest time between two samples of a table in s; the solver needs steps of at least this size.
+#: Shortest time in s between two samples of a table. The solver cannot take shorter steps.
 LEAST_SPACING_S: Final = 1e-100
 
 
