@@ -53,8 +53,8 @@ if _TYPE_CHECKING:
     from plow_twin.scene_file import load_scene as load_scene
     from plow_twin.view.motion import plot_motion as plot_motion
 
-#: Public names by the module that defines them. A module is imported when one of its names is first used, so that
-#: Ctrl-C stops a command from its first moment on, and scenes built in Python do not need the YAML reader.
+#: Public names, grouped by the module that defines them. A module is imported when one of its names is first used.
+#: Early imports would delay the handling of Ctrl-C, and would load the YAML reader for scenes that are built in Python.
 _NAMES = {
     "plow_twin.errors": (
         "ArgumentError",
@@ -99,7 +99,8 @@ _NAMES = {
     "plow_twin.view.motion": ("plot_motion",),
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}
-#: Names for a star import, which must work without the libraries that recordings and figures need.
+#: Names for `import *`. Names that need the libraries of recordings or figures are excluded, because these libraries
+#: may be missing.
 __all__ = [name for name, module in _HOMES.items() if not module.startswith(("plow_twin.record", "plow_twin.view"))]
 
 

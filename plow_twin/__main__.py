@@ -1,4 +1,4 @@
-"""`python -m plow_twin` is the command `plow-twin`."""
+"""Entry point of `python -m plow_twin`, which runs the command `plow-twin`."""
 
 from plow_twin.cli import main
 

@@ -1,4 +1,4 @@
-"""Rules for hosts and secrets that every connection to another program shares."""
+"""Checks of hosts and reading of secrets, for every connection to another program."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Final
 
 from plow_twin.errors import InputError, Problem
 
-#: Longest secret [B], which is the longest password that an MQTT packet can hold.
+#: Longest secret [B]. It is the longest password that fits into an MQTT packet.
 _LONGEST_SECRET: Final = 65_535
 
 
 def is_address(host: str) -> bool:
-    """Return whether a host is an IP address and not a name."""
+    """Return whether a host is an IP address. A name is no address."""
     try:
         ip_address(host)
     except ValueError:
@@ -27,12 +27,12 @@ def is_loopback(host: str) -> bool:
 
 
 def read_secret(path: Path) -> str:
-    """Return a password or token: the first line of a file.
+    """Return a password or token, which is the first line of a file.
 
     Raises
     ------
     InputError
-        The line is too long or not printable text. The message does not show the line.
+        The line is too long, or contains unprintable characters. The message does not contain the line.
     OSError
         The file cannot be read.
     """

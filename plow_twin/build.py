@@ -1,4 +1,4 @@
-"""The identity of a build: the version of the package, and all that the exact bits of a run depend on."""
+"""Version of the package, and fingerprint of everything that determines the exact bits of a run's results."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
-#: Subpackages whose code determines the bits of a run's results. `estimate` is among them because a twin that follows
-#: its machine uses it.
+#: Subpackages whose code determines the exact bits of a run's results. `estimate` is included because a twin can
+#: correct its parameters by estimates during the run.
 NUMERIC_SUBPACKAGES: Final = ("kernel", "model", "solve", "run", "estimate", "stream", "record")
 
 
@@ -27,7 +27,7 @@ def package_version() -> str:
 
 @cache
 def build_fingerprint() -> Mapping[str, str]:
-    """Return the causes of the exact bits of a run: versions, processor, platform, a hash of the numeric sources."""
+    """Return everything that determines the exact bits of a run: versions, processor, platform and source digest."""
     import llvmlite.binding
     import numba
 
@@ -46,7 +46,7 @@ def build_fingerprint() -> Mapping[str, str]:
 
 
 def source_digest(package: Path) -> str:
-    """Return a hash of the sources of a package's numeric subpackages, 16 hexadecimal digits."""
+    """Return a hash of the sources of a package's numeric subpackages, as 16 hexadecimal digits."""
     digest = hashlib.sha256()
     for subpackage in NUMERIC_SUBPACKAGES:
         for path in sorted((package / subpackage).rglob("*.py")):

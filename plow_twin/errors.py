@@ -1,4 +1,4 @@
-"""Exceptions of the package, with one base class; a message names the thing, the value got and the value expected."""
+"""Exceptions of the package. A message names the cause, the value that was found and the expected value."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from typing import Any, Final
 
 
 class PlowTwinError(Exception):
-    """Base of every error that the package raises on purpose."""
+    """Base class of every error that the package raises on purpose."""
 
 
-#: Longest value that a message shows in full [characters].
+#: Longest text of a value that a message contains [characters]. Longer texts are cut.
 _LONGEST_SHOWN: Final = 500
 #: Largest number of problems that a message lists.
 _MOST_SHOWN: Final = 50
 
 
-#: Unicode categories of the characters that control a terminal or change the writing direction.
+#: Unicode categories of characters that control a terminal or change the writing direction.
 _ACTING: Final = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
 
 
 def printable(text: str) -> str:
-    """Return a text that is safe for a terminal: control characters are escaped, line ends are kept."""
+    """Return a text that is safe for a terminal. Control characters are escaped, except tabs and line ends."""
     if text.isprintable():
         return text
     return "".join(
@@ -34,16 +34,16 @@ def printable(text: str) -> str:
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing wrong with an input.
+    """One problem of an input.
 
     Attributes
     ----------
     key : str
-        Where the problem is: the path of a number, a file or a row.
+        Path of a number, name of a file, or row where the problem was found.
     got : object
-        The value found there.
+        The invalid value.
     expected : str
-        The expected value, in words.
+        Description of the expected value.
     """
 
     key: str
@@ -58,14 +58,14 @@ class Problem:
 
 
 class InputError(PlowTwinError, ValueError):
-    """A file or values that a user wrote cannot be used; the message lists the first 50 problems.
+    """A file or value from a user is not valid. The message lists the first 50 problems.
 
     Attributes
     ----------
     problems : tuple of Problem
         All problems.
     source : str
-        Name of the file or other input.
+        Name of the file or other input that contains the problems.
     """
 
     def __init__(self, problems: Iterable[Problem], source: str) -> None:
@@ -79,18 +79,18 @@ class InputError(PlowTwinError, ValueError):
 
 
 class SceneError(InputError):
-    """A scene cannot be used."""
+    """A scene is not valid."""
 
     def __init__(self, problems: Iterable[Problem], source: str = "scene") -> None:
         super().__init__(problems, source)
 
 
 class ArgumentError(PlowTwinError, ValueError):
-    """An argument of a call cannot be used; the message names it, the value got and the value expected."""
+    """An argument of a call is not valid. The message contains the argument's name, value and expected value."""
 
 
 class SolverError(PlowTwinError, RuntimeError):
-    """The motion could not be continued; the message says when and why."""
+    """The solver cannot continue the motion. The message states the time and the reason."""
 
 
 class _StoppedError(PlowTwinError):
@@ -103,48 +103,48 @@ class _StoppedError(PlowTwinError):
 
 
 class LimitError(_StoppedError, SolverError):
-    """A run has reached a limit that its caller set; `result` is the motion up to `time_s`.
+    """A run has reached a limit that its caller set.
 
     Attributes
     ----------
     result : Result
-        The motion so far.
+        The motion up to `time_s`.
     time_s : float
-        Model time reached in s.
+        Model time in s at which the run stopped.
     """
 
 
 class RunInterrupted(_StoppedError, KeyboardInterrupt):
-    """A run was interrupted by the user; `result` is the motion up to `time_s`.
+    """The user interrupted a run.
 
     Attributes
     ----------
     result : Result
-        The motion so far.
+        The motion up to `time_s`.
     time_s : float
-        Model time reached in s.
+        Model time in s at which the run stopped.
     """
 
 
 class ToleranceWarning(UserWarning):
-    """A motion amplifies errors so much that the requested tolerance does not hold."""
+    """The motion amplifies errors so much that its error may exceed the requested tolerance."""
 
 
 class RecordingError(PlowTwinError, ValueError):
-    """A recording cannot be written or read; the message names the file and the record."""
+    """A recording cannot be written or read. The message names the file and the record."""
 
 
 class ExcessError(RecordingError):
-    """A file is larger, deeper or wider than the bounds; the message names the bound."""
+    """A file exceeds a bound on size, nesting depth or number of columns. The message names the bound."""
 
 
 class UnitError(RecordingError):
-    """A unit is unknown, or numbers look as if they had another unit; the message says how to state the unit."""
+    """A unit is unknown, or values suggest a unit that was not stated. The message shows how to state the unit."""
 
 
 class TakenError(RecordingError):
-    """A recording cannot be written, because another recording exists at the same place."""
+    """A recording cannot be written because a recording already exists under the same path."""
 
 
 class ForeignRecordingError(RecordingError):
-    """A recording is not a run of plow_twin, but perhaps of another program."""
+    """A recording was not written by plow_twin. Another program may have written it."""

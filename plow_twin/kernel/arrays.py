@@ -1,6 +1,6 @@
-"""Helpers for arrays and records in kernels: views without a reference count, copies, searches, checks.
+"""Helpers for arrays and records in kernels: views without a reference count, copies, searches and checks.
 
-These helpers compile faster than numba's own code. For example, numba's assignment of a slice also compiles the
+These helpers compile faster than numba's own code. For example, numba's assignment to a slice also compiles the
 formatting of an error message, which takes 2 s in each process that compiles a twin.
 """
 
@@ -19,8 +19,8 @@ from numba.extending import intrinsic
 
 from plow_twin.kernel.compiler import kernel
 
-#: Numba tries templates of the processor first. Its own templates for arrays come after seven for other types, which
-#: take a fifth of the compile time.
+#: Marks a template as specific to the processor, because numba tries these templates first. Otherwise numba would try
+#: seven templates of other types before its own templates for arrays, which takes a fifth of the compile time.
 _FIRST: Final = {"target": "cpu"}
 
 
@@ -35,10 +35,10 @@ class _SetArrayItem(SetItemBuffer):
 
 
 def _unowned(typingctx: Any, array: Any) -> Any:
-    """Return the same array without a reference count; the caller must keep its memory alive. None stays None.
+    """Return a view of an array without a reference count, or None for None. The caller must keep the memory alive.
 
-    With a reference count, each call that takes the array would increment and decrement it atomically, which costs a
-    seventh of a run's time.
+    With a reference count, each call that receives the array would increment and decrement the count atomically. These
+    operations would take a seventh of a run's time.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -58,8 +58,7 @@ unowned = cast("Callable[[Any], Any]", intrinsic(_unowned))
 def _copy_record(typingctx: Any, target: Any, source: Any) -> Any:
     """Copy a record to a record of the same type.
 
-    Numba's assignment loads the record as an array of bytes, and LLVM then needs 0.8 s to split this array into single
-    bytes.
+    Numba's assignment loads the record as an array of bytes. LLVM would need 0.8 s to split this array into bytes.
     """
     if not isinstance(target, types.Record) or target != source:
         return None
@@ -76,7 +75,7 @@ copy_record = cast("Callable[[Any, Any], None]", intrinsic(_copy_record))
 
 
 def _copy_part(typingctx: Any, target: Any, source: Any, first: Any, last: Any) -> Any:
-    """Copy the bytes from `first` to before `last` of a record to the same place in a record of another type."""
+    """Copy the bytes `first` to `last` - 1 of a record to the same offsets in a record of another type."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         begin, end = (context.cast(builder, arguments[i], signature.args[i], types.intp) for i in (2, 3))
@@ -92,14 +91,14 @@ copy_part = cast("Callable[[Any, Any, int, int], None]", intrinsic(_copy_part))
 
 @kernel()
 def copy_into(target: Any, source: Any) -> None:
-    """Copy the numbers of an array to an array of the same size."""
+    """Copy the elements of an array to an array of the same size."""
     for i in range(target.size):
         target[i] = source[i]
 
 
 @kernel()
 def all_finite(numbers: Any) -> bool:
-    """Return whether no number is NaN or infinite."""
+    """Return whether all numbers are finite."""
     finite = True
     for number in numbers:
         finite = finite and math.isfinite(number)
@@ -108,7 +107,7 @@ def all_finite(numbers: Any) -> bool:
 
 @kernel()
 def count_up_to(rising: Any, limit: float) -> int:
-    """Return how many numbers are at most `limit`; the numbers must be sorted in rising order."""
+    """Return how many numbers are at most `limit`. The numbers must be sorted in ascending order."""
     low, high = 0, rising.size
     while low < high:
         middle = (low + high) // 2

@@ -1,4 +1,4 @@
-"""Compile-time choice between two functions of a record: only the function that suits the record's type is compiled."""
+"""Choice of a kernel at compile time by the fields of a record. Only the chosen kernel is compiled."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from plow_twin.errors import ArgumentError
 
 
 def by_field(name: str, present: Callable[..., Any], absent: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function for kernels that calls `present` if the type of its record p has the field, else `absent`.
+    """Return a function for kernels that calls `present` if its first argument has the field, and else `absent`.
 
     Parameters
     ----------
     name : str
-        The field.
+        Name of the field.
     present, absent : callable
-        Compiled functions that take p and the same further arguments.
+        Compiled functions with the same parameters. The first parameter is a record.
     """
 
     def choose(p: Any, *more: Any) -> Any:

@@ -1,7 +1,7 @@
-"""The decorator of compiled functions: numba with a disk cache that is renewed if any kernel changes.
+"""The decorator of compiled functions: numba with a disk cache that is invalidated when any kernel changes.
 
-Numba's own cache checks only the file of the cached function and misses changes in the functions that it calls. Here
-each cached function is stamped with a digest of the source of all kernels.
+Numba's own cache checks only the file of the cached function, and misses changes in the functions that it calls. Here
+the cache entry of each function contains a digest of the source of all kernels.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from numba.np import linalg
 
 from plow_twin.kernel.linked import EntryCompiler, LinkedCompiler, for_any_value, garbage_kept, keep_from_python
 
-#: Relaxations of `fast` kernels: sums may be reordered and fused, but NaN and infinity are still handled correctly.
+#: Relaxations for `fast` kernels. Sums may be reordered and fused; NaN and infinity are handled correctly.
 FASTMATH: Final = frozenset({"contract", "reassoc", "nsz", "arcp"})
 
-#: Holds the warning about the cache once it has been issued.
+#: Text of the warning about the cache, once the warning has been issued.
 _said: list[str] = []
 
 
 def _load_numba() -> None:
-    """Load numba's tables of types and of code, without importing SciPy's linear algebra.
+    """Load numba's tables of types and of code without importing SciPy's linear algebra.
 
-    The import of SciPy's linear algebra takes 0.15 s, a third of a start. Numba needs it here only to check whether
-    there is a BLAS; compiled functions that use a BLAS import it themselves.
+    The import of SciPy's linear algebra takes 0.15 s, a third of the start time. Numba imports it here only to check
+    whether there is a BLAS. Compiled functions that call BLAS import SciPy's linear algebra themselves.
     """
     found = linalg.ensure_blas
     linalg.ensure_blas = lambda: None
@@ -65,17 +65,18 @@ SOURCE_DIGEST: Final = _source_digest()
 def kernel(
     *, fast: bool = False, inline: Literal["code", "source"] | None = None, entry: bool = False
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Compile a function.
+    """Return a decorator that compiles a function.
 
     Parameters
     ----------
     fast : bool
-        Allow reordered and fused sums.
+        Whether sums may be reordered and fused.
     inline : {"code", "source"}, optional
-        Inline the function's LLVM code or its source into its callers. Inlined source compiles more slowly and follows
-        the caller's `fast`, but may return records, unlike other functions of numba.
+        "code" inlines the function's LLVM code into its callers, "source" its Python source. A function with inlined
+        source can return records, unlike other functions of numba. However, it compiles more slowly and follows the
+        caller's `fast`.
     entry : bool
-        Whether Python calls the function too. The wrapper for Python costs a tenth of the compile time.
+        Whether Python calls the function, too. The wrapper for calls from Python takes a tenth of the compile time.
     """
     options: dict[str, Any] = {"fastmath": set(FASTMATH)} if fast else {}
     if inline == "source":
@@ -87,13 +88,13 @@ def kernel(
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         dispatcher = kept(function, **options)
-        if hasattr(dispatcher, "_compiler"):  # with NUMBA_DISABLE_JIT the function stays plain Python
+        if hasattr(dispatcher, "_compiler"):  # with NUMBA_DISABLE_JIT the dispatcher is the Python function
             for_any_value(dispatcher)
         cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
         if cache_file is not None:
             cache_file._source_stamp = SOURCE_DIGEST
-            # numba compares the version before it unpickles the index; unpickling fails if the index names a type that
-            # was removed
+            # numba compares the version before it unpickles the index. Without this order, an index that contains a
+            # type that has been removed from the sources would raise an error.
             cache_file._version = f"{numba.__version__} {SOURCE_DIGEST}"
             if inline != "source" and not entry:
                 keep_from_python(dispatcher)
@@ -104,25 +105,25 @@ def kernel(
 
 
 def for_kernels(entry: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a copy of an entry (a kernel that Python calls) for other kernels to call.
+    """Return a copy of an entry, which is a kernel that Python calls, for calls from other kernels.
 
-    If a kernel called the entry itself, numba would also optimise the entry alone and generate machine code that nobody
-    runs.
+    If a kernel called the entry itself, numba would also optimise the entry alone, and would generate machine code that
+    is never run.
     """
     function = getattr(entry, "py_func", None)
     if function is None:
         return entry  # NUMBA_DISABLE_JIT: the entry is a plain Python function
     copy = FunctionType(function.__code__, function.__globals__, function.__name__)
-    # numba names the files of the cache after `__qualname__`, so the copy needs a name of its own
+    # numba derives the names of cache files from `__qualname__`, so the copy needs a different name
     copy.__qualname__ = f"{function.__qualname__}_for_kernels"
     return kernel()(copy)
 
 
 @contextmanager
 def _read_only_cache() -> Iterator[None]:
-    """Let numba read the cache beside the sources without testing whether it can be written.
+    """Make numba accept a disk cache in the package's folder that cannot be written.
 
-    Another user may have filled this cache, for example when the package was installed.
+    Another user may have filled this cache, for example during the installation of the package.
     """
     locator: Any = caching._CacheLocator
     found = locator.ensure_cache_path
@@ -134,7 +135,7 @@ def _read_only_cache() -> Iterator[None]:
 
 
 def kept(function: Callable[..., Any], **options: Any) -> Any:
-    """Return numba's dispatcher with a cache on disk; it warns if the cache cannot be written, and works without it."""
+    """Return numba's dispatcher with a disk cache. If the cache cannot be written, a warning is issued once."""
     compiler = numba.njit(cache=True, nogil=True, error_model="numpy", **options)
     try:
         dispatcher = compiler(function)
@@ -148,17 +149,18 @@ def kept(function: Callable[..., Any], **options: Any) -> Any:
 
 
 def share(cache_file: Any) -> None:
-    """Make numba's cache of a function on disk safe for processes that compile at the same time.
+    """Make numba's disk cache of a function safe for processes that compile at the same time.
 
-    Numba names the files of code by numbers from the index, and writes the index first. If two processes compile
-    different signatures, one process could therefore store its code under the signature of the other process. Here a
-    file is named by a hash of its content, and is written before the index. A race can still lose an entry of the
-    index; the signature of this entry is then compiled again.
+    Numba names the files of machine code by numbers from the index, and writes the index first. If two processes
+    compile different signatures, one process could therefore store its code under the signature of the other process.
+
+    Here the name of a file is a hash of its content, and the file is written before the index. Two processes that write
+    at the same time can still lose an entry of the index. The signature of this entry is then compiled again.
 
     Parameters
     ----------
     cache_file : numba.core.caching.IndexDataCacheFile
-        The function's cache file; its method `save` is replaced.
+        Cache file of the function. Its method `save` is replaced.
     """
     stem = cache_file._index_name.removesuffix("nbi")
 
@@ -168,7 +170,7 @@ def share(cache_file: Any) -> None:
         with cache_file._open_for_write(cache_file._data_path(name)) as file:
             file.write(code)
         overloads = cache_file._load_index()
-        # an existing index that loads as empty belongs to other sources, so their compiled files are deleted
+        # an existing index is loaded as empty if it belongs to other sources; its compiled files are then deleted
         if not overloads and Path(cache_file._index_path).exists():
             for old in Path(cache_file._cache_path).glob(f"{glob.escape(stem)}*.nbc"):
                 if old.name != name:
@@ -187,7 +189,7 @@ def _save_or_warn(cache: Any) -> None:
             save(signature, result)
         except OSError as error:
             place = Path(cache.cache_path).parent
-            # numba resets the registry of warnings that Python has issued, so `_said` prevents a second warning
+            # numba resets Python's registry of issued warnings, so `_said` prevents a repetition
             if not _said:
                 _said.append(f"compiled kernels are not kept for the next start: {place}: {error.strerror or error}")
                 warnings.warn(_said[0], RuntimeWarning, stacklevel=1)
@@ -196,9 +198,9 @@ def _save_or_warn(cache: Any) -> None:
 
 
 def for_arguments(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
-    """Return the entry compiled for the types of these arguments; it does not check the types of later arguments.
+    """Return the kernel compiled for the types of these arguments. The result does not check the types of arguments.
 
-    Numba needs more time to check the types of nested tuples and records than the twin needs for a sample.
+    Numba's check of nested tuples and records takes longer than the computation of one sample by a twin.
     """
     compile_for = getattr(function, "compile", None)
     if compile_for is None:

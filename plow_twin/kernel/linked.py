@@ -1,9 +1,9 @@
-"""Two compilers for numba: one for kernels that only kernels call, one for kernels that Python calls too.
+"""Two compilers for numba: one for kernels that only kernels call, and one for kernels that Python calls.
 
-LLVM optimises a kernel together with every kernel that it calls. Numba would also optimise each called kernel alone and
-generate its machine code, which takes a quarter of the compile time. The first compiler stops before this optimisation,
-at code that callers can link. Both compilers use numba's extension point (its manual, "Customizing the Compiler"), each
-with its own class of code library.
+LLVM optimises a kernel together with every kernel that it calls. By default, numba would also optimise each called
+kernel alone and generate its machine code, which takes a quarter of the compile time. The first compiler omits these
+steps and returns LLVM code that callers can link. Both compilers use numba's extension point (numba's manual,
+"Customizing the Compiler"). Each has its own class of code library.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ _ENVIRONMENT = "_ZN08NumbaEnv"
 
 
 class LinkedLibrary(JITCodeLibrary):
-    """The code of a kernel for its callers to link; machine code is made only for the variables that numba sets."""
+    """Code of a kernel that its callers link. Machine code is generated only for the variables that numba sets."""
 
     def __init__(self, codegen: Any, name: str) -> None:
         super().__init__(codegen, name)
         self._exported: list[str] = []
-        #: whether sums may be reordered and fused, so that the last bits may depend on the caller
+        #: whether sums may be reordered and fused; if so, the last bits of a sum may depend on the caller
         self.fast = False
 
     def add_ir_module(self, ir_module: llvmlite.ir.Module) -> None:
-        """Add the functions of a module, and note the names of the functions that callers use."""
+        """Add the functions of a module, and store the names of the functions that callers use."""
         super().add_ir_module(ir_module)
         defined = (function for function in ir_module.functions if not function.is_declaration)
         self._exported += [function.name for function in defined if not function.linkage]
 
     def finalize(self) -> None:
-        """Link the libraries of all called functions."""
+        """Link the code of all called functions into this library."""
         self._finalized = True
         whole = self._final_module
         self._finalize_dynamic_globals()
@@ -50,7 +50,7 @@ class LinkedLibrary(JITCodeLibrary):
             self._dynamic_globals += library._dynamic_globals
             environments |= _environments(library._final_module)
         for name in self._exported:
-            # with this linkage a caller gets its own copy of the kernel, and can drop the copy after inlining it
+            # with this linkage each caller gets its own copy of the kernel, and can drop the copy after inlining it
             whole.get_function(name).linkage = "linkonce_odr" if self.fast else "weak_odr"
         self._shared_module = whole
         self._final_module = _variables(self._codegen._create_empty_module(self.name), environments)
@@ -74,10 +74,10 @@ def _variables(module: llvmlite.ir.Module, names: set[str]) -> llvm.ModuleRef:
 
 
 class EntryLibrary(JITCodeLibrary):
-    """The code of a kernel that Python calls, with its own copy of every kernel that it calls.
+    """Code of a kernel that Python calls. It contains its own copy of every kernel that it calls.
 
-    If entries shared copies, all entries would use the copies of the entry that is loaded first. These copies may
-    differ in the last bit, because they were optimised for that entry. Copies become internal before LLVM optimises, so
+    If entries shared copies, all entries would use the copies of the entry that is loaded first. These copies were
+    optimised for that entry, so their last bits may differ. The copies become internal before LLVM's optimisation, so
     that LLVM inlines kernels with one caller. Copies of `fast` kernels become internal only after the optimisation,
     because inlining may change the order of their sums.
     """
@@ -88,7 +88,7 @@ class EntryLibrary(JITCodeLibrary):
         self._keep(llvm.Linkage.linkonce_odr)
 
     def _keep(self, linkage: llvm.Linkage) -> None:
-        """Give internal linkage to the defined functions that have this linkage."""
+        """Change the linkage of all defined functions with the given linkage to internal."""
         for function in self._final_module.functions:
             if function.linkage == linkage and not function.is_declaration:
                 function.linkage = llvm.Linkage.internal
@@ -102,7 +102,7 @@ def _new_library(state: Any, kind: type[JITCodeLibrary]) -> JITCodeLibrary:
 
 @register_pass(mutates_CFG=True, analysis_only=False)
 class _LowerForLinking(NativeLowering):
-    """Numba's lowering, without an entry point for Python."""
+    """Numba's lowering without a wrapper for Python."""
 
     _name = "lower_for_linking"
 
@@ -112,7 +112,7 @@ class _LowerForLinking(NativeLowering):
         state.flags.no_compile = True
         super().run_pass(state)
         state.library.finalize()
-        # numba looks the function up by this object when it compiles callers; the object is never called
+        # numba finds the function by this object when it compiles callers; the object is never called
         entry_point = object()
         state.targetctx.insert_user_function(entry_point, state.cr.fndesc, [state.library])
         state["cr"] = state.cr._replace(cfunc=entry_point)
@@ -150,14 +150,14 @@ class EntryCompiler(_Compiler):
     lowering = _LowerForPython
 
     def compile_extra(self, func: Any) -> Any:
-        """Compile with garbage collection paused; it would take a seventh of the time and free little memory."""
+        """Compile without garbage collection, which would take a seventh of the time and free little memory."""
         with garbage_kept():
             return super().compile_extra(func)
 
 
 @contextmanager
 def garbage_kept() -> Iterator[None]:
-    """Pause Python's garbage collection."""
+    """Pause Python's garbage collection within the context."""
     paused = gc.isenabled()
     gc.disable()
     try:
@@ -168,7 +168,7 @@ def garbage_kept() -> Iterator[None]:
 
 
 def keep_from_python(dispatcher: Any) -> None:
-    """Make a call from Python raise an error, since there is no machine code to run."""
+    """Make calls from Python raise a `TypeError`, because the kernel has no machine code."""
 
     def refuse(*arguments: Any, **named: Any) -> None:
         raise TypeError(
@@ -179,10 +179,9 @@ def keep_from_python(dispatcher: Any) -> None:
 
 
 def for_any_value(dispatcher: Any) -> None:
-    """Compile a kernel for the types of its arguments alone.
+    """Make numba ignore the values of arguments, so that it compiles a kernel once for their types.
 
-    Numba would compile it once more for each constant that a caller passes, and for a variable that begins as a
-    constant, even where no call remains that uses this code.
+    By default, numba also compiles a kernel for each constant that a caller passes, even if this code is never called.
     """
     fold = dispatcher._compiler.fold_argument_types
 

@@ -1,8 +1,8 @@
-"""First root and maximum of a polynomial on an interval; its Bernstein form ensures that no root is missed.
+"""First root and maximum of a polynomial on an interval, by its Bernstein form, which ensures that no root is missed.
 
-A polynomial lies within the hull of its Bernstein coefficients, and has at most as many roots as these coefficients
-have sign changes. Both bounds become sharper when the interval is halved (Farouki, Comput. Aided Geom. Des. 29 (2012)
-379).
+The values of a polynomial lie between its smallest and its largest Bernstein coefficient. The number of sign changes of
+the coefficients is an upper bound of the number of roots. Both bounds become sharper when the interval is halved
+(Farouki, Comput. Aided Geom. Des. 29 (2012) 379).
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from plow_twin.kernel.simd import exact_row, set_row
 
 Array = NDArray[np.float64]
 
-#: Largest number of times that an interval is halved to isolate a root or a maximum.
+#: Largest number of halvings of an interval when a root or a maximum is isolated.
 MAX_HALVINGS: Final = 48
 
 
 @kernel()
 def to_bernstein(g: Array, n: int, h: float, inverse_binomial: Array, b: Array) -> None:
-    """Write the Bernstein coefficients of the polynomial g of degree n on [0, h] to b[0..n]."""
+    """Write the Bernstein coefficients on [0, h] of the polynomial g of degree n to b[0..n]."""
     power = 1.0
     for k in range(n + 1):
         b[k] = g[k] * power * inverse_binomial[k]
@@ -35,8 +35,8 @@ def to_bernstein(g: Array, n: int, h: float, inverse_binomial: Array, b: Array) 
 
 @kernel()
 def sum_to_bernstein(b: Array, n: int) -> None:
-    """Turn  g_k h^k / C(n, k)  in each of b's eight columns into the Bernstein coefficients of g on [0, h]."""
-    # two sweeps are made at once, which halves the number of stores
+    """Convert g_k h^k / C(n, k) in each of b's eight columns to the Bernstein coefficients of g on [0, h], in place."""
+    # the loop combines two sweeps, which halves the number of stores
     for r in range(1, n + 1, 2):
         before = exact_row(b, r)
         once = before + exact_row(b, r - 1)
@@ -50,7 +50,7 @@ def sum_to_bernstein(b: Array, n: int) -> None:
 
 @kernel(inline="code")
 def _halve(left: Array, right: Array, n: int) -> None:
-    """Halve an interval: `left` keeps the coefficients of its left half, `right` gets the right half's."""
+    """Halve an interval: write the left half's coefficients over those in `left`, and the right half's to `right`."""
     for r in range(n + 1):
         right[n - r] = left[n]
         for j in range(n, r, -1):
@@ -59,7 +59,7 @@ def _halve(left: Array, right: Array, n: int) -> None:
 
 @kernel(fast=True)
 def _crossing(g: Array, n: int, low: float, high: float, start: float) -> float:
-    """Return the only root in [low, high] by Halley's method kept within the bracket; g(low) >= 0 > g(high)."""
+    """Return the only root in [low, high], by Halley's method with bisection as fallback. g(low) >= 0 > g(high)."""
     x = min(max(start, low), high)
     for _ in range(80):
         value, slope, bend = g[n], 0.0, 0.0
@@ -77,7 +77,7 @@ def _crossing(g: Array, n: int, low: float, high: float, start: float) -> float:
         if not (low <= new <= high):
             new = 0.5 * (low + high)
         elif abs(change) <= 1e-6 * new and abs(bend * change) <= 1e-3 * abs(slope):
-            # Halley's method converges cubically, so the next change would be of the order of this change's cube
+            # Halley's method converges cubically, so the next change would be of the order of the cube of this change
             return new
         if abs(new - x) <= 2e-16 * high or high - low <= 2e-16 * high:
             return new
@@ -87,17 +87,17 @@ def _crossing(g: Array, n: int, low: float, high: float, start: float) -> float:
 
 @kernel()
 def first_root(g: Array, n: int, h: float, w) -> float:
-    """Return where g first becomes negative in [0, h), or infinity if it does not; g[0] must be >= 0."""
+    """Return the point in [0, h) where g first becomes negative, or inf without such a point. g[0] must be >= 0."""
     to_bernstein(g, n, h, w.binomial[n], w.halves[0])
     return first_root_within(g, n, h, w)
 
 
 @kernel()
 def first_root_within(g: Array, n: int, h: float, w) -> float:
-    """Return the root that `first_root` finds, from the Bernstein coefficients in `w.halves[0]`.
+    """Return the root of `first_root`, given the Bernstein coefficients in `w.halves[0]`.
 
-    An interval without a negative Bernstein coefficient has no root, and an interval with a single sign change has a
-    single root. Every other interval is halved, and its left half is searched first.
+    An interval without a negative Bernstein coefficient has no root. An interval with exactly one sign change has
+    exactly one root. Every other interval is halved, and its left half is searched first.
     """
     b, bounds = w.halves, w.bounds
     bounds[0, 0], bounds[0, 1] = 0.0, h
@@ -125,7 +125,7 @@ def first_root_within(g: Array, n: int, h: float, w) -> float:
             top -= 1
         else:
             middle = 0.5 * (low + high)
-            # push the left half above the right half, so that it is searched first
+            # push the left half on top of the right half, so that the left half is searched first
             for k in range(n + 1):
                 b[top + 1, k] = b[top, k]
             _halve(b[top + 1], b[top], n)
@@ -145,10 +145,10 @@ def _value(g: Array, n: int, x: float) -> float:
 
 @kernel()
 def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
-    """Return the larger of `floor` >= 0 and the maximum of g on [0, h], to a relative error of 1e-12.
+    """Return the larger of `floor` >= 0 and the maximum of g on [0, h], with a relative error of 1e-12.
 
-    If the Bernstein coefficients of g' change their sign at most once, a maximum between the ends is at the only root
-    of g'. Otherwise intervals are halved until the hull of g's own coefficients bounds the maximum (`_narrowed`).
+    If the Bernstein coefficients of g' change sign at most once, an interior maximum is the only root of g'. Otherwise
+    intervals are halved until the Bernstein coefficients of g bound the maximum tightly (`_narrowed`).
     """
     best, slope, b = max(floor, g[0], _value(g, n, h)), w.column[1], w.halves
     steepest, power = 0.0, 1.0
@@ -156,7 +156,7 @@ def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
         power *= h
         steepest += k * abs(g[k]) * power
     if abs(g[1]) >= steepest:
-        # g is monotonic on [0, h], so its maximum is at an end
+        # g is monotonic on [0, h], so its maximum is at an end of the interval
         return best
     for k in range(n):
         slope[k] = (k + 1) * g[k + 1]
@@ -175,7 +175,10 @@ def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
 
 @kernel()
 def _narrowed(g: Array, n: int, h: float, best: float, w) -> float:
-    """Return the larger of `best` and the maximum of g on [0, h]; intervals whose hull exceeds `best` are halved."""
+    """Return the larger of `best` and the maximum of g on [0, h].
+
+    Intervals whose largest Bernstein coefficient exceeds `best` are halved.
+    """
     b = w.halves
     to_bernstein(g, n, h, w.binomial[n], b[0])
     top = 0
@@ -196,7 +199,7 @@ def _narrowed(g: Array, n: int, h: float, best: float, w) -> float:
 
 @kernel()
 def shift_column(g: Array, lane: int, n: int, x: float, out: Array) -> None:
-    """Shift the polynomial in one column of g by x: write the coefficients of g(x + t) to that column of `out`."""
+    """Write the coefficients of g(x + t) to one column of `out`, where the same column of g contains a polynomial g."""
     for k in range(n + 1):
         out[k, lane] = g[k, lane]
     for r in range(n):

@@ -1,8 +1,8 @@
-"""A type for kernels that holds eight numbers as one SIMD vector.
+"""A type for kernels that represents eight numbers as one SIMD vector. A lane is one of the eight positions.
 
-The compiler does not always vectorise a loop over eight columns. With this type `row`, `set_row`, `splat` and `total`
+The compiler does not always vectorise a loop over eight columns. With this type, `row`, `set_row`, `splat` and `total`
 are single operations, and + - * / act on all eight numbers. If the processor's vectors are shorter, the compiler splits
-them.
+each operation.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 _WIDTH = 8
 _VECTOR = ir.VectorType(ir.DoubleType(), _WIDTH)
 _BITS = ir.VectorType(ir.IntType(64), _WIDTH)
-#: Flags that let sums be fused and reordered, as `kernel(fast=True)` does.
+#: Flags that allow LLVM to fuse and reorder sums, the same as for `kernel(fast=True)`.
 _FLAGS = ("contract", "reassoc", "nsz", "arcp")
 
 
 def _operation(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Make an operation for kernels from a function that emits its code; kernels omit the first parameter."""
+    """Return an operation for kernels from a function that emits its code. Calls omit the parameter `typingctx`."""
     operation: Callable[..., Any] = intrinsic(function)
     return operation
 
 
 class Lanes(types.Type):
-    """Numba's type of eight float64."""
+    """Numba type of eight float64 numbers."""
 
-    #: LLVM's flags for the changes that it may make to sums
+    #: LLVM flags that allow changes of the order and rounding of sums
     flags: tuple[str, ...] = _FLAGS
 
     def __init__(self, name: str = "Lanes") -> None:
@@ -40,7 +40,7 @@ class Lanes(types.Type):
 
 
 class ExactLanes(Lanes):
-    """Eight float64 whose operations are rounded as written, so that the bits do not depend on the code around them."""
+    """Eight float64 numbers whose operations are rounded as written. The bits do not depend on the surrounding code."""
 
     flags = ()
 
@@ -73,21 +73,21 @@ def _load(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 
 @_operation
 def row(typingctx: Any, array: Any, index: Any) -> Any:
-    """Return row `index` of a contiguous array of shape (n, 8), or all of an array of shape (8,)."""
+    """Return row `index` of a contiguous array of shape (n, 8), or the whole array if its shape is (8,)."""
     return lanes(array, index), _load
 
 
 @_operation
 def exact_row(typingctx: Any, array: Any, index: Any) -> Any:
-    """Return the result of `row` as `ExactLanes`."""
+    """Return the same numbers as `row`, with the type `ExactLanes`."""
     return exact_lanes(array, index), _load
 
 
 @_operation
 def gathered(typingctx: Any, array: Any, index: Any, places: Any) -> Any:
-    """Return eight numbers of a contiguous array of shape (n, 8).
+    """Return eight elements of a contiguous array of shape (n, 8).
 
-    The tuple `places` holds the offsets of the eight numbers, counted in numbers from the start of row `index`.
+    The tuple `places` contains the offsets of the eight elements from the start of row `index`, counted in elements.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -128,19 +128,19 @@ def _splat(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 
 @_operation
 def splat(typingctx: Any, value: Any) -> Any:
-    """Return a vector of eight equal numbers."""
+    """Return a vector with the same number in all lanes."""
     return lanes(value), _splat
 
 
 @_operation
 def exact_splat(typingctx: Any, value: Any) -> Any:
-    """Return the result of `splat` as `ExactLanes`."""
+    """Return the same vector as `splat`, with the type `ExactLanes`."""
     return exact_lanes(value), _splat
 
 
 @_operation
 def pack(typingctx: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
-    """Return eight numbers as one vector."""
+    """Return a vector of the eight numbers."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         vector = ir.Constant(_VECTOR, ir.Undefined)
@@ -153,7 +153,7 @@ def pack(typingctx: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any,
 
 
 def permutation(*places: int) -> Callable[..., Any]:
-    """Make an operation that permutes lanes: lane i of its result is lane places[i] of its argument."""
+    """Return an operation that permutes lanes. Lane i of its result is lane places[i] of its argument."""
 
     @_operation
     def permuted(typingctx: Any, value: Any) -> Any:
@@ -191,9 +191,9 @@ def total(typingctx: Any, value: Any) -> Any:
 
 @_operation
 def three_totals(typingctx: Any, first: Any, second: Any, third: Any) -> Any:
-    """Return a vector with the lane sums of three vectors in lanes 2, 3 and 4, and 0 in the other lanes.
+    """Return a vector that contains the sums of three vectors in lanes 2, 3 and 4, and 0 in the other lanes.
 
-    The three sums share vector additions, which is faster than three calls of `total`.
+    The three sums share vector additions, so this operation is faster than three calls of `total`.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -221,7 +221,7 @@ def three_totals(typingctx: Any, first: Any, second: Any, third: Any) -> Any:
 
 @_operation
 def below(typingctx: Any, left: Any, right: Any) -> Any:
-    """Return an integer whose bit i is set if left < right in lane i; NaN sets no bit."""
+    """Return an integer whose bit i is set if left < right in lane i. A NaN in lane i leaves bit i unset."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         found = builder.fcmp_ordered("<", *arguments)
@@ -232,7 +232,7 @@ def below(typingctx: Any, left: Any, right: Any) -> Any:
 
 @_operation
 def equal(typingctx: Any, array: Any, index: Any, number: Any) -> Any:
-    """Return an integer whose bit i is set if lane i of row `index` of a contiguous int64 array is `number`."""
+    """Return an integer whose bit i is set if element i of row `index` of a contiguous int64 array equals `number`."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place, sought = (context.cast(builder, arguments[i], signature.args[i], types.int64) for i in (1, 2))
@@ -247,7 +247,7 @@ def equal(typingctx: Any, array: Any, index: Any, number: Any) -> Any:
 
 @_operation
 def transpose(typingctx: Any, target: Any, source: Any) -> Any:
-    """Write the transpose of a contiguous array of shape (8, 8) to another such array."""
+    """Write the transpose of a contiguous array of shape (8, 8) to a different contiguous array of this shape."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         def place(i: int, row_index: int) -> Any:
@@ -257,7 +257,7 @@ def transpose(typingctx: Any, target: Any, source: Any) -> Any:
         rows = [builder.load(place(1, i), align=8) for i in range(_WIDTH)]
         distance = 1
         while distance < _WIDTH:
-            # exchange the blocks beside the diagonal of each block of twice the distance
+            # in each block of size 2 * distance, exchange the two off-diagonal blocks of size distance
             low = [i if i & distance == 0 else _WIDTH + i - distance for i in range(_WIDTH)]
             high = [i + distance if i & distance == 0 else _WIDTH + i for i in range(_WIDTH)]
             for i in range(_WIDTH):
@@ -276,7 +276,7 @@ def transpose(typingctx: Any, target: Any, source: Any) -> Any:
 
 @_operation
 def choose(typingctx: Any, bits: Any, there: Any, elsewhere: Any) -> Any:
-    """Return lane i of `there` if bit i of `bits` is set, otherwise lane i of `elsewhere`."""
+    """Return a vector with lane i of `there` if bit i of `bits` is set, and lane i of `elsewhere` if not."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         number = context.cast(builder, arguments[0], signature.args[0], types.int64)
@@ -288,7 +288,7 @@ def choose(typingctx: Any, bits: Any, there: Any, elsewhere: Any) -> Any:
 
 @_operation
 def lowest_bit(typingctx: Any, bits: Any) -> Any:
-    """Return the index of the lowest set bit; `bits` must not be zero."""
+    """Return the index of the lowest set bit. `bits` must not be zero."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
@@ -297,14 +297,14 @@ def lowest_bit(typingctx: Any, bits: Any) -> Any:
 
 
 def _called(builder: Any, name: str, arguments: Any) -> Any:
-    """Emit a call of an LLVM function whose arguments are vectors."""
+    """Emit a call of an LLVM function that takes and returns vectors."""
     kind = ir.FunctionType(_VECTOR, [_VECTOR] * len(arguments))
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v8f64"), arguments)
 
 
 @_operation
 def fused(typingctx: Any, factor: Any, other: Any, term: Any) -> Any:
-    """Return factor * other + term of each lane, rounded once if the processor has fused operations."""
+    """Return factor * other + term for each lane. It is rounded once if the processor has fused operations."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return _called(builder, "fmuladd", arguments)
@@ -338,7 +338,7 @@ def _each(number: int) -> Any:
 
 @_operation
 def exponent_of(typingctx: Any, value: Any) -> Any:
-    """Return the binary exponent of each lane's positive number, an integer as float64; 1024 for infinity."""
+    """Return the binary exponent of the positive number in each lane, as float64. The exponent of inf is 1024."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         bits = builder.lshr(builder.bitcast(arguments[0], _BITS), _each(52))
@@ -349,7 +349,7 @@ def exponent_of(typingctx: Any, value: Any) -> Any:
 
 @_operation
 def significand_of(typingctx: Any, value: Any) -> Any:
-    """Return each lane's positive number divided by 2 to the power of its `exponent_of`, from 1 to below 2."""
+    """Return the significand in [1, 2) of the positive number in each lane: the number over 2^`exponent_of`."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         bits = builder.and_(builder.bitcast(arguments[0], _BITS), _each(2**52 - 1))
@@ -360,7 +360,7 @@ def significand_of(typingctx: Any, value: Any) -> Any:
 
 @_operation
 def power_of_two(typingctx: Any, exponent: Any) -> Any:
-    """Return 2 to the power of each lane's integer from -1022 to 1023, given as float64."""
+    """Return 2 to the power of the integer in each lane. The integers are float64, from -1022 to 1023."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         number = builder.add(builder.fptosi(arguments[0], _BITS), _each(1023))
@@ -374,7 +374,7 @@ def _elementwise(operation: Callable[..., Any], emit: str) -> None:
 
     @infer_global(operation)
     class _Typing(AbstractTemplate):
-        # numba tries templates of the processor before its general templates, of which an operator has twenty
+        # numba tries templates of the processor first; its list of general templates of an operator has twenty entries
         metadata = {"target": "cpu"}  # noqa: RUF012
 
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
