@@ -1,1 +1,1 @@
-"""Runs written to MCAP files and read back: messages, recorder, reader and replay."""
+"""Write runs to MCAP files, read them back, and replay them."""

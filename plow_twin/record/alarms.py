@@ -1,4 +1,4 @@
-"""The alarms of a run: configured by its parameters, written as messages, and computed again by a replay."""
+"""Configure the alarms of a run, write them as messages, and compute them again in a replay."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from plow_twin.stream.journal import Parameter, Pose
 from plow_twin.stream.outputs import Published
 
 ALARMS: Final = "alarms"
-#: Parameter by which the journal records an acknowledgement.
+#: Name of the parameter whose entry in the journal means that an operator acknowledged the alarms.
 ACKNOWLEDGED: Final = "alarms_acknowledged"
-#: For each quantity, the factor from SI and the unit in an alarm's text.
+#: Unit in which an alarm's text gives each quantity, with the factor from SI to this unit.
 _UNITS: Final = {
     "force": (1e-3, "kN"),
     "clearance": (1e3, "mm"),
@@ -32,12 +32,12 @@ _UNITS: Final = {
 }
 _NAMES: Final = ("force", "clearance", "clearance_rate", "wear_rate")
 
-#: A difference of two messages: step, stamp [ns], topic, field, recorded value, computed value.
+#: A field whose recorded and computed values differ: step, stamp [ns], topic, field, recorded value, computed value.
 Difference = tuple[int, int, str, str, str, str]
 
 
 def alarms_of(parameters: Mapping[str, Any]) -> Alarms:
-    """Return the alarms that the node's parameters configure, before any of them is raised."""
+    """Return new alarms with the thresholds and the duration from the node's parameters."""
     thresholds = {name: Thresholds(*parameters.get(f"alarm_{name}", ())) for name in _NAMES}
     residual = parameters.get("alarm_residual", ())
     if any(residual):
@@ -46,7 +46,7 @@ def alarms_of(parameters: Mapping[str, Any]) -> Alarms:
 
 
 def alarms_message(alarms: Alarms, node: str, hardware_id: str) -> DiagnosticStatus:
-    """Return the message with the level of each alarm and the cause of each latched alarm."""
+    """Return the status message that gives the level of each alarm and the cause of each latched alarm."""
     values: dict[str, str] = {}
     for name, alarm in alarms.alarms.items():
         raised = alarm.raised
@@ -64,9 +64,9 @@ def alarms_message(alarms: Alarms, node: str, hardware_id: str) -> DiagnosticSta
 
 
 def alarm_texts(values: Mapping[str, str], *, own_start: bool = False, newest: bool = False) -> list[str]:
-    """Return a sentence for each latched alarm in the `values` of `alarms_message`.
+    """Return a sentence for each latched alarm in the key-value pairs `values` of an alarms message.
 
-    `newest` adds the present value. `own_start` is passed to `time_text`.
+    The argument `newest` adds the present value to each sentence, and `own_start` is passed to `time_text`.
     """
     found = []
     for name, (factor, unit) in _UNITS.items():
@@ -85,10 +85,10 @@ def alarm_texts(values: Mapping[str, str], *, own_start: bool = False, newest: b
 
 
 class AlarmCheck:
-    """Compute the alarms of a run again, and compare each of their messages with the recorded message.
+    """Compute the alarms of a run again, and compare each computed message with the recorded message.
 
-    Alarms depend on every publication since the start of the run, so they cannot be compared after a missing
-    publication.
+    An alarm depends on every publication since the start of the run. After a missing publication, alarms can therefore
+    not be compared.
     """
 
     def __init__(self, header: RunHeader, possible: bool) -> None:
@@ -97,18 +97,18 @@ class AlarmCheck:
         self._computed: deque[tuple[int, int, DiagnosticStatus]] = deque()
         self._recorded: deque[OutputRecord] = deque()
         self.possible = possible
-        #: numbers of recorded messages that were compared, and that could not be compared
+        #: number of recorded messages that were compared, and number of messages that could not be compared
         self.compared = self.not_compared = 0
 
     def give_up(self) -> None:
-        """Stop comparing, because a publication or an entry of the journal is missing."""
+        """Stop the comparison, because a publication or a journal entry is missing."""
         self.possible = False
         self.not_compared += len(self._recorded)
         self._recorded.clear()
         self._computed.clear()
 
     def pose(self, sequence: int, step: int, pose: Pose) -> None:
-        """Update the alarms with a measured pose of the journal."""
+        """Update the alarms with a measured pose from the journal."""
         if self.possible and self._alarms.feed_pose(pose.stamp_ns, pose.pose):
             self._say(sequence, step)
 
@@ -125,10 +125,10 @@ class AlarmCheck:
         published: Published,
         poses: Sequence[tuple[int, int, Pose]] = (),
     ) -> None:
-        """Update the alarms with publications and with the poses between them.
+        """Update the alarms with publications and with the measured poses between the publications.
 
-        `sequence` and `step`, shape (n,), give the journal entry and the step of each publication; each pose comes with
-        its own entry and step.
+        `sequence` and `step`, shape (n,), are the number of the journal entry and the step number of each publication.
+        The same two numbers precede each pose in `poses`.
         """
         if not self.possible:
             return
@@ -145,7 +145,7 @@ class AlarmCheck:
 
     def _take(self, sequence: NDArray[np.int64], step: NDArray[np.int64], published: Published) -> None:
         if len(published.rows) == 1 and not published.finite:
-            return  # a publication that is not finite is not sent
+            return  # the twin does not send a publication that contains NaN or infinity
         for index in self._alarms.feed(published):
             self._say(int(sequence[index]), int(step[index]))
 
@@ -159,7 +159,8 @@ class AlarmCheck:
     def differences(self) -> Iterator[Difference]:
         """Yield the differences between recorded and computed messages.
 
-        A message without a counterpart waits, because the journal may still say that the counterpart was lost.
+        A recorded message stays in the queue until its computed message exists, and the reverse. A later journal entry
+        may report that one of the two messages was lost.
         """
         while self._recorded and self._computed:
             record, (sequence, step, computed) = self._recorded.popleft(), self._computed.popleft()
@@ -173,8 +174,9 @@ class AlarmCheck:
             yield step, record.publish_time_ns, ALARMS, *difference
 
     def left_over(self, step: int) -> Iterator[Difference]:
-        """Yield the messages that have no counterpart at the end of a complete recording; `step` is the last
-        advance.
+        """Yield the messages that still have no counterpart at the end of a complete recording.
+
+        A recorded message without a computed message gets the step number `step` of the last advance.
         """
         for record in self._recorded:
             self.compared += 1

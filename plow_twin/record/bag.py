@@ -1,4 +1,4 @@
-"""A recording of arbitrary topics beside a run: messages as bytes in an MCAP file."""
+"""Write messages of arbitrary topics, as bytes, to an MCAP file in a folder of a run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,11 @@ _MIN_FREE_BYTES: Final = 64 * 1024 * 1024
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic: its name, type, the `ros2msg` text of the type, its REP-2016 hash and the offered QoS as YAML."""
+    """A topic with its message type.
+
+    `schema` is the `ros2msg` text of the type, `type_hash` is the REP-2016 hash of the type, and `qos` is the offered
+    QoS in YAML.
+    """
 
     name: str
     message_type: str
@@ -30,10 +34,11 @@ class Topic:
 
 
 class BagWriter:
-    """Write messages to a new folder; `lost` counts by topic the messages for which the disk had no room.
+    """Write messages to an MCAP file in a new folder.
 
-    A killed process loses the messages since the last `flush`. `on_trouble` receives a text when the disk is full, and
-    another when it has room again.
+    If the process is killed, the messages since the last `flush` are lost. `lost` counts, for each topic, the messages
+    that did not fit on the disk. `on_trouble` receives a text when the disk becomes full, and a text when writing
+    succeeds again.
 
     Raises
     ------
@@ -70,7 +75,7 @@ class BagWriter:
             self.flush()
 
     def flush(self) -> None:
-        """Pass the waiting messages to the operating system; if the disk is full, count them as lost."""
+        """Write the buffered messages to the file; if the disk is full, count the messages as lost."""
         waiting, self._waiting = self._waiting, Counter()
         try:
             short = shortage(self.folder, _MIN_FREE_BYTES) if waiting else None
@@ -91,12 +96,12 @@ class BagWriter:
             self.written.update(waiting)
 
     def close(self) -> None:
-        """Write index and `metadata.yaml`.
+        """Write the index of the file, close the file, and write `metadata.yaml`.
 
         Raises
         ------
         OSError
-            The disk is full; the file is left without an index.
+            The disk is full. The file stays without an index.
         """
         self.flush()
         self._file.finish()
@@ -109,17 +114,20 @@ class BagWriter:
 
 
 def beside_folders(run: Path) -> Sequence[Path]:
-    """Return the folders of other topics in a run's folder."""
+    """Return the subfolders of a run with the recordings of other topics."""
     return sorted(path for path in run.glob(f"{BESIDE}*") if path.is_dir() and any(path.glob("*.mcap")))
 
 
 def readable_beside(run: Path, lost: Counter[str]) -> list[Path]:
-    """Return the folders of `beside_folders` that can be read; `lost` receives all other losses."""
+    """Return the folders of `beside_folders` that contain a readable MCAP file.
+
+    `lost` receives the losses that the recorder counted, and the number of files in folders that cannot be read.
+    """
     found = []
     for folder in beside_folders(run):
         lost.update(recorded_losses(folder))
         parts = [*folder.glob("*.mcap")]
-        # the reader of the folder counts its unreadable files
+        # if a folder can be read in part, its reader counts the unreadable files
         if any(map(is_mcap, parts)):
             found.append(folder)
         else:

@@ -1,6 +1,6 @@
-"""Conversion of plain messages to CDR bytes and back by the type store of rosbags, without a ROS installation.
+"""Encode messages as CDR bytes and decode them with the type store of rosbags, without a ROS installation.
 
-Padding bytes are zero, so equal messages have equal bytes.
+Padding bytes are always zero, so that equal messages have equal bytes.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _TEXT_AT = 8
 
 @cache
 def typestore() -> Typestore:
-    """Return the message types of ROS 2 Jazzy."""
+    """Return the rosbags type store with the message types of ROS 2 Jazzy."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY)
@@ -42,7 +42,7 @@ def typestore() -> Typestore:
 
 @cache
 def schema_text(message_type: str) -> str:
-    """Return the `ros2msg` schema of a message type, with the types that it uses."""
+    """Return the `ros2msg` schema of a message type, including the types of its fields."""
     text, _ = typestore().generate_msgdef(message_type, ros_version=2)
     return text
 
@@ -54,7 +54,7 @@ def type_hash(message_type: str) -> str:
 
 
 def warm_up() -> None:
-    """Make the schemas, hashes and encoders, which takes 0.1 s, before the first message."""
+    """Fill the caches of schemas, type hashes and encoders, so that the first message is not 0.1 s late."""
     for message_type in MESSAGE_TYPES:
         schema_text(message_type)
         type_hash(message_type)
@@ -70,12 +70,12 @@ def encode(message: Message) -> bytes:
 
 
 def decode(data: bytes, message_type: str) -> Message:
-    """Return the message in CDR bytes.
+    """Return the message that is encoded in CDR bytes.
 
     Raises
     ------
     RecordingError
-        The type is unknown, or the bytes are not a message of this type.
+        The message type is unknown, or the bytes are not a message of the type.
     """
     kind = MESSAGE_TYPES.get(message_type)
     if kind is None:
@@ -84,7 +84,7 @@ def decode(data: bytes, message_type: str) -> Message:
         return _decode_short_text(data)
     try:
         return _DECODERS[kind](typestore().deserialize_cdr(data, message_type))
-    except Exception as error:  # rosbags does not catch index, struct and assertion errors
+    except Exception as error:  # rosbags lets index, struct and assertion errors of damaged bytes escape
         raise RecordingError(f"{message_type}: got {len(data)} bytes, expected one message ({error!r})") from error
 
 
@@ -180,7 +180,7 @@ def _decode_integers(wire: Any) -> Integers:
 
 
 def _decode_short_text(data: bytes) -> Text:
-    """Decode a string message without rosbags, because the journal has many strings."""
+    """Decode a string message without rosbags, which is too slow for the many strings of a journal."""
     (length,) = struct.unpack_from("<I", data, 4) if len(data) >= _TEXT_AT else (0,)
     if data[:2] != b"\x00\x01" or not 0 < length <= len(data) - _TEXT_AT:
         raise RecordingError(f"{Text.TYPE}: got {len(data)} bytes, expected one message")
@@ -191,7 +191,7 @@ def _decode_short_text(data: bytes) -> Text:
 
 
 def _encode_short_text(message: Text) -> bytes:
-    """Encode a string message without rosbags, because a live journal has several strings each second."""
+    """Encode a string message without rosbags, which is too slow for the strings of a live journal."""
     text = message.data.encode()
     return b"\x00\x01\x00\x00" + struct.pack("<I", len(text) + 1) + text + b"\x00"
 

@@ -1,10 +1,10 @@
-"""Reading of MCAP files from front to back, chunk by chunk.
+"""Read MCAP files from front to back, chunk by chunk, without the index at the end of the file.
 
-Messages are arrays of offsets instead of objects. No index is needed: a truncated file is read up to its last whole
-record, and damaged chunks are skipped and counted.
+A truncated file is read up to its last whole record. Damaged chunks are skipped and counted. For speed, the messages of
+a chunk are stored as arrays of offsets into its bytes.
 
-A *head* is the opcode and the length at the start of a record. A *channel mask* has a bit for each channel of a chunk,
-so that a chunk can be skipped before it is read.
+A *head* is the opcode and the length at the start of a record. A *channel mask* has a bit for each channel of a chunk.
+The mask is known before the chunk is read, so that a chunk without wanted channels can be skipped.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from plow_twin.record.compression import RECORD_LIMIT, decompress
 from plow_twin.record.template import Bytes, Indexes, compiled
 from plow_twin.record.words import word
 
-try:  # the crc32 of isal is twenty times as fast as that of the standard library
+try:  # the function `crc32` of isal is twenty times as fast as the function of the standard library
     from isal.isal_zlib import crc32 as crc32
 except ImportError:
     from zlib import crc32 as crc32
 
-#: Name of the metadata record that a repair writes in place of a damaged chunk.
+#: Name of the metadata record that replaces a damaged chunk in a repaired file.
 DAMAGE_RECORD: Final = "plow_twin_damage"
 MAGIC: Final = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _METADATA = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x0C
@@ -38,31 +38,32 @@ _ATTACHMENT: Final = 0x09
 _TABLES: Final = (".csv", ".parquet")
 _HEAD: Final = struct.Struct("<BQ")
 _HEAD_SIZE: Final = _HEAD.size
-#: Size of a record's head and of the channel number at the start of an index record [B].
+#: Size [B] of the start of an index record: a head and a channel number of two bytes.
 _INDEX_HEAD: Final = _HEAD.size + 2
-#: Largest unpacked size of a file's chunks, as a multiple of the file's size; `RECORD_LIMIT` is allowed in addition.
+#: Limit on the decompressed size of all chunks of a file, as a multiple of the file's size. `RECORD_LIMIT` is added, so
+#: that the limit admits small files.
 UNPACKED_RATIO: Final = 200
-#: Largest number of schemas and channels in a file.
+#: Largest number of schemas and channels that a file may declare.
 _MOST_DECLARED: Final = 10_000
-#: Number of channels that have a bit in a channel mask; the mask of a chunk with another channel is -1.
+#: Number of bits in a channel mask. A chunk with a channel number of 63 or more has the mask -1.
 _CHANNEL_BITS: Final = 63
 _AHEAD: Final = 64
-#: Compiled code calls `pread`, because a recording has many record heads.
+#: The function `pread` of the C library. Compiled code calls it, because a call from Python for each head is slow.
 _pread: Final[Any] = types.ExternalFunction("pread", types.intp(types.int32, types.uintp, types.uintp, types.int64))
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
-#: Bytes of a message record before its data: opcode, length, channel, sequence, log time, publish time.
+#: Number of bytes before the data of a message: opcode, length, channel, sequence, log time and publish time.
 MESSAGE_HEAD: Final = 31
 _MESSAGE_FIELDS: Final = MESSAGE_HEAD - _HEAD_SIZE
 _COLUMNS: Final = 6
-#: Chunks below this size [B] are scanned together.
+#: Size [B] up to which several chunks are scanned in one call.
 _SMALL: Final = 2**18
-#: With `wanted`, chunks below this size are scanned together: large chunks between small ones may be skipped.
+#: The same size if `wanted` is given. The large chunks are then often skipped, and many small chunks remain.
 _SMALL_ALONE: Final = 2**20
 
 
 @dataclass(frozen=True)
 class Channel:
-    """A topic of a file: its type, encoding and the schema's text."""
+    """A channel of an MCAP file: its topic, with the message type, the encoding and the text of the schema."""
 
     topic: str
     message_type: str
@@ -73,7 +74,10 @@ class Channel:
 
 @dataclass(frozen=True)
 class Messages:
-    """Messages of one chunk in the file's order; each array has shape (n,), and `start` are offsets in `buffer`."""
+    """Messages of one chunk in the order of the file, as arrays of shape (n,).
+
+    The data of message `i` is `buffer[start[i] : start[i] + length[i]]`.
+    """
 
     buffer: Bytes
     channel: Indexes
@@ -87,17 +91,17 @@ class Messages:
         return len(self.channel)
 
     def __getitem__(self, chosen: Any) -> Messages:
-        """Return some of the messages, by a mask, a slice or indexes."""
+        """Return the messages that a mask, a slice or an array of indexes selects."""
         columns = (self.channel, self.sequence, self.log_time_ns, self.publish_time_ns, self.start, self.length)
         return Messages(self.buffer, *(column[chosen] for column in columns))
 
     @classmethod
     def none(cls) -> Messages:
-        """Return no messages."""
+        """Return an empty batch."""
         return cls(np.zeros(0, np.uint8), *(np.zeros(0, np.int64) for _ in range(6)))
 
     def data(self, index: int) -> bytes:
-        """Return the bytes of one message."""
+        """Return the data of the message with this index."""
         start = int(self.start[index])
         return self.buffer[start : start + int(self.length[index])].tobytes()
 
@@ -106,8 +110,9 @@ class Messages:
 class ChunkReader:
     """Iterate over the chunks of one MCAP file.
 
-    `channels` grows while the file is read. At the end, `finished` says whether the file is complete, `damaged` counts
-    the chunks that could not be read, and `left_out` those of them that a repair has left out.
+    The reader adds each declared channel to `channels`. At the end, `finished` is True if the file is complete.
+    `damaged` is the number of records and chunks that could not be read. `left_out` is the number of damaged chunks
+    that an earlier repair removed; `damaged` includes this number.
 
     Parameters
     ----------
@@ -116,10 +121,11 @@ class ChunkReader:
     on_metadata
         Function that receives each metadata record.
     wanted
-        Function that receives the channel numbers of each chunk with a readable index; False: the chunk is not read.
+        Function that receives the set of channel numbers of a chunk. If it returns False, the chunk is skipped. A chunk
+        without a usable index is always read.
     more
-        Function for a file that is still being written. It receives the stream and the known size at the end of the
-        file, after an empty batch has been yielded, and returns True when the file has grown.
+        Function that waits for a file to grow. At the end of the file, the reader yields an empty batch and calls
+        `more` with the stream and the size of the file [B]. If `more` returns True, the reader continues.
     """
 
     path: Path
@@ -131,13 +137,13 @@ class ChunkReader:
     damaged: int = 0
     left_out: int = 0
     position: int = 0
-    #: result of `wanted` by channel mask
+    #: result of `wanted` for each channel mask
     _answers: dict[int, bool] = field(default_factory=dict, init=False)
-    #: number of rows for the next table of messages
+    #: number of messages for which the next table has space
     _room: int = field(default=256, init=False)
-    #: unpacked size of the chunks so far [B]
+    #: decompressed size of all chunks read so far [B]
     _unpacked: int = field(default=0, init=False)
-    #: schema and channel records by opcode and number; a chunk may repeat them
+    #: declared schemas and channels by opcode and number, in order to skip repeated declarations
     _declared: dict[tuple[int, bytes], bytes] = field(default_factory=dict, init=False)
     _others: Indexes = field(default_factory=lambda: np.empty(256, np.int64), init=False)
 
@@ -156,7 +162,7 @@ class ChunkReader:
                 begin = place + _HEAD_SIZE
                 if length > RECORD_LIMIT and opcode != _ATTACHMENT:
                     break
-                # a footer counts only together with the magic after it
+                # a footer is complete only if the magic bytes follow it
                 behind = len(MAGIC) if opcode == _FOOTER else 0
                 if begin + length + behind > size:
                     if self.more is None:
@@ -188,7 +194,7 @@ class ChunkReader:
                 elif opcode in (_SCHEMA, _CHANNEL):
                     self._declare(opcode, os.pread(descriptor, length, begin), schemas)
                 elif opcode == _METADATA:
-                    # the messages before a note of damage are passed on first, so that the note keeps its place
+                    # messages before a note of damage are yielded before `damaged` is increased
                     yield from self._scan(waiting.pop_all(), schemas)
                     self._metadata(os.pread(descriptor, length, begin))
                 elif opcode == _FOOTER:
@@ -197,7 +203,7 @@ class ChunkReader:
             yield from self._scan(waiting.pop_all(), schemas)
 
     def _is_wanted(self, channels: int) -> bool:
-        """Return whether the chunk with a channel mask is wanted; a chunk without an index is always wanted."""
+        """Return whether a chunk with the channel mask `channels` must be read."""
         if self.wanted is None or channels <= 0:
             return True
         if channels not in self._answers:
@@ -208,7 +214,7 @@ class ChunkReader:
         return self._answers[channels]
 
     def _open(self, record: bytes) -> Bytes | None:
-        """Return the content of a chunk, or None for a damaged chunk."""
+        """Return the decompressed content of a chunk, or None if the chunk is damaged."""
         try:
             _, _, size, crc, letters = _CHUNK_HEAD.unpack_from(record)
             place = _CHUNK_HEAD.size + letters
@@ -218,14 +224,14 @@ class ChunkReader:
             if len(data) != length or size > RECORD_LIMIT:
                 return None
             content = decompress(compression, data, size)
-        except Exception:  # each decompressor raises its own errors for damaged data
+        except Exception:  # the type of the error depends on the decompressor
             return None
         if len(content) != size or (crc and crc32(content) != crc):
             return None
         return np.frombuffer(content, np.uint8)
 
     def _count_unpacked(self, count: int, size: int) -> None:
-        """Add `count` to the unpacked size of the chunks; `size` is the size of the file [B]."""
+        """Add `count` [B] to the decompressed size, and check the sum against the size of the file, `size` [B]."""
         self._unpacked += count
         most = RECORD_LIMIT + UNPACKED_RATIO * size
         if self._unpacked > most:
@@ -234,7 +240,7 @@ class ChunkReader:
             )
 
     def _scan(self, contents: list[Bytes], schemas: dict[int, tuple[str, bytes]]) -> Iterator[Messages]:
-        """Yield the messages of several chunks as one batch, or as a batch for each chunk if one is damaged."""
+        """Yield the messages of several chunks as one batch; if a chunk is damaged, yield a batch for each chunk."""
         if not contents:
             return
         content = contents[0] if len(contents) == 1 else np.concatenate(contents)
@@ -294,7 +300,7 @@ class ChunkReader:
         self.on_metadata(metadata.name, dict(metadata.metadata))
 
     def _note_damage(self, schemas: dict[int, tuple[str, bytes]]) -> None:
-        """Count a damaged chunk; read the channels that it may have declared from the index at the file's end."""
+        """Count a damaged chunk, and read the channels that the chunk may have declared from the end of the file."""
         from mcap.reader import make_reader
 
         self.damaged += 1
@@ -315,7 +321,7 @@ class ChunkReader:
 
 
 class _Waiting:
-    """Chunks and single messages that wait to be scanned together, because each scan has a fixed cost."""
+    """Chunks and single messages to scan in one call, because each call of `scan` has a fixed cost."""
 
     def __init__(self) -> None:
         self._contents: list[Bytes] = []
@@ -331,7 +337,10 @@ class _Waiting:
 
 
 def is_mcap(path: Path) -> bool | None:
-    """Return whether a file begins as an MCAP file does; None if its writer was killed while it wrote these bytes."""
+    """Return True if a file begins with the magic bytes of MCAP.
+
+    None means that the file ends within the magic bytes: its writer was killed early.
+    """
     try:
         with path.open("rb") as stream:
             head = stream.read(len(MAGIC))
@@ -341,13 +350,13 @@ def is_mcap(path: Path) -> bool | None:
 
 
 def metadata_records(path: Path) -> list[tuple[str, dict[str, str]]]:
-    """Return the name and content of each metadata record of a file."""
+    """Return the name and the content of each metadata record in a file."""
     from mcap.reader import make_reader
 
     with open_mcap(path) as stream:
         try:
             return [(record.name, dict(record.metadata)) for record in make_reader(stream).iter_metadata()]
-        except Exception:  # the file has no index at its end, or a damaged index
+        except Exception:  # the index at the end of the file is missing or damaged
             pass
     found: list[tuple[str, dict[str, str]]] = []
     for _ in ChunkReader(path, lambda name, record: found.append((name, record)), lambda numbers: False):
@@ -356,22 +365,22 @@ def metadata_records(path: Path) -> list[tuple[str, dict[str, str]]]:
 
 
 class _Heads:
-    """The heads of the records of a file, read many at a time."""
+    """Reader of record heads, which reads many heads in one compiled call."""
 
     def __init__(self, descriptor: int, size: int) -> None:
         self._descriptor, self._size = descriptor, size
         self._table = np.empty((_AHEAD, 5), np.int64)
         self._rows: list[tuple[int, int, int, int, int]] = []
         self._next = 0
-        self._index = [0, 0]  # end of the newest record with its index, and the channel mask of this index
+        self._index = [0, 0]  # end of the last record, including its index records, and its channel mask
 
     def at(self, place: int) -> tuple[int, int]:
-        """Return opcode and length of the record at a place; zeros at the end."""
+        """Return the opcode and the length of the record at offset `place`, or zeros at the end of the file."""
         if self._next >= len(self._rows) or self._rows[self._next][0] != place:
             count = look_ahead(self._descriptor, self._size, place, self._table)
             self._rows, self._next = self._table[:count].tolist(), 0
             if not self._rows:
-                # raises the error if the file cannot be read
+                # if the file cannot be read, this call raises the error
                 os.pread(self._descriptor, 1, place)
                 return 0, 0
         _, opcode, length, *self._index = self._rows[self._next]
@@ -379,17 +388,17 @@ class _Heads:
         return opcode, length & (1 << 64) - 1
 
     def index(self) -> tuple[int, int]:
-        """Return the channel mask of the newest chunk and the offset at which its index records end."""
+        """Return the channel mask of the chunk from the last call of `at`, and the end of its index records [B]."""
         end, channels = self._index
         return channels, end
 
 
 @compiled
 def look_ahead(descriptor, size, place, table):  # type: ignore[no-untyped-def]
-    """Read the heads of the records from `place` on into the rows of `table`; return the number of rows.
+    """Read record heads, beginning at offset `place`, into the rows of `table`; return the number of rows.
 
-    The columns are place, opcode, length, end and channel mask. Index records have no rows of their own: the end and
-    the mask in the row of their chunk cover them.
+    The columns are offset, opcode, length, end and channel mask. An index record has no row: its channel is added to
+    the mask of the chunk before it, and the end of that chunk is moved behind the index record.
     """
     head, count = np.zeros(_INDEX_HEAD, np.uint8), 0
     while True:
@@ -416,11 +425,18 @@ def look_ahead(descriptor, size, place, table):  # type: ignore[no-untyped-def]
 
 @compiled
 def scan(content: Bytes, table: Indexes, others: Indexes) -> tuple[int, int, bool]:
-    """Find the messages, schemas and channels in the content of a chunk.
+    """Find the messages, schemas and channels in the decompressed content of a chunk.
 
-    The columns of `table` receive the messages, and `others` the places of schemas and channels. Returns the numbers of
-    both, and whether the records end with the chunk. If the table is too small, the number of messages is one more than
-    its rows.
+    Each message fills a column of `table`. The array `others` receives the offsets of schemas and channels.
+
+    Returns
+    -------
+    messages : int
+        Number of messages; the number of columns plus one if the table is too small.
+    others : int
+        Number of schemas and channels.
+    whole : bool
+        Whether the last record ends at the end of the chunk.
     """
     place, count, other = 0, 0, 0
     size, room = content.size, table.shape[1]

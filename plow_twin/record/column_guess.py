@@ -1,4 +1,4 @@
-"""Guess of the columns (load, pose, time) and units of an unknown CSV file, from names and magnitudes."""
+"""Guess the meaning and units of the columns in an unknown CSV file, from their names and magnitudes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from plow_twin.scene_file.csv_rows import csv_rows, delimiter_of, open_csv
 
 Array = NDArray[np.float64]
 
-#: Pattern of the column name of each quantity, by role and quantity; it is matched with the result of `_plain`.
+#: For each role and quantity, a pattern of column names. The pattern is matched with the result of `_plain`.
 _NAMES: Final = {
     ("excitation", "fx"): r"fx|(force|load|kraft|last)x|x(force|load|kraft)|fhor(izontal)?|horizontalforce",
     ("excitation", "fy"): r"fy|(force|load|kraft|last)y|y(force|load|kraft)|fver(tical)?|verticalforce",
@@ -37,11 +37,11 @@ _TIME: Final = r"t|time|timestamp|stamp|zeit|zeitstempel|date|datetime|datum"
 _UNIT: Final = re.compile(
     r"(.+?)\s*(?:[\[(]\s*([^\])]+?)\s*[\])]|[ _](kN ?m|N ?m|kN|N|mm|cm|m|mrad|rad|deg|ms|us|ns|s))"
 )
-#: A time above one of these limits counts from 1970 in the unit before the limit. Each limit is a date in 2001.
+#: Lower limits of a time that counts from 1970, for each unit of time. Each limit is the same date in 2001.
 _DATES: Final = (("ns", 1e18), ("us", 1e15), ("ms", 1e12), ("s", 1e9))
-#: Largest number of cells that are examined: the wider a file, the fewer of its rows are examined.
+#: Largest number of cells that are examined. In a file with many columns, fewer rows are therefore examined.
 _MOST_CELLS: Final = 2_000_000
-#: The components of a load; each needs a column.
+#: The components of the load. A file without a column for each component cannot be used.
 _NEEDED: Final = tuple(("excitation", name) for name in ROLES["excitation"])
 
 
@@ -49,9 +49,18 @@ _NEEDED: Final = tuple(("excitation", name) for name in ROLES["excitation"])
 class Guess:
     """The guessed meaning of a file's columns.
 
-    `columns` maps role and name of a quantity to a column, and `units` maps the name of each quantity that is not in SI
-    to its unit. `time` is the time column and `time_unit` its unit, empty for dates as text. `because` says how each
-    column was found. `open` maps each undecided quantity, or `t` for the time, to the columns or units to choose from.
+    Attributes
+    ----------
+    columns : dict
+        Column of each quantity, by role and name of the quantity.
+    units : dict
+        Unit of each quantity that is not in SI.
+    time, time_unit : str
+        Time column and its unit. The unit is empty if the column contains dates.
+    because : dict
+        How each column was found.
+    open : dict
+        For each undecided quantity, the columns or units from which the user must choose. The key of the time is `t`.
     """
 
     path: Path
@@ -95,15 +104,16 @@ _ZONE: Final = re.compile(r"([Zz]|:\d\d([.,]\d+)?[+-]\d\d(:?\d\d)?)$")
 
 
 def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: Mapping[str, str]) -> Guess:
-    """Guess the meanings of a table's columns, from at most 20,000 rows and two million cells.
+    """Guess the meanings of the columns of a CSV file.
 
-    `columns` and `units` are stated by the user, by name of the quantity (fx, ..., or t for the time). The scene's
-    loads and sizes say which magnitudes are plausible.
+    At most 20,000 rows and two million cells are examined. The magnitudes of the numbers are compared with the loads
+    and sizes of the scene. `columns` and `units` contain the statements of the user, by name of the quantity (fx, ...,
+    or t for the time).
 
     Raises
     ------
     RecordingError
-        The file cannot be read, has no header or no rows, or lacks a column that the user states.
+        The file cannot be read, the header or the rows are missing, or the file has no column with a stated name.
     """
     guess, rows = _read(path)
     for name, column in columns.items():
@@ -185,7 +195,7 @@ def _find_time(
     if not np.isfinite(found).any():
         index = guess.names.index(guess.time)
         stamps = [time_ns(row[index]) for row in rows]
-        # times count from the first stamp, because a float resolves today's date only to 0.2 us
+        # time is counted from the first stamp, because a float resolves the time since 1970 only to 0.2 us
         first = next((stamp for stamp in stamps if stamp is not None), 0)
         guess.stamps_s = np.array([np.nan if stamp is None else (stamp - first) * 1e-9 for stamp in stamps])
         if stamps and np.isnan(guess.stamps_s).all():
@@ -254,6 +264,6 @@ def _unit_of(name: str) -> str:
 
 
 def _plain(name: str) -> str:
-    """Return a column's name in lower case without its unit, spaces and punctuation."""
+    """Return the name of a column in lower case, without unit, spaces and punctuation."""
     found = _UNIT.fullmatch(name)
     return re.sub(r"[^a-z0-9]", "", (found[1] if found else name).lower())

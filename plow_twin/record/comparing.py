@@ -1,6 +1,6 @@
-"""Comparison, byte for byte, of the messages that a run sent with the messages that its replay computes.
+"""Compare the recorded messages of a run, byte for byte, with the messages that a replay computes.
 
-The *kind* of a message is the index of its topic in `REPLAYED`, -1 for any other topic.
+The *kind* of a message is the index of its topic in `REPLAYED`, or -1 if `REPLAYED` does not contain the topic.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ _IS_SLOW = np.array([topic.cadence is Cadence.SLOW for topic in REPLAYED])
 
 
 class Sent:
-    """Find, for each message that was sent during a series of journal entries, the advance before it.
+    """Find the advance of the twin after which each message was sent, for a series of journal entries.
 
     Parameters
     ----------
     sequence, kind : ndarray of int64, shape (n,)
-        Number of the journal entry before each message (rising), and kind of the message.
+        Sequence number of the journal entry before each message, in ascending order, and kind of the message.
     done : ndarray of int64, shape (k,)
-        Number of advances up to each entry of the series.
+        Number of advances up to and including each entry of the series.
     first, advances
-        Sequence number of the first entry, and number of advances.
+        Sequence number of the first entry of the series, and number of advances in the series.
     """
 
     def __init__(self, sequence: Indexes, kind: Indexes, done: Indexes, first: int, advances: int) -> None:
@@ -43,21 +43,21 @@ class Sent:
         self.counts = np.zeros(_KINDS, np.int64)
         numbers = np.full(advances, -1)
         find_advances(sequence, kind, done, first, self.after, self.counts, numbers)
-        #: indexes of the advances after which messages were sent, that is, of the publications
+        #: indexes of the advances after which messages were sent; each of these advances is a publication
         self.taken = np.flatnonzero(numbers >= 0)
-        #: sequence number of the first message after each of these advances
+        #: sequence number of the first message of each publication
         self.first_sequence = numbers[self.taken]
-        #: index of the publication after each advance
+        #: index of the publication that follows each advance
         self.publication = np.empty(advances, np.int64)
         self.publication[self.taken] = np.arange(len(self.taken))
 
     def expect(self, published: Published, templates: Templates, kinds: NDArray[np.bool_]) -> None:
-        """Set the expected publications; `kinds` is True for each kind of message to compare."""
+        """Set the publications that a replay computed; `kinds` is True for each kind of message to compare."""
         rows, slow = published
         slow_of = np.full(len(rows), -1)
         slow_of[slow["row"]] = np.arange(len(slow))
         numbers = [topic.numbers(topic.record_of(published)) for topic in REPLAYED]
-        #: compiled code reads these arrays by address, so they must stay alive
+        #: Compiled code reads these arrays by address. This reference prevents that they are freed.
         self._numbers = [[_with_whole_rows(part) for part in parts] for parts in numbers]
         self._expected = (
             self.publication, slow_of, kinds, np.ascontiguousarray(rows["stamp_ns"]),
@@ -65,7 +65,7 @@ class Sent:
         )  # fmt: skip
 
     def differing(self, messages: Messages, chosen: slice) -> list[int]:
-        """Return the indexes of differing messages; `chosen` is the slice of `messages` in the series."""
+        """Return the indexes of the messages that differ; `chosen` is the slice of the series for `messages`."""
         wrong = np.empty(len(messages), bool)
         places = messages.start, messages.length
         count = compare(messages.buffer, *places, self.kind[chosen], self.after[chosen], *self._expected, wrong)
@@ -74,7 +74,11 @@ class Sent:
 
 @compiled
 def find_advances(sequence, kind, done, first, after, counts, numbers):  # type: ignore[no-untyped-def]
-    """Fill the arrays of `Sent`; `numbers` gets the number of the entry before each advance's messages."""
+    """Fill the arrays of `Sent`.
+
+    `numbers`, shape (advances,), receives the sequence number of the first message after each advance. An element stays
+    -1 if no message follows the advance.
+    """
     for n in range(sequence.size):
         advance = done[sequence[n] - first] - 1
         after[n] = advance
@@ -89,10 +93,11 @@ def _with_whole_rows(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _pieces(numbers: list[list[NDArray[np.float64]]], templates: Templates) -> tuple[Indexes, Indexes]:
-    """Return the pieces of all kinds of messages, and for each kind the index at which its pieces end.
+    """Return the pieces of all kinds of messages, and the index at which the pieces of each kind end.
 
-    A piece is a series of numbers that is contiguous both in the message and in the row: (offset in the message [B],
-    count of numbers, address in the first row, stride between rows [B]).
+    A piece is a series of numbers that is contiguous in the message and also in a row of the publications. Its four
+    values are the offset in the message [B], the count of numbers, the address in the first row, and the distance of
+    rows [B].
     """
     found, ends = [], [0]
     for kind, parts in enumerate(numbers):
@@ -114,14 +119,15 @@ def compare(  # type: ignore[no-untyped-def]
     buffer, starts, lengths, kinds, after, publication, slow, compared, stamps, pieces, piece_ends,
     data, fixed, ends, different,
 ):  # fmt: skip
-    """Compare each message, byte for byte, with its template filled with the stamp and numbers of its publication.
+    """Compare each message with its template, filled with the stamp and the numbers of the publication.
 
     Parameters
     ----------
     kinds, after : ndarray of int64, shape (n,)
         As in `Sent`.
     publication, slow : ndarray of int64
-        Index of each advance's publication, and of each publication's slow part (below 0: no slow part).
+        Index of the publication after each advance, and index of the slow part of each publication. An index below 0
+        means that a publication has no slow part.
     compared : ndarray of bool
         Whether messages of each kind are compared.
     pieces, piece_ends
@@ -129,7 +135,12 @@ def compare(  # type: ignore[no-untyped-def]
     data, fixed, ends
         As in `Templates`.
     different : ndarray of bool, shape (n,)
-        Receives True for each message that differs. The function returns the number of these messages.
+        Receives True for each message that differs.
+
+    Returns
+    -------
+    int
+        Number of messages that differ.
     """
     count = 0
     for n in range(starts.size):

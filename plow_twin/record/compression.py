@@ -1,4 +1,4 @@
-"""Decompression of MCAP chunks: zstd and LZ4."""
+"""Decompress the chunks of MCAP files, which use zstd or LZ4."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import numpy as np
 from plow_twin.errors import RecordingError
 from plow_twin.record.template import Bytes
 
-#: Largest record and largest chunk [B]. A greater length means damage, because writers close a chunk at a few MiB.
+#: Largest size of a record or a chunk [B]. Writers close a chunk at a few MiB, so a larger size is taken as damage.
 RECORD_LIMIT: Final = 64 * 1024 * 1024
 _of_thread: Final = threading.local()
-#: Format of an LZ4 frame: head, magic number, flags, and the length before each block.
+#: Format of an LZ4 frame. The head contains the magic number and flags, and a length precedes each block.
 _LZ4_HEAD: Final = struct.Struct("<IBB")
 _LZ4_MAGIC: Final = 0x184D2204
 _LZ4_INDEPENDENT, _LZ4_SIZE = 0x60, 0x08
@@ -25,7 +25,7 @@ _LZ4_LENGTH: Final = struct.Struct("<I")
 
 
 def decompress(compression: str, data: memoryview, size: int) -> bytes | Bytes:
-    """Return the decompressed content of a chunk, which has at most `size` bytes."""
+    """Return the decompressed content of a chunk; decompression stops at `size` bytes."""
     if compression == "zstd":
         import zstandard
 
@@ -59,10 +59,15 @@ def _lz4_block() -> Callable[[int, int, int, int], int] | None:
 
 
 def independent_blocks(data: memoryview, size: int) -> Bytes | None:
-    """Return the content, `size` bytes, of an LZ4 frame written by the recorder, or None for any other frame.
+    """Return the decompressed content of an LZ4 frame that has independent blocks and no checksums.
 
-    The recorder writes independent blocks without checksums. They are decompressed directly into the result; the lz4
-    package copies the content, which costs a replay 13 % more processor time.
+    The recorder writes such frames. Their blocks are decompressed directly into the result, which saves the copy that
+    the package lz4 makes.
+
+    Returns
+    -------
+    ndarray of uint8, shape (size,), or None
+        None if the frame has another format, is damaged, or has another size.
     """
     block = _lz4_block()
     if block is None or len(data) < _LZ4_HEAD.size or len(data) > RECORD_LIMIT:
@@ -88,7 +93,7 @@ def independent_blocks(data: memoryview, size: int) -> Bytes | None:
 
 
 def _zstd() -> Any:
-    """Return this thread's decompressor; to make one takes as long as to decompress a small chunk."""
+    """Return the decompressor of this thread. A new decompressor would cost as much time as a small chunk."""
     import zstandard
 
     if not hasattr(_of_thread, "zstd"):

@@ -1,4 +1,4 @@
-"""Selection of publications to record; a kept publication also has the impulses and peaks of those left out."""
+"""Select the publications to record, and add the impulses and peaks of omitted publications to the next one."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from plow_twin.stream.outputs import Published
 
 
 class Decimation:
-    """Thin publications out.
+    """Selection of the publications to record.
 
-    `outputs` is `all`, `decimated` or `none`. A decimated recording keeps the first publication in each period of
-    `rate_hz` [Hz], and each publication with a slow part.
+    The argument `outputs` is `all`, `decimated` or `none`. With `decimated`, the first publication in each period of
+    the rate `rate_hz` [Hz] is recorded, and also each publication with a slow part.
     """
 
     def __init__(self, outputs: str, rate_hz: float) -> None:
@@ -28,7 +28,10 @@ class Decimation:
         return self._outputs == "all"
 
     def select(self, published: Published) -> Published | None:
-        """Return the publication to record for `published`, which has one row, or None to leave it out."""
+        """Return the publication to record, or None if `published` is omitted.
+
+        `published` has one row. Impulses and peaks of the result cover the omitted publications before it.
+        """
         if self._outputs == "all":
             return published
         if self._outputs == "none":

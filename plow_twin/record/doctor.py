@@ -1,7 +1,7 @@
-"""Examination of a recording, and repair, which restores the end and index of a truncated or damaged file.
+"""Examine a recording, and repair truncated and damaged files.
 
-A repair copies every readable message into a new file and keeps the old file under another name. Lost messages stay
-lost and are counted.
+A repair copies every readable message into a new file with an index and renames the old file. Messages that cannot be
+read are lost; the report contains their number.
 """
 
 from __future__ import annotations
@@ -35,36 +35,36 @@ from plow_twin.record.unused import InputCounts
 from plow_twin.stream.journal import Digest, Failed, Sample, Snapshot
 
 _CHUNK_SIZE: Final = 2**20
-#: Key of the repaired parts in `metadata.yaml`, there with the prefix `plow_twin_`.
+#: Key in `metadata.yaml` of the names of repaired parts. The file has the key with the prefix `plow_twin_`.
 REPAIRED_KEY: Final = "repaired"
 _HASH: Final = "topic_type_hash"
 
 
 @dataclass
 class PartReport:
-    """State of one file of a recording."""
+    """The state of one file of a recording."""
 
     path: Path
     bytes: int
     finished: bool
     damaged_chunks: int
     messages: dict[str, int]
-    #: number of bytes after the end; other readers refuse a file that has such bytes
+    #: number of bytes after the end of the MCAP content; other readers refuse a file with trailing bytes
     trailing_bytes: int = 0
-    #: number of chunks that an earlier repair left out
+    #: number of damaged chunks that an earlier repair removed
     left_out: int = 0
-    #: whether the file begins as an MCAP file does
+    #: whether the file begins with the magic bytes of MCAP
     mcap: bool = True
 
     @property
     def healthy(self) -> bool:
-        """Whether the file is complete, with no bytes after its end and no damage."""
+        """Whether the file is complete and undamaged, without trailing bytes."""
         return self.mcap and self.finished and not self.damaged_chunks and not self.trailing_bytes
 
 
 @dataclass
 class RunReport:
-    """State of a recording: its parts, journal entries, losses and problems."""
+    """The state of a recording: parts, journal entries, losses and problems."""
 
     path: Path
     parts: list[PartReport] = field(default_factory=list)
@@ -76,14 +76,14 @@ class RunReport:
     repeated: int = 0
     lost: dict[str, int] = field(default_factory=dict)
     inputs: dict[str, dict[str, int]] = field(default_factory=dict)
-    #: number of failed advances, whose samples have no forces
+    #: number of samples to which the twin could not advance, so that they have no computed forces
     failed_advances: int = 0
     #: time from the first advance to the last [s]
     span_s: float = 0.0
     problems: list[str] = field(default_factory=list)
 
     def facts(self) -> dict[str, Any]:
-        """Return all facts for JSON."""
+        """Return the report as a dictionary for JSON."""
         parts = [
             {
                 "file": part.path.name,
@@ -113,7 +113,7 @@ class RunReport:
 
 
 def examine(path: Path) -> RunReport:
-    """Read a recording from front to back and report its content and its losses.
+    """Read a recording from front to back, and return a report of its content and losses.
 
     Raises
     ------
@@ -126,7 +126,7 @@ def examine(path: Path) -> RunReport:
     report.parts = [_part(part) for part in reader.parts]
     expected: int | None = None if reader.header.part else 0
     run_time = RunTime(reader.header.parameters)
-    in_a_row = 0  # number of entries without a gap before the expected entry
+    in_a_row = 0  # number of consecutive entries directly before the expected entry
     inputs = InputCounts(reader.header.excitation_source)
     for batch in reader.batches(outputs=False):
         entries = batch.entries
@@ -213,7 +213,7 @@ def _part_problems(part: PartReport) -> list[str]:
 
 
 def _metadata_problems(reader: RunReader) -> list[str]:
-    """Return the problems of `metadata.yaml`, by which other programs find the parts."""
+    """Return the problems of `metadata.yaml`, from which other programs read the names of the parts."""
     folder = reader.path.parent
     if not (folder / "metadata.yaml").is_file():
         return ["metadata.yaml is missing"]
@@ -227,14 +227,18 @@ def _metadata_problems(reader: RunReader) -> list[str]:
 
 
 def repair(path: Path) -> list[Path]:
-    """Restore the end of each truncated or damaged part, and the `metadata.yaml` of the folder.
+    """Rewrite each truncated or damaged part of a recording, and write a new `metadata.yaml` if necessary.
+
+    Old files are renamed:
+
+    - A truncated, damaged or empty part becomes `<name>.damaged` (`<name>.damaged_2`, ...).
+    - A part that repeats another part becomes `<name>.repeated`.
+    - A part of another run becomes `<name>.foreign`.
 
     Returns
     -------
     list of Path
-        The files that were rewritten or put aside, including files of other topics beside the run. A truncated, damaged
-        or empty part is kept as `<name>.damaged` (`<name>.damaged_2`, ...), a part that repeats another part as
-        `<name>.repeated`, and a part of another run as `<name>.foreign`.
+        Files that were rewritten or renamed, including the recordings of other topics in the folder of the run.
 
     Raises
     ------
@@ -297,9 +301,10 @@ def _list_parts(folder: Path, parts: Sequence[Path], repaired: Sequence[str]) ->
 
 
 def _rewrite(part: Path, *, last: bool) -> None:
-    """Replace a file by a new file with its readable messages and a note of damage at each gap.
+    """Replace a file by a new file with the readable messages and a note of damage at each gap.
 
-    A missing end is a gap, except in the last part.
+    A part without an end also gets a note of damage, because messages may be missing before the next part. The last
+    part has no next part and gets no note.
     """
     target = part.with_name(f"{part.name}.partial")
     target.unlink(missing_ok=True)
@@ -309,7 +314,7 @@ def _rewrite(part: Path, *, last: bool) -> None:
     def on_metadata(name: str, record: dict[str, str]) -> None:
         if name == LOSS_RECORD:
             loss.update(record)
-        elif name != DAMAGE_RECORD:  # notes of damage are written anew below
+        elif name != DAMAGE_RECORD:  # `note_damage` writes the earlier notes again
             file.metadata(name, record)
 
     reader = ChunkReader(part, on_metadata)

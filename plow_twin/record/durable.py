@@ -1,4 +1,4 @@
-"""Writing of files in one step, disk errors that name the file, and waiting for the disk."""
+"""Replace files atomically, add file names to disk errors, and wait until data are on the disk."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Add the path to an `OSError` raised inside this context, such as the error of a full disk."""
+    """Add the path to an `OSError` that is raised inside this context without a file name."""
     try:
         yield
     except OSError as error:
@@ -22,22 +22,22 @@ def naming(path: Path) -> Iterator[None]:
 
 @contextmanager
 def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
-    """Open a stream whose content becomes the file `path` in one step at the end.
+    """Open a stream, and replace the file `path` atomically by the content of the stream when the context ends.
 
-    Until then, and after an error or a kill, an existing file stays unchanged. With `sync` the new file also survives a
-    loss of power. A pipe or a device is written to directly.
+    If an error occurs or the process is killed, an existing file stays unchanged. With `sync`, the new file also
+    survives a loss of power. A pipe or a device cannot be replaced, so the stream writes to it directly.
 
     Raises
     ------
     OSError
-        The file cannot be written; the error names it.
+        The file cannot be written. The error contains the path.
     """
     try:
         if path.exists() and not path.is_file():
             with path.open("wb") as stream:
                 yield stream
             return
-        place = path.resolve()  # a symbolic link stays, and its target is replaced
+        place = path.resolve()  # if `path` is a symbolic link, the target of the link is replaced
         beside = place.with_name(f".{place.name}.{os.getpid()}")
         try:
             with beside.open("wb") as stream:
@@ -52,19 +52,22 @@ def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
         if sync:
             sync_path(place.parent)
     except OSError as error:
-        if error.errno is None:  # the library that raised the error has described it
+        if error.errno is None:  # an error of a library, which has its own message
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def write_whole(path: Path, content: bytes, *, sync: bool = False) -> None:
-    """Write a file in one step by `whole_file`."""
+    """Write `content` to a file atomically; the arguments are those of `whole_file`."""
     with whole_file(path, sync=sync) as stream:
         stream.write(content)
 
 
 def sync_path(*paths: Path) -> None:
-    """Wait until files, or the entries of folders, are on the disk. A new file needs both."""
+    """Wait until the content of files, or of folders, is on the disk.
+
+    A new file survives a loss of power only if the file and its folder are synchronized.
+    """
     for path in paths:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         try:

@@ -1,5 +1,6 @@
-"""Records of a recording, one by one and in batches of arrays: journal entries, and outputs (messages that were
-sent).
+"""Records of a recording, as single objects and in batches of arrays.
+
+A record is a journal entry or an output, that is, a message that the twin sent.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _HALF, _WHOLE = 2**31, 2**32
 
 @dataclass(frozen=True, slots=True)
 class EntryRecord:
-    """A journal entry, or a note of the recorder, with its sequence number."""
+    """A journal entry, or a note of the recorder about lost messages, with its sequence number."""
 
     sequence: int
     log_time_ns: int
@@ -33,7 +34,10 @@ class EntryRecord:
 
 @dataclass(frozen=True, slots=True)
 class OutputRecord:
-    """A message that was sent after journal entry number `sequence`; `data` are its CDR bytes."""
+    """A message that the twin sent.
+
+    `sequence` is the sequence number of the journal entry before the message, and `data` contains the CDR bytes.
+    """
 
     sequence: int
     log_time_ns: int
@@ -43,7 +47,7 @@ class OutputRecord:
     data: bytes
 
     def message(self) -> Message:
-        """Decode the message."""
+        """Return the decoded message."""
         return decode(self.data, self.message_type)
 
 
@@ -52,11 +56,22 @@ Record = EntryRecord | OutputRecord
 
 @dataclass(frozen=True)
 class Entries:
-    """Journal entries as arrays of shape (n,), in the order in which the twin used them.
+    """Journal entries in the order in which the twin used them.
 
-    `sample` is True for samples of the load. `digest_at` (m,) has the indexes of the digests, `digest` (m,) their
-    values, and `stamp_ns` their stamps. `rest` maps the index of each other entry to the entry. The numbers in
-    `sequence` do not wrap at 2^32.
+    Attributes
+    ----------
+    sequence, log_time_ns : ndarray of int64, shape (n,)
+        Sequence number, without the wrap at 2^32, and receive time of each entry.
+    sample : ndarray of bool, shape (n,)
+        Whether an entry is a sample of the load.
+    stamp_ns : ndarray of int64, shape (n,)
+        Stamp of each sample and digest.
+    wrench : ndarray, shape (n, 3)
+        Load of each sample [N, N, N m].
+    digest_at, digest : ndarray, shape (m,)
+        Index of each digest in the other arrays, and its value.
+    rest : dict
+        All other entries, by index.
     """
 
     sequence: Indexes
@@ -88,12 +103,12 @@ class Entries:
     def samples(self) -> tuple[Indexes, NDArray[np.float64]]:
         """Return the stamps and wrenches of the samples."""
         places = np.flatnonzero(self.sample)
-        # indices take a fifth of the time of a mask
+        # selection by indices is five times as fast as selection by a mask
         return self.stamp_ns[places], self.wrench.take(places, axis=0)
 
     @cached_property
     def others(self) -> Mapping[int, Entry | Dropped]:
-        """All entries but samples, by index."""
+        """All entries that are not samples, by index."""
         stamps = self.stamp_ns[self.digest_at].tolist()
         found: dict[int, Entry | Dropped] = {
             index: Digest(stamp_ns, f"{digest:016x}")
@@ -102,7 +117,7 @@ class Entries:
         return found | dict(self.rest)
 
     def record(self, index: int) -> EntryRecord:
-        """Return an entry with its sequence number."""
+        """Return the entry at `index` as a record."""
         entry: Entry | Dropped
         if self.sample[index]:
             fx, fy, moment = self.wrench[index].tolist()
@@ -113,7 +128,7 @@ class Entries:
 
     @classmethod
     def joined(cls, parts: list[Entries]) -> Entries:
-        """Return the entries of one or more parts, joined."""
+        """Return one series with the entries of all parts."""
         if len(parts) == 1:
             return parts[0]
         begins = np.cumsum([0, *map(len, parts)]).tolist()
@@ -139,7 +154,11 @@ NO_ENTRIES: Final = Entries(_NONE, _NONE, np.zeros(0, bool), _NONE, np.zeros((0,
 
 @dataclass(frozen=True)
 class Outputs:
-    """Outputs of one chunk; `topics` maps channels to topic and type; `sequence` does not wrap at 2^32."""
+    """Messages of one chunk that the twin sent.
+
+    `sequence` is the sequence number of each message without the wrap at 2^32, and `topics` maps the number of each
+    channel to its topic and message type.
+    """
 
     messages: Messages
     sequence: Indexes
@@ -150,14 +169,14 @@ class Outputs:
 
     @cached_property
     def newest(self) -> int:
-        """The highest sequence number; there must be at least one message."""
+        """The highest sequence number. It is undefined without a message."""
         return int(self.sequence.max())
 
     def __getitem__(self, chosen: slice) -> Outputs:
         return Outputs(self.messages[chosen], self.sequence[chosen], self.topics)
 
     def record(self, index: int) -> OutputRecord:
-        """Return a message with its sequence number."""
+        """Return the message at `index` as a record."""
         messages = self.messages
         topic, message_type = self.topics[int(messages.channel[index])]
         return OutputRecord(
@@ -172,10 +191,10 @@ class Outputs:
 
 @dataclass(frozen=True)
 class Batch:
-    """Entries, and all outputs sent after them and before the next batch.
+    """Journal entries, and the outputs that the twin sent after these entries and before the next batch.
 
-    `damaged` is True if chunks since the previous batch could not be read; their records may be missing anywhere in
-    this batch.
+    `damaged` is True if a chunk since the previous batch could not be read. Any record of this batch may then be
+    missing.
     """
 
     entries: Entries
@@ -183,7 +202,7 @@ class Batch:
     damaged: bool = False
 
     def parted(self, places: Sequence[int]) -> Iterator[Batch]:
-        """Yield the batch in pieces; a new piece begins at each entry of `places` (rising indexes)."""
+        """Split the batch before the entries at the indexes `places`, which must ascend, and yield the pieces."""
         outputs, begin = self.outputs, 0
         for place in places:
             now, outputs = parted_at(outputs, int(self.entries.sequence[place]))
@@ -193,13 +212,16 @@ class Batch:
 
 
 class Holes:
-    """Search for missing journal entries by sequence number, batch after batch."""
+    """Find missing journal entries by their sequence numbers, in one batch after the other."""
 
     def __init__(self) -> None:
         self._next: int | None = None
 
     def find(self, entries: Entries) -> dict[int, int]:
-        """Map the index of each entry after a gap to the number of entries missing in the gap, in order."""
+        """Return the number of entries that are missing before each entry that follows a gap.
+
+        The keys are the indexes of the entries, in ascending order.
+        """
         if not len(entries):
             return {}
         reached = np.maximum.accumulate(entries.sequence) + 1
@@ -211,7 +233,7 @@ class Holes:
 
 
 def parted_at(outputs: Sequence[Outputs], end: int) -> tuple[list[Outputs], list[Outputs]]:
-    """Return the messages with sequence numbers below `end`, and the other messages."""
+    """Return the messages with sequence numbers below `end`, and the remaining messages."""
     before, after = [], []
     for part in outputs:
         place = len(part) if part.newest < end else int((part.sequence >= end).argmax())
@@ -221,12 +243,12 @@ def parted_at(outputs: Sequence[Outputs], end: int) -> tuple[list[Outputs], list
 
 
 def in_order(batch: Batch) -> Iterator[Record]:
-    """Yield each entry, followed by the outputs sent after it."""
+    """Yield each entry, followed by the outputs that the twin sent after the entry."""
     sequences = [part.sequence for part in batch.outputs]
     owners = np.concatenate([np.full(len(part), number) for number, part in enumerate(sequences)] or [np.zeros(0, int)])
     places = np.concatenate([np.arange(len(part)) for part in sequences] or [np.zeros(0, int)])
-    # A message comes before the first entry with a higher number. Entries may be out of order, so the highest number up
-    # to each entry is compared.
+    # A message is placed before the first entry with a higher sequence number. The search needs ascending numbers, but
+    # entries may be out of order. Each number is therefore replaced by the highest number up to its entry.
     bounds = np.maximum.accumulate(batch.entries.sequence) if len(batch.entries) else batch.entries.sequence
     slots = np.searchsorted(bounds, np.concatenate(sequences or [np.zeros(0, np.int64)]), side="right")
     order = np.argsort(slots, kind="stable")
@@ -242,6 +264,6 @@ def in_order(batch: Batch) -> Iterator[Record]:
 
 @compiled
 def unwrap(sequence: Indexes, base: int, out: Indexes) -> None:
-    """Unwrap 32-bit sequence numbers into `out`; each gets the possible value nearest to `base`."""
+    """Unwrap 32-bit sequence numbers: `out` receives the value nearest to `base` with the same lower 32 bits."""
     for n in range(sequence.size):
         out[n] = base + ((sequence[n] - base + _HALF) & (_WHOLE - 1)) - _HALF

@@ -1,4 +1,4 @@
-"""The estimates of a live node, read from its journal, and the scene at the end of a run."""
+"""Read the estimates of a live node from its journal, and the scene at the end of a run."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from plow_twin.stream.session import wear_in
 
 @dataclass(frozen=True, eq=False)
 class LiveEstimate:
-    """An estimate in a node's journal, and its window of measurements, formed again from the journal.
+    """An estimate from the journal of a node, with its window of measurements.
 
-    `window` is None if measurements are missing.
+    The window is computed again from the journal. It is None if the journal does not contain all its measurements.
     """
 
     entry: Estimated
@@ -38,7 +38,7 @@ class LiveEstimate:
 
 
 def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
-    """Yield the estimates of a run in order; each window is formed at the same entry as in the node."""
+    """Yield the estimates of a run in order, with the windows of measurements that the node used."""
     settings = reader.header.parameters
     if not settings.get("estimate"):
         return
@@ -73,7 +73,10 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
 
 
 def left_by(reader: RunReader) -> tuple[Scene, Estimated | None]:
-    """Return the scene at the end of a run, with wear and model changes, and the newest pad estimate."""
+    """Return the scene at the end of a run, including wear and changes of the model, and the last estimate.
+
+    An estimate before the last setting of the wear is not returned.
+    """
     scene, newest = reader.header.scene(reader.path), None
     depth, changes = None, dict[str, float]()
     for batch in reader.batches(outputs=False):
@@ -94,13 +97,13 @@ def left_by(reader: RunReader) -> tuple[Scene, Estimated | None]:
 
 
 def stated(parameters: Mapping[str, Any]) -> tuple[Deviation, Deviation]:
-    """Return the standard deviations of poses and load that the node's parameters state."""
+    """Return the standard deviations of the poses and of the load from the node's parameters."""
     poses, load = (parameters.get(f"{name}_deviation", UNSTATED) for name in ("head_pose", "excitation"))
     return tuple(map(float, poses)), tuple(map(float, load))
 
 
 def _whole(window: Window | str, entry: Estimated) -> Window | None:
-    """Return the window if its bounds and counts are as in the journal, otherwise None."""
+    """Return the window if its bounds and numbers of measurements agree with the entry, otherwise None."""
     if isinstance(window, str):
         return None
     formed = window.start_ns, window.end_ns, window.samples, window.poses

@@ -1,6 +1,6 @@
-"""Reading of a recording that is still being written: check whether its writer runs, wait for new content.
+"""Read a recording that is still being written: check whether the writer still runs, and wait for new content.
 
-A writer locks its file; the operating system releases the lock however the process ends.
+A writer locks its file. When the process ends, also by a crash, the operating system releases the lock.
 """
 
 from __future__ import annotations
@@ -15,7 +15,10 @@ POLL_S: Final = 0.1
 
 
 def claim(descriptor: int) -> None:
-    """Lock a file as being written until it is closed; do nothing on a file system without locks."""
+    """Lock a file until it is closed, as a sign that it is being written.
+
+    On a file system without locks, the function does nothing.
+    """
     import fcntl
 
     try:
@@ -25,7 +28,7 @@ def claim(descriptor: int) -> None:
 
 
 def is_claimed(descriptor: int) -> bool:
-    """Return whether another process still writes to a file, which it has locked by `claim`."""
+    """Return whether another process has locked a file by `claim` and is still writing to it."""
     import fcntl
 
     try:
@@ -37,16 +40,19 @@ def is_claimed(descriptor: int) -> bool:
 
 
 class Tail:
-    """The wait of a reader at the end of a growing file. It calls `stop` meanwhile; True ends the reading."""
+    """Wait of a reader at the end of a growing file; it ends early when the function `stop` returns True."""
 
     def __init__(self, stop: Callable[[], bool] = lambda: False) -> None:
         self._stop = stop
         self.stopped = False
 
     def more(self, stream: IO[bytes], size: int) -> bool:
-        """Wait until a file is longer than `size` [B]; return False if its writer ends or `stop` is true."""
+        """Wait until a file is longer than `size` [B].
+
+        Returns False if the writer ends or `stop` returns True before the file grows.
+        """
         while True:
-            # the lock is checked before the size, so that bytes are read that a writer adds just before it ends
+            # checking the size first would miss bytes that the writer adds between the two checks, just before it ends
             alive = is_claimed(stream.fileno())
             if os.fstat(stream.fileno()).st_size > size:
                 return True

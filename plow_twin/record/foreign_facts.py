@@ -1,4 +1,4 @@
-"""Facts of a recording of another program, read through a mapping."""
+"""Summarize a recording of another program, which is read with the help of a mapping."""
 
 from __future__ import annotations
 
@@ -14,7 +14,11 @@ from plow_twin.record.sources import open_source
 
 @dataclass
 class _Seen:
-    """Counts of a role's used and unfit messages, and the ranges of their stamps [ns] and SI values."""
+    """Statistics of the messages of one role.
+
+    `used` and `unfit` count the messages that fit and do not fit the role. The other fields are the ranges of the
+    stamps [ns] and of the values [SI units] of the messages that fit.
+    """
 
     used: int = 0
     unfit: int = 0
@@ -49,15 +53,16 @@ class _Seen:
 
 
 def foreign_facts(path: Path, mapping: Path | None, units: Mapping[str, str]) -> tuple[dict[str, Any], bool]:
-    """Read a recording of another program from front to back.
+    """Read a recording of another program from front to back, and return a summary.
 
     Returns
     -------
     facts : dict
-        Topics with their types. For each role: its topic, the counts of its messages that fit and do not fit the role,
-        their span [s] and rate [Hz], and the smallest and the largest value of each quantity in SI.
+        Types of the topics, counts of losses, and a dictionary for each role. The latter contains the topic, the
+        numbers of messages that fit and do not fit the role, their span [s] and rate [Hz], and the range of each
+        quantity [SI units].
     lossy : bool
-        Whether a part of the recording could not be read.
+        Whether a part of the recording could not be read, or messages do not fit their role.
 
     Raises
     ------

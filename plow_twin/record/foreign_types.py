@@ -1,4 +1,8 @@
-"""Message types whose text is in a recording; parsing is bounded, because decoders are generated from the types."""
+"""Parse the definitions of message types that a recording contains.
+
+A decoder is generated from each type. The size of a type is limited, so that a damaged or hostile file cannot cause a
+huge decoder.
+"""
 
 from __future__ import annotations
 
@@ -6,24 +10,26 @@ from typing import Any, Final
 
 from plow_twin.errors import RecordingError
 
-#: Largest length of the text of a type and its parts, without comments [characters]; usual texts have some 10,000.
+#: Largest length [characters] of a type's text, including the types of its fields but not the comments. Common texts
+#: have about 10,000 characters.
 _LONGEST: Final = 2**18
-#: Largest number of parts (numbers, texts, arrays of numbers) of a message; a sequence counts as one item.
+#: Largest number of parts of a message. A part is a number, a text or an array of numbers. A sequence counts as a
+#: single item.
 _MOST_PARTS: Final = 1_000
 
 
 def parsed_types(text: str, message_type: str) -> dict[str, Any]:
-    """Return the types in a `ros2msg` text.
+    """Return the types that a `ros2msg` text defines.
 
     Raises
     ------
     RecordingError
-        The text is too long, or the type contains itself or too many parts. The parser and the type store raise other
-        errors for other bad texts.
+        The text is too long, the type contains itself, or the type has too many parts. For other invalid texts, the
+        parser of rosbags raises its own errors.
     """
     from rosbags.typesys import get_types_from_msg
 
-    # the parser's time grows with the square of the number of consecutive empty lines
+    # empty lines are removed, because the parser's time grows with the square of the number of consecutive empty lines
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if sum(map(len, lines)) > _LONGEST:
         raise RecordingError(f"{message_type}: got a longer text, expected at most {_LONGEST} characters")
@@ -35,11 +41,11 @@ def parsed_types(text: str, message_type: str) -> dict[str, Any]:
 
 
 def _count(name: str, types: dict[str, Any], counts: dict[str, int]) -> int:
-    """Return the number of parts of a message; a type that is not in `types` is one part."""
+    """Return the number of parts of a message type; a type that `types` does not contain counts as one part."""
     if name not in types:
         return 1
     if name not in counts:
-        # until its parts are counted, a type counts as too large, so that a type that contains itself is refused
+        # this value refuses a type that contains itself: the value is read again while the parts are counted
         counts[name] = _MOST_PARTS + 1
         counts[name] = max(1, sum(_parts(field, types, counts) for _, field in types[name][1]))
     if counts[name] > _MOST_PARTS:

@@ -1,4 +1,4 @@
-"""The header of a recording: scene and settings, which replay needs beside the journal."""
+"""The header of a recording: the scene and the settings that a replay needs in addition to the journal."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from plow_twin.model.scene import Scene
 from plow_twin.solve.compiled_scene import TOLERANCE_RANGE
 from plow_twin.stream.journal import ParameterValue
 
-#: Name of the MCAP metadata record with the header.
+#: Name of the MCAP metadata record that contains the header.
 HEADER_RECORD: Final = "plow_twin"
-#: Name of the MCAP metadata record with the loss counters, written at close.
+#: Name of the MCAP metadata record that contains the numbers of lost messages. It is written when the file is closed.
 LOSS_RECORD: Final = "plow_twin_loss"
-#: Key, in the loss record, of the reason of an early end; the other keys are topics.
+#: Key in the loss record under which the reason of an early end is written. All other keys are topics.
 STOPPED_EARLY_KEY: Final = "stopped_early"
-#: Version of the layout that `docs/recording.md` describes.
+#: Version of the file layout, which `docs/recording.md` describes.
 LAYOUT_VERSION: Final = 4
 
 
@@ -27,10 +27,22 @@ LAYOUT_VERSION: Final = 4
 class RunHeader:
     """Scene and settings of a run.
 
-    `scene_yaml` is self-contained. `topics` maps base names of outputs to their topic names in the run. `clock` is the
-    clock of the receive times: `system` or `ros` (under `/clock`). `origin_ns` is the first stamp if it was known.
-    `record_outputs` says which outputs are recorded: `all`, `decimated` or `none`. `part` is the number of this file;
-    all files of a run share the random `run_id`.
+    Attributes
+    ----------
+    scene_yaml : str
+        Scene in YAML, without references to other files.
+    topics : dict
+        Topic name of each output in the run, by base name of the output.
+    clock : str
+        Clock of the receive times: `system`, or `ros` if the node used the time from `/clock`.
+    origin_ns : int or None
+        First stamp [ns], or None if it was not known at the start.
+    record_outputs : str
+        Recorded outputs: `all`, `decimated` or `none`.
+    part : int
+        Number of this file in the run.
+    run_id : str
+        Random identifier that all files of a run have in common.
     """
 
     scene_yaml: str
@@ -70,16 +82,16 @@ class RunHeader:
         return f"{self.node}/journal/entries"
 
     def topic(self, base_name: str) -> str:
-        """Return the topic name under which an output was sent."""
+        """Return the name of the topic on which an output was sent."""
         return self.topics.get(base_name, f"{self.node.rpartition('/')[0]}/{base_name}")
 
     def scene(self, source: object) -> Scene:
-        """Return the scene; `source` names the recording in an error.
+        """Return the scene of the run; an error message names the recording by `source`.
 
         Raises
         ------
         RecordingError
-            The recording is damaged, or this version does not know the scene's contact law.
+            The recording is damaged, or this version of plow_twin does not have the contact law of the scene.
         """
         from plow_twin.scene_file import loads_scene
 
@@ -89,7 +101,7 @@ class RunHeader:
             raise RecordingError(str(error)) from error
 
     def to_record(self) -> dict[str, str]:
-        """Return the MCAP metadata record: texts as they are, other values as JSON."""
+        """Return the content of the MCAP metadata record: strings are unchanged, other values are written as JSON."""
         record = {"layout_version": str(LAYOUT_VERSION)}
         for spec in fields(self):
             value = getattr(self, spec.name)
@@ -99,12 +111,12 @@ class RunHeader:
 
     @classmethod
     def from_record(cls, record: Mapping[str, str], source: str) -> RunHeader:
-        """Read the MCAP metadata record; unknown keys are ignored.
+        """Return the header from the content of the MCAP metadata record. Unknown keys are ignored.
 
         Raises
         ------
         RecordingError
-            A key is missing or has a wrong value; the message names `source`.
+            A key is missing or has an invalid value. The message begins with `source`.
         """
         layout = record.get("layout_version", "")
         if layout != str(LAYOUT_VERSION):
@@ -127,7 +139,7 @@ class RunHeader:
 
 
 def _fits(value: Any, kind: str) -> bool:
-    """Return whether a value of the header has the type `kind`; an integer must fit into 64 bits."""
+    """Return whether a value has the type with the name `kind`; an integer must fit in 64 bits."""
     if kind.startswith("Mapping"):
         kinds = str | bool | int | float | list if "ParameterValue" in kind else str
         return isinstance(value, dict) and all(isinstance(item, kinds) for item in value.values())

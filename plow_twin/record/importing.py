@@ -1,4 +1,4 @@
-"""Use of any recording's load as input of a twin, with the checks, the late samples and the journal of a live run."""
+"""Feed the load from any recording to twins, with the input checks and the journal of a live run."""
 
 from __future__ import annotations
 
@@ -23,20 +23,21 @@ from plow_twin.stream.steps import Steps
 
 @dataclass
 class Feed:
-    """Pass messages to walkers in order of arrival; check samples of the load first.
+    """Pass the messages of a recording to walkers in the order of their arrival, after a check of each load sample.
 
-    `measured` is called with the role, stamp [ns] and numbers of each message that is neither a load nor a speed.
+    The function `measured` receives the role, the stamp [ns] and the values of each message that contains neither a
+    load nor a speed.
     """
 
     walkers: list[Walker]
     roles: dict[str, Role]
     measured: Callable[[str, int, dict[str, float]], object]
     intake: Intake = field(default_factory=Intake)
-    #: unused messages by reason; the intake also counts those of the load
+    #: numbers of unused messages, by reason; `intake` counts the unused load samples, too
     unfit: Counter[str] = field(default_factory=Counter)
-    #: whether the measured poses go into the first walker's journal
+    #: whether the first walker writes the measured poses to its journal
     with_poses: bool = False
-    #: stretches without samples, in which the load is interpolated linearly
+    #: intervals without samples, in which the twin interpolates the load linearly
     silences: Silences = field(default_factory=lambda: Silences(Policy.excitation_timeout_s))
     _poses: list[Pose | PartOfPose] = field(default_factory=list)
     _stamps: list[int] = field(default_factory=list)
@@ -48,12 +49,12 @@ class Feed:
         self._steps = Steps(self.intake)
 
     def run(self, messages: Iterable[Arrived]) -> None:
-        """Process all messages.
+        """Process all messages and close the walkers.
 
         Raises
         ------
         RecordingError
-            No sample could be used.
+            No load sample can be used.
         """
         for name, arrived, found in readings(messages, self.roles):
             if arrived.after_hole:
@@ -77,7 +78,7 @@ class Feed:
             walker.close()
 
     def _hole(self) -> None:
-        """Start anew after missing messages, so that no load is interpolated across them."""
+        """Reset the walkers after missing messages, so that no load is interpolated across the gap."""
         self._steps.end()
         self.flush()
         self.silences.restart()
@@ -92,7 +93,7 @@ class Feed:
                 self.flush()
                 for walker in self.walkers:
                     walker.speed_m_s = speed
-                    # the speed acts from the newest sample on
+                    # a new speed takes effect at the stamp of the newest sample
                     walker.apply(Travel(self._reached_ns or 0, speed), max(0, log_time_ns))
         elif name == "excitation":
             wrench = (values["fx"], values["fy"], values["m"])
@@ -122,7 +123,7 @@ class Feed:
             self.flush()
 
     def flush(self) -> None:
-        """Advance by the waiting samples, after applying the poses that arrived with them."""
+        """Apply the buffered poses, and then advance the walkers by the buffered samples."""
         first_ns = self._log_times[0] if self._log_times else 0
         for pose in self._poses if self._log_times or self._reached_ns is not None else ():
             self.walkers[0].apply(pose, first_ns)

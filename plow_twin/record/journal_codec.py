@@ -1,4 +1,7 @@
-"""Journal entries as ROS messages, exact to the bit: samples as wrenches, digests as two integers, the rest as JSON."""
+"""Convert journal entries to ROS messages and back, without any loss of precision.
+
+A sample becomes a wrench, a digest becomes two integers, and every other entry becomes a JSON text.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +47,7 @@ from plow_twin.stream.journal import (
 
 @dataclass(frozen=True)
 class Dropped:
-    """A note of the recorder: `count` messages on `topic` before this place did not reach the file."""
+    """A note of the recorder that the preceding `count` messages on `topic` could not be written to the file."""
 
     topic: str
     count: int
@@ -71,7 +74,7 @@ _KINDS: Final[dict[str, type[Any]]] = {
     "loss": Loss,
     "dropped": Dropped,
 }
-#: Bytes of a digest's message before its two numbers: encoding, no dimensions, no offset, count of numbers, padding.
+#: First bytes of a message with a digest: encoding, no dimensions, no offset, count of numbers (2), and padding.
 _DIGEST_HEAD: Final = np.frombuffer(struct.pack("<BBHIII4x", 0, 1, 0, 0, 0, 2), np.uint8)
 _DIGEST_SIZE: Final = len(_DIGEST_HEAD) + 16
 _MASK: Final = 2**64 - 1
@@ -81,7 +84,7 @@ _NAMES: Final = {kind: name for name, kind in _KINDS.items()}
 
 
 def to_message(entry: Entry | Dropped, frame_id: str) -> Message:
-    """Return an entry as a message."""
+    """Return the message that represents a journal entry."""
     if isinstance(entry, Sample):
         fx, fy, m = entry.wrench
         return WrenchStamped(entry.stamp_ns, frame_id, (fx, fy, 0.0), (0.0, 0.0, m))
@@ -93,7 +96,7 @@ def to_message(entry: Entry | Dropped, frame_id: str) -> Message:
     if isinstance(entry, Snapshot | Restore):
         values["data"] = base64.b64encode(entry.data).decode()
     elif isinstance(entry, Unused):
-        # JSON has no infinity and NaN, so they are written as texts
+        # infinity and NaN are written as strings, because JSON has no such numbers
         values["values"] = [
             [number if math.isfinite(number) else repr(number) for number in row] for row in entry.values
         ]
@@ -101,12 +104,12 @@ def to_message(entry: Entry | Dropped, frame_id: str) -> Message:
 
 
 def from_message(message: Message, source: str = "journal") -> Entry | Dropped:
-    """Return the entry in a message.
+    """Return the journal entry that a message represents.
 
     Raises
     ------
     RecordingError
-        The message is not an entry; the error names `source`.
+        The message does not represent a journal entry. The error begins with `source`.
     """
     if isinstance(message, WrenchStamped):
         wrench = (message.force[0], message.force[1], message.torque[2])
@@ -126,9 +129,21 @@ def from_message(message: Message, source: str = "journal") -> Entry | Dropped:
 def read_digests(
     buffer: Bytes, start: Indexes, length: Indexes
 ) -> tuple[NDArray[np.bool_], Indexes, NDArray[np.uint64]]:
-    """Return a mask of the messages that are digests, and the stamps [ns] and values of these digests.
+    """Find the messages that are digests.
 
-    `start` and `length`, shape (n,), give the place of each message in `buffer`.
+    Parameters
+    ----------
+    buffer : ndarray of uint8
+        Content of a chunk.
+    start, length : ndarray of int64, shape (n,)
+        Offset and length of each message in the buffer.
+
+    Returns
+    -------
+    found : ndarray of bool, shape (n,)
+        Whether each message is a digest.
+    stamp_ns, digest : ndarray, shape (m,)
+        Stamp [ns] and value of each digest.
     """
     found = (length == _DIGEST_SIZE) & (start >= 0) & (start + _DIGEST_SIZE <= buffer.size)
     messages = buffer[start[found, None] + np.arange(_DIGEST_SIZE)]
@@ -150,7 +165,7 @@ def _from_json(text: str, source: str) -> Entry | Dropped:
 
 
 def _exactly(*kinds: type) -> Callable[[Any], Any]:
-    """Return a function that accepts only values of exactly these types: 1, 1.0 and True differ."""
+    """Return a function that refuses values of other types; unlike `isinstance`, it distinguishes 1 and True."""
 
     def read(value: Any) -> Any:
         if type(value) not in kinds:
@@ -196,7 +211,7 @@ _READERS: Final[dict[str, Callable[[Any], Any]]] = {
     "tuple[tuple[float, ...], ...]": _rows,
     "ParameterValue": _exactly(bool, int, float, str),
 }
-#: For each kind of entry, its fields and the functions that read their values.
+#: For each kind of entry, the name of each field and the function that reads the value of the field.
 _FIELDS: Final = {
     name: [(spec.name, _READERS[str(spec.type)]) for spec in fields(kind)] for name, kind in _KINDS.items()
 }

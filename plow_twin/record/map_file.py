@@ -1,4 +1,4 @@
-"""Mapping files: their schema, the roles of topics, units, and the model of the load from the drive's signals."""
+"""Read mapping files, which assign roles and units to topics and state the model of the load from drive signals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from plow_twin.record.times import STAMP_UNITS
 from plow_twin.scene_file.validation import NUMBER, Schema, choice, mapping, validate
 from plow_twin.scene_file.yaml_text import read_yaml
 
-#: For each role of a topic, the quantities that its messages may contain.
+#: Quantities that a message may contain, for each role of a topic.
 ROLES: Final[dict[str, tuple[str, ...]]] = {
     "excitation": ("fx", "fy", "m"),
     "head_pose": ("x", "y", "theta"),
@@ -24,14 +24,14 @@ ROLES: Final[dict[str, tuple[str, ...]]] = {
 }
 #: Type of a topic whose fields are nodes of an OPC UA server.
 OPCUA: Final = "opcua"
-#: Stamp of a node's value that becomes the stamp of the sample: the sensor's or the server's.
+#: Values of the key `stamp` for OPC UA nodes: the stamp of the data source, or the stamp of the server.
 SOURCE_STAMP: Final = "source"
 SERVER_STAMP: Final = "server"
-#: Keys that a node may have besides its identifier.
+#: Keys that an OPC UA node may have in a mapping file, in addition to its identifier.
 _NODE_KEYS: Final = ("scale", "offset", "unit", "limits")
-#: Key of the model that computes the load from the drive's signals.
+#: Key of the model that computes the load from the signals of the drive.
 LOAD_MODEL: Final = "load_model"
-#: For each kind of quantity, the factor from each of its units to SI.
+#: Units of each kind of quantity, with the factor from the unit to SI.
 UNITS: Final[dict[str, dict[str, float]]] = {
     "force": {"N": 1.0, "kN": 1e3, "MN": 1e6},
     "moment": {"N m": 1.0, "Nm": 1.0, "kN m": 1e3, "kNm": 1e3},
@@ -40,7 +40,7 @@ UNITS: Final[dict[str, dict[str, float]]] = {
     "power": {"W": 1.0, "kW": 1e3, "MW": 1e6},
     "speed": {"m/s": 1.0, "mm/s": 1e-3, "m/min": 1.0 / 60.0, "km/h": 1.0 / 3.6},
 }
-#: The kind of each quantity, by role and name.
+#: Kind of each quantity, by its role and name.
 QUANTITIES: Final = {
     **{("excitation", name): "force" for name in ("fx", "fy")},
     ("excitation", "m"): "moment",
@@ -71,18 +71,18 @@ _MOST_OFFSET_S: Final = 1e9
 
 
 class MapError(InputError, RecordingError):
-    """A mapping cannot be used, or does not fit the recording."""
+    """A mapping is invalid, or does not fit the recording."""
 
 
 def read_map_file(path: Path) -> dict[str, Any]:
-    """Return the roles and the load model of a mapping file.
+    """Return the checked content of a mapping file: the roles, and the load model if the file has one.
 
-    A scale, offset, unit or limit that the file gives once for a role is repeated for each of the role's numbers.
+    A role may have one scale, offset, unit or limit for all its quantities. In the result, each quantity has its own.
 
     Raises
     ------
     MapError
-        The file cannot be used.
+        The file cannot be read or is invalid.
     """
     given, problems = read_yaml(path, "mapping", ", ".join(ROLES))
     if isinstance(given, dict):
@@ -113,7 +113,7 @@ def _for_each(role: Any, entry: Any) -> Any:
 
 
 def _nodes_as_fields(role: Any, entry: Any) -> Any:
-    """Return a role whose nodes (`fx: {node: ns=2;s=Load.Fx, unit: kN}`) are written as fields."""
+    """Convert OPC UA nodes in a role, such as `fx: {node: ns=2;s=Load.Fx, unit: kN}`, to fields with units."""
     if role not in ROLES or not isinstance(entry, dict):
         return entry
     named = {**entry, **(entry["fields"] if isinstance(entry.get("fields"), dict) else {})}
@@ -129,7 +129,7 @@ def _nodes_as_fields(role: Any, entry: Any) -> Any:
             given = rest.get(key)
             rest[key] = {**(given if isinstance(given, dict) else {}), **own}
         elif isinstance(rest.get(key), dict):
-            # a value for all names is kept only for names with a node or field
+            # `_for_each` gave each quantity a value; quantities without a node or field do not need it
             rest[key] = {name: value for name, value in rest[key].items() if name in fields or name not in ROLES[role]}
     return {"stamp": SOURCE_STAMP, "stamp_unit": "ns", **rest, "topic": role, "type": OPCUA, "fields": fields}
 
@@ -139,7 +139,7 @@ def _is_node(field: Any) -> bool:
 
 
 def map_error(path: Path, key: str, got: object, expected: str) -> MapError:
-    """Return the error of one value in a mapping file."""
+    """Return the error about one value in a mapping file."""
     return MapError([Problem(key, got, expected)], str(path))
 
 

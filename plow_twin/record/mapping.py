@@ -1,7 +1,7 @@
-"""Roles of the topics of a recording: fields, factors, offsets and stamps, from a YAML file or from names and types.
+"""Assign roles to the topics of a recording, by a YAML file or by the names and types of the topics.
 
-A *role* says which quantities of the model a topic has: `excitation` (the load), `head_pose`, `travel`, `forces`,
-`gaps` or `drive`.
+The *role* of a topic determines which quantities of the model its messages contain. The roles are `excitation` (the
+load), `head_pose`, `travel`, `forces`, `gaps` and `drive`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, likely_u
 from plow_twin.scene_file.parquet_lines import SUFFIX
 
 Number = TypeVar("Number", float, NDArray[np.float64])
-#: Losses whose keys begin with this prefix count messages that do not fit their role.
+#: Prefix of the keys under which messages that do not fit their role are counted as losses.
 UNFIT: Final = "unfit, "
 _WRENCH: Final = {"fx": "wrench.force.x", "fy": "wrench.force.y", "m": "wrench.torque.z"}
 _POSE: Final = {"x": "pose.position.x", "y": "pose.position.y", "theta": "pose.orientation"}
@@ -51,7 +51,7 @@ _FIELDS: Final[dict[tuple[str, str], dict[str, str]]] = {
     ("forces", "sensor_msgs/msg/JointState"): {name: f"effort[{name}]" for name in PAIR_NAMES},
     ("gaps", "sensor_msgs/msg/JointState"): {name: f"position[{name}]" for name in PAIR_NAMES},
 }
-#: Topic names by which a role is found if there is no mapping.
+#: Topic names from which a role is guessed if no mapping is given.
 _NAMES: Final = {
     "excitation": ("excitation", "load", "wrench"),
     "head_pose": ("head_pose", "pose"),
@@ -63,14 +63,27 @@ _NAMES: Final = {
 
 @dataclass(frozen=True)
 class Role:
-    """The role of a topic: where a message has each quantity, and how to convert it.
+    """Role of a topic: the field of each quantity in a message, and its conversion to SI units.
 
-    A quantity in SI is (`scale` times the field plus `offset`) times `factor`; values outside `limits` are not used.
-    `stamp` is `header`, `log`, or for CSV and JSON the path of the time (a number in `stamp_unit`, or an ISO 8601
-    text); `clock_offset_ns` is added to the stamp. `sequence` is the path of the sender's message number, or empty.
+    A path consists of names that are separated by dots. In a path, `[3]` selects the item with the index 3 of an array,
+    and `[fx]` selects the item at the index of `fx` in the field `name` of the message. A path to a quaternion yields
+    the angle about z.
 
-    A field is a path of names. `[3]` selects an array item by its index, and `[name]` by the index of this name in the
-    message's field `name`. A path to a quaternion gives the angle about z.
+    Attributes
+    ----------
+    fields : dict
+        Path of each quantity.
+    scale, offset, factor : dict
+        Conversion of each quantity to SI: (`scale` * field + `offset`) * `factor`.
+    limits : dict
+        Range of each quantity [SI units]. Values outside the range are not used.
+    stamp : str
+        `header` (stamp of the message), `log` (receive time), or the path of the time in a CSV or JSON message. The
+        time is a number in `stamp_unit` or an ISO 8601 text.
+    clock_offset_ns : int
+        Time that is added to each stamp [ns].
+    sequence : str
+        Path of the message number that the sender assigned, or an empty string.
     """
 
     topic: str
@@ -88,7 +101,10 @@ class Role:
     stamp_unit_is_stated: bool = False
 
     def read(self, arrived: Arrived) -> tuple[int, dict[str, float]] | None:
-        """Return stamp [ns] and numbers (NaN: empty field), or None if a number or the stamp is missing."""
+        """Return the stamp [ns] and the values of a message, or None if a value or the stamp is missing.
+
+        The value of an empty field is NaN.
+        """
         values = {}
         for name, path in self.fields.items():
             value = _follow(arrived.content, path)
@@ -99,7 +115,7 @@ class Role:
         return None if stamp_ns is None else (stamp_ns, values)
 
     def in_si(self, name: str, value: Number) -> Number:
-        """Return a number or an array of the quantity `name`, given in the recording's units, in SI."""
+        """Convert a number or an array of the quantity `name` from the unit in the recording to SI."""
         return (value * self.scale.get(name, 1.0) + self.offset.get(name, 0.0)) * self.factor.get(name, 1.0)
 
     def stamp_ns(self, arrived: Arrived) -> int | None:
@@ -108,8 +124,9 @@ class Role:
         return None if stamp_ns is None else stamp_ns + self.clock_offset_ns
 
     def why_unfit(self, arrived: Arrived, *, with_value: bool = False) -> str:
-        """Return a sentence that says which field or stamp of a message is not a number; `with_value` adds its
-        value.
+        """Return a text with the first field of a message that is not a number, or with an invalid stamp.
+
+        `with_value` adds the value of the field to the text.
         """
         content = arrived.content
         if with_value and content is None:
@@ -142,7 +159,10 @@ class Role:
         return f"{self.topic} has no time at {stamp!r}{got(stamp)}, expected {expected}"
 
     def plausible(self, values: Mapping[str, Number]) -> bool:
-        """Return whether all numbers, or arrays of numbers, are within their limits; a missing number passes."""
+        """Return whether all numbers, or arrays of numbers, are within their limits.
+
+        NaN and a missing number count as within the limits.
+        """
         return not any(
             np.any((values[name] < low) | (values[name] > high))
             for name, (low, high) in self.limits.items()
@@ -150,12 +170,12 @@ class Role:
         )
 
     def empty(self, arrived: Arrived) -> bool:
-        """Return whether all fields of this role are empty in a message."""
+        """Return whether all fields of this role are empty or missing in a message."""
         content = arrived.content
         return isinstance(content, Mapping) and all(_at(content, path) in (None, "") for path in self.fields.values())
 
     def number(self, arrived: Arrived) -> int | None:
-        """Return the sender's number of the message, or None if it has no number."""
+        """Return the message number that the sender assigned, or None if the message has no number."""
         value = _follow(arrived.content, self.sequence)
         return int(value) if value is not None and math.isfinite(value) and value == int(value) >= 0 else None
 
@@ -168,10 +188,10 @@ class Role:
             if self.stamp == "header":
                 name = next((name for name in TIMES if name in content), None)
                 return received_ns if name is None else time_ns(content[name], self.stamp_unit)
-            # if the mapping names the stamp, the receive time does not replace a missing stamp
+            # if the mapping states the path of the stamp, the receive time does not replace a missing stamp
             return time_ns(_at(content, self.stamp), self.stamp_unit)
         stamp = getattr(getattr(content, "header", None), "stamp", None)
-        # types without a header have only their receive time
+        # a message without a header has no stamp, so the receive time is used
         return received_ns if stamp is None else int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
@@ -191,7 +211,7 @@ def _at(content: Mapping[str, Any], path: str) -> Any | None:
 
 def _plain_number(value: Any) -> float | None:
     if isinstance(value, str):
-        value = value.strip()  # `strip` also removes space characters that `float` refuses
+        value = value.strip()  # some space characters that `strip` removes would be refused by `float`
         if not value:
             return math.nan
         if not NUMBER.fullmatch(value):
@@ -205,7 +225,7 @@ def _plain_number(value: Any) -> float | None:
 
 
 def _follow(content: Any, path: str) -> float | None:
-    """Return the number at a path, or None if there is no number."""
+    """Return the number at `path` in a message, or None if the message has no number there."""
     if isinstance(content, Mapping):
         return _plain_number(_at(content, path))
     value = content
@@ -230,9 +250,9 @@ def _follow(content: Any, path: str) -> float | None:
 def readings(
     messages: Iterable[Arrived], roles: Mapping[str, Role]
 ) -> Iterator[tuple[str, Arrived, tuple[int, dict[str, float]] | None]]:
-    """Yield each message with each of its roles, read by `Role.read`.
+    """Yield the name of the role, the message, and the result of `Role.read` for each message and role of its topic.
 
-    If several roles share a topic, roles whose fields are all empty are left out.
+    If a topic has several roles, roles whose fields are all empty in a message are omitted.
     """
     by_topic: dict[str, list[tuple[str, Role]]] = {}
     for name, role in roles.items():
@@ -245,7 +265,10 @@ def readings(
 
 
 def stamps_by(roles: Iterable[Role]) -> StampOf[Arrived]:
-    """Return a function that returns a message's stamp [ns], from the first role that finds a stamp."""
+    """Return a function that returns the stamp of a message [ns].
+
+    If a topic has several roles, the first role that finds a stamp determines it.
+    """
     by_topic: dict[str, list[Role]] = {}
     for role in roles:
         by_topic.setdefault(role.topic, []).append(role)
@@ -258,7 +281,7 @@ def stamps_by(roles: Iterable[Role]) -> StampOf[Arrived]:
 
 
 def messages_of(source: Source, roles: Mapping[str, Role]) -> Iterator[Arrived]:
-    """Return the messages of a recording that have a role; separate files are put in order by their stamps."""
+    """Yield the messages of all topics that have a role; messages from several files are merged by their stamps."""
     topics = {role.topic for role in roles.values()}
     return source.messages(topics.__contains__, stamps_by(roles.values()))
 
@@ -268,7 +291,8 @@ def roles_by_source(
 ) -> Iterator[tuple[Source, dict[str, Role]]]:
     """Yield each recording of a run with the roles of its topics.
 
-    A role is looked for among the topics of all recordings. Topics that begin with `left_out` have no role.
+    The topics of all recordings are searched together for the topic of each role. Topics that begin with `left_out`
+    get no role.
     """
     tables = [
         {topic: kind for topic, kind in source.topics().items() if not left_out or not topic.startswith(left_out)}
@@ -280,14 +304,19 @@ def roles_by_source(
 
 
 def read_map(path: Path | None, topics: Mapping[str, TopicType] | None) -> dict[str, Role]:
-    """Return the roles of topics, by the YAML file `path` or, if it is None, by names and types.
+    """Return the roles of topics.
 
-    `topics` maps topics to types. If it is None, each topic has the type that the file states, by default JSON.
+    Parameters
+    ----------
+    path : Path or None
+        Mapping file in YAML. Without a file, the roles are guessed from the names and types of the topics.
+    topics : dict or None
+        Type of each topic. If it is None, the mapping file determines the type of a topic, which is JSON by default.
 
     Raises
     ------
     MapError
-        The file cannot be used.
+        The file cannot be read, is invalid, or does not fit the topics.
     """
     if path is None:
         topics = topics or {}
@@ -329,7 +358,7 @@ def _role(path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str, 
 
 
 def _check_nodes(path: Path, role: str, found: Role) -> None:
-    """Raise a `MapError` for settings that OPC UA nodes do not have."""
+    """Raise a `MapError` if the role of OPC UA nodes has a setting that nodes do not support."""
     if found.stamp not in (SOURCE_STAMP, SERVER_STAMP):
         raise map_error(path, f"{role}.stamp", found.stamp, f"{SOURCE_STAMP} or {SERVER_STAMP} for nodes")
     if found.stamp_unit != "ns":
@@ -339,12 +368,14 @@ def _check_nodes(path: Path, role: str, found: Role) -> None:
 
 
 def with_units(roles: Mapping[str, Role], units: Mapping[str, str]) -> dict[str, Role]:
-    """Return the roles with changed units; `units` maps a quantity (fx, x, ...; t: the stamps) to its unit.
+    """Return the roles with the units that the user states.
+
+    `units` maps the name of a quantity (fx, x, ..., or t for the stamps) to its unit.
 
     Raises
     ------
     UnitError
-        No role has a quantity of the stated name, or the stated unit is not a unit of this quantity.
+        No role has a quantity with a stated name, or a quantity cannot have the stated unit.
     """
     changed = dict(roles)
     for name, unit in units.items():
@@ -373,7 +404,10 @@ def _limits(path: Path, key: str, given: float | list[float]) -> tuple[float, fl
 
 
 def _check_columns(path: Path, name: str, role: Role) -> None:
-    """Raise a `MapError` for a name that is not a column, nor a path that begins with a column (`load.f[0]`)."""
+    """Raise a `MapError` for a field that names no column.
+
+    A path may also begin with the name of a column: `load.f[0]`.
+    """
     columns = role.message_type
     if not isinstance(columns, Columns):
         return
@@ -386,7 +420,7 @@ def _check_columns(path: Path, name: str, role: Role) -> None:
 
 
 def _check_stamp_unit(path: Path, name: str, role: Role) -> None:
-    """Raise a `MapError` for a unit that stamps cannot have."""
+    """Raise a `MapError` if the stamps of a role cannot have a unit."""
     kind, why = role.message_type, ""
     if role.stamp == "log":
         why = "none with stamp: log"
@@ -426,7 +460,7 @@ def _default_fields(role: str, kind: TopicType) -> dict[str, str]:
 
 
 def _guess(role: str, topics: Mapping[str, TopicType]) -> Role | None:
-    """Return the role of a topic that is found by its name or as the only topic of a fitting type."""
+    """Find the topic of a role by the names in `_NAMES`, or as the only topic of a fitting type."""
     fitting = {}
     for topic, kind in topics.items():
         fields = _default_fields(role, kind)
@@ -434,7 +468,7 @@ def _guess(role: str, topics: Mapping[str, TopicType]) -> Role | None:
         if enough and "/journal/" not in topic:
             fitting[topic] = fields
     ending = [topic for name in _NAMES[role] for topic in fitting if topic.rpartition("/")[2] == name]
-    # many topics have the types of forces and gaps, so these two roles are found by name only
+    # the roles `forces` and `gaps` are found by name only, because their message type is common
     lonely = list(fitting) if len(fitting) == 1 and role in ("excitation", "head_pose", "travel") else []
     lonely = [topic for topic in lonely if topic.rpartition("/")[2] not in ("head_state", "contact_forces")]
     for topic in (*ending, *lonely):
