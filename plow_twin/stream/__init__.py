@@ -1,1 +1,1 @@
-"""The stream of samples over time: order, gaps, hold policy and health counters. No module here reads a clock."""
+"""Processing of the stream of samples: order of stamps, gaps, hold policy and health counters, without a clock."""

@@ -1,7 +1,7 @@
-"""Alarms on publications, with two levels, hysteresis and a minimum duration.
+"""Alarms for published values, with two levels, hysteresis and a minimum duration.
 
-An alarm keeps its highest level, the *latched* level, until it is acknowledged. Alarms depend only on the publications,
-the measured poses and the acknowledgements, so a replay gives the same alarms.
+The highest level that an alarm has reached is its *latched* level. The latched level remains until an operator
+acknowledges the alarm. Alarms read no clock, so a replay raises the same alarms.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from plow_twin.solve.totals import summary
 from plow_twin.stream.intake import NS_PER_S
 from plow_twin.stream.outputs import CLEARANCE_NAMES, Published, Rows
 
-#: An alarm leaves a level when its value falls below this share of the level's threshold.
+#: An alarm leaves a level when its value falls below `HYSTERESIS` times the threshold of that level.
 HYSTERESIS: Final = 0.95
-#: Time [ns] over which the growth rate of the clearance is computed; from one clearance to the next it grows too
-#: little.
+#: Time [ns] over which the growth rate of the clearance is computed. Wear is too slow for a rate from two successive
+#: clearances.
 RATE_SPAN_NS: Final = 10 * NS_PER_S
-#: Time [ns] for which poses of the model are kept for late measured poses.
+#: The poses of the model are stored for this time [ns], so that a late measured pose can be compared with the model.
 _KEPT_NS: Final = 2 * NS_PER_S
 _PRUNED: Final = 500
 _MOST_WAITING: Final = 1000
 
 
 class Level(IntEnum):
-    """Severity of an alarm, on the levels of a diagnostic status."""
+    """Severity of an alarm; the numbers are the levels of a `diagnostic_msgs/DiagnosticStatus`."""
 
     NONE = 0
     WARN = 1
@@ -44,13 +44,13 @@ class Level(IntEnum):
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Values at and above which an alarm has the level warning or error; 0: never."""
+    """Values from which an alarm has the level WARN or ERROR; a threshold of 0 disables its level."""
 
     warn: float = 0.0
     error: float = 0.0
 
     def level(self, value: float, before: Level) -> Level:
-        """Return the level of a value, with hysteresis."""
+        """Return the level for `value`, with hysteresis if the present level is `before`."""
         found = Level.NONE
         for level, threshold in ((Level.WARN, self.warn), (Level.ERROR, self.error)):
             bound = threshold * HYSTERESIS if before >= level else threshold
@@ -61,7 +61,7 @@ class Thresholds:
 
 @dataclass(frozen=True)
 class Raised:
-    """Cause of a latched level: value, threshold, stamp, and the pair or axis, if any."""
+    """Cause of a latched level; `place` is the pair or axis of the value, or empty."""
 
     value: float
     threshold: float
@@ -71,16 +71,15 @@ class Raised:
 
 @dataclass
 class Alarm:
-    """The alarm of one quantity, with its present and its latched level."""
+    """Alarm for one quantity, with a present level and a latched level."""
 
     thresholds: Thresholds
     value: float = 0.0
     level: Level = Level.NONE
     latched: Level = Level.NONE
-    #: cause of the latched level
     raised: Raised | None = None
     _since_ns: int | None = None
-    #: smallest threshold; the level stays NONE while the value is below it
+    #: smallest threshold above 0; an alarm with the level NONE keeps this level while its value is below the threshold
     lowest: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -88,7 +87,10 @@ class Alarm:
         self.lowest = min((found for found in thresholds if found > 0.0), default=math.inf)
 
     def feed(self, value: float, stamp_ns: int, duration_ns: int) -> bool:
-        """Judge a value and return whether the level has changed; a higher level counts once it lasts `duration_ns`."""
+        """Update the level for a new value, and return whether the level has changed.
+
+        The level rises only after the value has stayed above a threshold for `duration_ns`.
+        """
         self.value = value
         before = self.level
         if not before and value < self.lowest:
@@ -120,14 +122,17 @@ class Alarm:
             self.raised = replace(self.raised, threshold=self._threshold())
 
     def stays(self, values: NDArray[np.float64]) -> bool:
-        """Return whether the level stays the same for all these values."""
+        """Return whether the level is NONE and all `values` leave it at NONE."""
         if self.level or self.lowest == math.inf:  # an alarm without a threshold stays quiet
             return not self.level
         return float(values.max(initial=-math.inf)) < self.lowest
 
 
 class _Model:
-    """The latest poses of the model, and the measured poses that wait for the model."""
+    """Recent poses of the model, with which measured poses are compared.
+
+    A measured pose that is newer than the model waits until the model reaches its stamp.
+    """
 
     def __init__(self) -> None:
         self._stamps_ns: list[int] = []
@@ -135,9 +140,9 @@ class _Model:
         self._waiting: list[tuple[int, float, float]] = []
 
     def add(self, stamp_ns: int, x: float, y: float) -> list[tuple[int, float]]:
-        """Add a pose of the model; return stamps and residuals [m] of the measured poses that waited for it."""
+        """Add a pose of the model; return stamp [ns] and residual [m] of each measured pose that had to wait."""
         place = bisect_left(self._stamps_ns, stamp_ns)
-        # a late sample makes the model's poses from its stamp on obsolete
+        # a stamp that is not newer belongs to a motion computed again, so the poses of the old motion are dropped
         del self._stamps_ns[place:], self._q[place:]
         self._stamps_ns.append(stamp_ns)
         self._q.append((x, y))
@@ -151,7 +156,11 @@ class _Model:
         return [found for pose in due if (found := self.residual(*pose)) is not None]
 
     def residual(self, stamp_ns: int, x: float, y: float) -> tuple[int, float] | None:
-        """Return a measured pose's stamp and distance [m] from the model; None if unknown (yet)."""
+        """Return the stamp [ns] of a measured pose and its distance [m] from the model.
+
+        The result is None for a pose that is newer than the model, which then waits, or older than all stored poses of
+        the model.
+        """
         if not self._stamps_ns or stamp_ns > self._stamps_ns[-1]:
             if len(self._waiting) < _MOST_WAITING:
                 self._waiting.append((stamp_ns, x, y))
@@ -171,12 +180,15 @@ class Alarms:
     Parameters
     ----------
     thresholds
-        By name: `force` [N], the largest force of a pair in the advances with samples since the previous publication;
-        `clearance` [m], the larger of the horizontal and the vertical clearance; `clearance_rate` [m/s], its growth
-        rate over `RATE_SPAN_NS`; `wear_rate` [m/s], the largest wear rate of a pad; `residual` [m], the distance of a
-        measured pose from the model.
+        Thresholds of each alarm, by the name of its quantity:
+
+        - `force` [N]: largest force of a pair since the previous publication, apart from advances without samples
+        - `clearance` [m]: the larger of the horizontal and the vertical clearance
+        - `clearance_rate` [m/s]: growth rate of this clearance over `RATE_SPAN_NS`
+        - `wear_rate` [m/s]: largest wear rate of a pad
+        - `residual` [m]: distance of a measured pose from the model
     duration_s
-        Time for which a level must last before the alarm takes this level [s].
+        Time [s] for which a value must stay above a threshold before the level rises.
     """
 
     def __init__(self, thresholds: Mapping[str, Thresholds], duration_s: float = 0.0) -> None:
@@ -184,13 +196,14 @@ class Alarms:
         self._duration_ns = round(duration_s * NS_PER_S)
         self._model = _Model() if "residual" in self.alarms else None
         self._clearances: deque[tuple[int, float]] = deque()
-        #: alarms whose latched level was raised by the newest row or pose
+        #: names of the alarms whose latched level was raised by the newest row or pose
         self.raised: list[str] = []
 
     def feed(self, published: Published) -> Iterator[int]:
-        """Judge publications; yield the index of each row that changes a level, before the next row is judged.
+        """Update the alarms row by row, and yield the index of each row that changes a level.
 
-        Rows without a sample are not judged.
+        While the generator is paused, the alarms have the levels at the yielded row. Rows that were computed without a
+        sample are skipped.
         """
         if len(published.rows) > 1 and self._feed_quiet(published):
             return
@@ -218,7 +231,7 @@ class Alarms:
         return changed
 
     def _place(self, row: np.void, slow: np.void | None) -> None:
-        """Note the pair or axis of each alarm that was raised."""
+        """Store in each raised alarm the pair or the axis with the largest value."""
         where = {"force": PAIR_NAMES[int(row["measured_peak"].argmax())]}
         if slow is not None:
             axis = CLEARANCE_NAMES[int(slow["clearance"][:2].argmax())]
@@ -235,7 +248,10 @@ class Alarms:
         return self._model is not None
 
     def _feed_quiet(self, published: Published) -> bool:
-        """Judge many rows at once and return True; return False, without effect, if a row may change a level."""
+        """Update the alarms with many rows at once and return True, provided that no row can change a level.
+
+        Otherwise return False and change nothing.
+        """
         rows, slow = published
         growth = self.alarms.get("clearance_rate")
         if self._model is not None or rows["held"].any() or (growth is not None and growth.lowest < math.inf):
@@ -260,7 +276,7 @@ class Alarms:
         return True
 
     def feed_pose(self, stamp_ns: int, pose: Sequence[float]) -> bool:
-        """Judge a measured pose (x, y [m], theta [rad]); return whether a level has changed."""
+        """Compare a measured pose (x, y [m], theta [rad]) with the model; return whether a level has changed."""
         found = None if self._model is None else self._model.residual(stamp_ns, pose[0], pose[1])
         if found is None:
             return False
@@ -299,7 +315,7 @@ class Alarms:
         return max((max(levels) for levels in self.levels.values()), default=Level.NONE)
 
     def acknowledge(self) -> list[str]:
-        """Acknowledge all alarms; return the names of the alarms that are still present."""
+        """Acknowledge all alarms; return the names of the alarms whose present level is above NONE."""
         for alarm in self.alarms.values():
             alarm.acknowledge()
         return [name for name, alarm in self.alarms.items() if alarm.level]

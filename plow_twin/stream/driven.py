@@ -1,5 +1,5 @@
 # ruff: noqa: D102
-"""Interfaces that a session drives: a twin, and a twin that follows measurements."""
+"""Interfaces of the twins that a session can advance."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from plow_twin.run.twin import Advanced
 
 Array = NDArray[np.float64]
 
-#: Largest number of measured poses that are kept in case the motion is computed again: ten seconds at 1 kHz.
+#: Largest number of measured poses that are stored in case the motion is computed again: ten seconds at 1 kHz.
 MOST_MEASURED: Final = 10_000
 
 
 class Driven(Protocol):
-    """The part of a twin that a session needs; `plow_twin.run.twin.Twin` documents it."""
+    """Methods and properties that a session needs of a twin; `plow_twin.run.twin.Twin` documents them."""
 
     @property
     def scene(self) -> Scene: ...
@@ -54,37 +54,46 @@ class Driven(Protocol):
 
 @runtime_checkable
 class Following(Driven, Protocol):
-    """A twin that follows measurements; its rows have more columns (`followed` in `plow_twin.solve.state.ROW`)."""
+    """A twin that is corrected by measured poses and by estimates.
+
+    Its rows also contain the fields `FOLLOWED_FIELDS` of `plow_twin.stream.outputs`.
+    """
 
     #: number of poses and estimates added so far
     added: int
-    #: whether `catch_up` does the work on intervals and measurements of a row that is published alone
+    #: whether a row that is published alone is returned before its intervals are computed, which `catch_up` does later
     defers: bool
 
     def catch_up(self) -> None:
-        """Finish the work that was left after the newest row; every other call does this first."""
+        """Finish the deferred computation for the newest row; every other method does this first."""
 
     def add_pose(self, t: float, q: ArrayLike, known: float = ...) -> None:
-        """Add a pose `q`, shape (3,), measured at model time `t` in s; components not measured are NaN.
+        """Add a pose `q`, shape (3,), measured at model time `t` in s; a component that was not measured is NaN.
 
-        The pose has an effect from model time `known` in s on.
+        The pose has no effect before the model time `known` in s.
         """
 
     def add_estimate(self, text: str, t: float, start: float = ...) -> None:
-        """Add an estimate (JSON) that has an effect from model time `t` in s on; its window begins at `start` in s."""
+        """Add an estimate (JSON) that takes effect at model time `t` in s; its window begins at model time `start` in
+        s.
+        """
 
     @property
     def known(self) -> str:
-        """The estimate that is followed (JSON); empty: the prior."""
+        """The estimate (JSON) that the twin follows; empty while it follows the prior."""
 
     def follow_estimate(self, known: str) -> None:
-        """Continue from the present state with an estimate that `known` returned."""
+        """Continue from the present state with the estimate `known`, a value of the property `known`."""
 
     def follow_parameters(self) -> None:
         """Continue as a single twin from the state of the median twin, without corrections by poses."""
 
     def end_spans(self, ends: NDArray[np.int64], begins: bool) -> None:
-        """Set which rows of the next `advance_rows` are published, and whether the first begins a span."""
+        """Set the indices `ends` of the rows that are published by the next `advance_rows`.
+
+        A span of peaks and impulses ends at each published row. `begins` states whether a new span begins with the
+        first row.
+        """
 
     def snapshot_size(self, data: bytes) -> int:
-        """Return the length of the snapshot with which `data` begins."""
+        """Return the length in bytes of the snapshot at the beginning of `data`."""

@@ -1,6 +1,7 @@
-"""Handling of arriving samples and of silence: the driver feeds a session from live events.
+"""The driver, which feeds a session with the samples of a live stream and advances it while no samples arrive.
 
-The *intake* judges each sample. During a *silence* no sample arrives, and the model follows the steady clock.
+An *intake* accepts or rejects each sample. During a *silence*, which is a stretch without samples, the model follows
+the steady clock.
 """
 
 from __future__ import annotations
@@ -41,21 +42,21 @@ from plow_twin.stream.session import Series, Session
 from plow_twin.stream.silences import Silences
 from plow_twin.stream.steps import Steps
 
-#: Stamp [ns] and wrench (Fx, Fy [N], M [N m]) of an arrived sample.
+#: Stamp [ns] and wrench (Fx, Fy [N], M [N m]) of a sample that has arrived.
 Arrival = tuple[int, tuple[float, float, float]]
 
 #: Largest model time [ns] by which one call advances during a silence.
 _LARGEST_HOLD_NS: Final = NS_PER_S
-#: Longest time between two checks for silence [ns]; the policy may change meanwhile.
+#: Longest time between two checks for silence [ns], so that a changed policy soon has an effect.
 _LONGEST_QUIET_NS: Final = NS_PER_S // 10
-#: Largest number of resets by jumps of the clock within `_RESET_WINDOW_NS`. Two clocks that disagree would otherwise
-#: reset the model for ever.
+#: Largest number of resets by jumps of the clock within `_RESET_WINDOW_NS`. Without this limit, two senders with
+#: different clocks would reset the model again and again.
 _MOST_RESETS: Final = 5
 _RESET_WINDOW_NS: Final = 10 * NS_PER_S
 
 
 class StreamState(Enum):
-    """State of the stream."""
+    """State of the stream of samples."""
 
     WAITING = "waiting for the first sample"
     RUNNING = "running"
@@ -66,12 +67,20 @@ class StreamState(Enum):
 
 @dataclass
 class Policy:
-    """Settings that may change at run time.
+    """Settings for silences and failures, which may change at run time.
 
-    After `excitation_timeout_s` without a sample, the model follows the steady clock. It stays behind the clock by this
-    time, so that samples with a smaller delay can still be used. If `hold` is `hold`, the last load is kept; if it is
-    `zero`, the load falls to zero within one call of `Driver.silence`. After a further `hold_limit_s` the model stands
-    still. After `failure_limit` failed advances in a row the model is reset (see `Failures.wants_restart`); 0: never.
+    Attributes
+    ----------
+    excitation_timeout_s : float
+        Time without a sample [s] after which the model follows the steady clock. The model stays behind the clock by
+        this time, so that a sample with a smaller delay can still be used.
+    hold : str
+        With `hold`, the last load acts during a silence. With `zero`, the load falls to zero within one call of
+        `Driver.silence`.
+    hold_limit_s : float
+        Further time without a sample [s] after which the model stands still.
+    failure_limit : int
+        Number of consecutive failed advances after which the model is reset (see `Failures.wants_restart`); 0: never.
     """
 
     excitation_timeout_s: float = 0.5
@@ -83,8 +92,8 @@ class Policy:
 class Driver:
     """Feed a session from live events and return the publications.
 
-    Times are arguments: `now_ns` is on a steady clock, and stamps are on the clock of the samples. With `every_sample`,
-    each advance is published; otherwise only `due` publishes.
+    The driver reads no clock. The argument `now_ns` is the time of a steady clock; stamps are times of the samples'
+    clock. With `every_sample`, each advance is published; otherwise only `due` publishes.
     """
 
     def __init__(self, session: Session, intake: Intake, policy: Policy, *, every_sample: bool = True) -> None:
@@ -100,7 +109,7 @@ class Driver:
         self.holds = 0
         #: number of late samples that were inserted
         self.rolled_back = 0
-        #: number of speeds that could not act at their stamps
+        #: number of travel speeds that could not take effect at their stamps
         self.travel_misplaced = 0
         #: times of the latest resets by jumps of the clock, on the steady clock [ns]
         self._resets_ns: deque[int] = deque()
@@ -110,16 +119,16 @@ class Driver:
         self.clock = Intake(jump_back_s=intake.jump_back_s, jump_forward_s=intake.jump_forward_s)
         self._received_ns = 0
         self._newest_ns: int | None = None
-        #: time up to which the real-time factor has counted [ns]
+        #: stamp up to which the model time is counted in `real_time` [ns]
         self._counted_ns: int | None = None
         self._zeroed = False
-        #: time spent inactive [ns], by which the scene's own loads lag behind the clock
+        #: time spent inactive [ns], by which the model lags behind the node's clock under the scene's own loads
         self._behind_ns = 0
         self._resumed = False
 
     @property
     def policy(self) -> Policy:
-        """The rules for silence and failures; a new policy acts at once."""
+        """The settings for silences and failures; a new policy takes effect at once."""
         return self._policy
 
     @policy.setter
@@ -135,8 +144,8 @@ class Driver:
     def samples(self, arrived: Iterable[Arrival], now_ns: int) -> Iterator[Published]:
         """Judge samples in order of arrival, advance to the accepted samples, and yield the publications.
 
-        The caller must send each publication before it asks for the next, so that a recording has them in order. A
-        sample whose stamp jumps is held back until the next sample arrives or the stream falls silent.
+        The caller must send each publication before it requests the next publication, so that a recording contains them
+        in order. A sample whose stamp jumps waits until the next sample arrives or a silence begins.
         """
         run: list[Sample] = []
         for stamp_ns, wrench in arrived:
@@ -156,10 +165,10 @@ class Driver:
     def series(
         self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], now_ns: int
     ) -> Iterator[Published | Series]:
-        """Use many samples, stamps (n,) [ns] and wrenches (n, 3), with the same outcome as `samples`.
+        """Use many samples, stamps (n,) [ns] and wrenches (n, 3), with the same motion and publications as `samples`.
 
-        Plausible samples are applied together as a `Series`, which the caller journals and publishes before it asks for
-        the next item. The other samples go through `samples`.
+        Plausible samples are applied together and yielded as a `Series`. The caller must journal and publish the series
+        before it requests the next item. All other samples are processed as in `samples`.
         """
         run: list[Sample] = []
         goes_on = self.intake.go_on(stamps, wrench)
@@ -201,9 +210,12 @@ class Driver:
     def _use_samples(
         self, run: list[Sample], stamp_ns: int, wrench: tuple[float, float, float], now_ns: int
     ) -> Iterator[Published]:
-        """Judge a sample and add it to `run`, the samples to apply together; apply `run` first where necessary."""
+        """Judge a sample and append it to `run`, a list of samples that will be applied together.
+
+        The samples already in `run` are applied first if the new sample cannot be judged or applied with them.
+        """
         late = bool(run) and self._is_late(run[0])
-        # a stamp that does not rise is late or a jump back, which can be judged only after `run` has been applied
+        # whether a stamp that does not rise is late or a jump back can be judged only after `run` has been applied
         if run and not late and stamp_ns <= run[-1].stamp_ns:
             yield from self._use(run, now_ns)
             late = False
@@ -228,7 +240,9 @@ class Driver:
         return self.session.outputs.pop()
 
     def silence(self, now_ns: int) -> Published:
-        """Advance under the hold policy if the excitation has been silent for too long; to be called at intervals."""
+        """Advance without samples if the last sample is older than `excitation_timeout_s`; the caller calls this at
+        intervals.
+        """
         if self._newest_ns is None:
             return NOTHING
         timeout_ns = round(self.policy.excitation_timeout_s * NS_PER_S)
@@ -253,7 +267,7 @@ class Driver:
         return self._advance(Hold(stamp_ns), now_ns, StreamState.STALE)
 
     def quiet_ns(self, now_ns: int) -> int:
-        """Return the time [ns] for which `silence` need not be called, whether samples arrive or not."""
+        """Return a time [ns] during which a call of `silence` would have no effect."""
         timeout_ns = round(self.policy.excitation_timeout_s * NS_PER_S)
         left_ns = timeout_ns if self._newest_ns is None else self._received_ns + timeout_ns - now_ns
         return max(0, min(left_ns, _LONGEST_QUIET_NS))
@@ -261,7 +275,7 @@ class Driver:
     def clock_tick(self, stamp_ns: int, now_ns: int) -> Published:
         """Advance under the scene's own loads to the time `stamp_ns` of the node's clock minus the time spent inactive.
 
-        The first call after `resume` only measures the time spent inactive.
+        The first call after `resume` determines the time spent inactive and does not advance the model.
         """
         reached_ns = self.session.stamp_ns
         if reached_ns is None:
@@ -284,10 +298,10 @@ class Driver:
         return self._advance(Hold(stamp_ns), now_ns, StreamState.RUNNING)
 
     def travel(self, stamp_ns: int, speed_m_s: float) -> None:
-        """Use a speed along the face [m/s] from its stamp on; the sign is the direction.
+        """Apply a travel speed along the face [m/s] from its stamp on; the sign gives the direction.
 
-        If the stamp is more than `jump_forward_s` ahead, or older than every kept state, it must come from another
-        clock. The speed then acts at once and is counted in `travel_misplaced`.
+        A stamp that is more than `jump_forward_s` ahead of the model, or older than all stored states, must come from
+        another clock. The speed then takes effect at once and is counted in `travel_misplaced`.
         """
         reached_ns, oldest_ns = self.session.stamp_ns, self.session.history.oldest_ns
         if reached_ns is not None:
@@ -299,11 +313,11 @@ class Driver:
         self.session.apply(Travel(stamp_ns, speed_m_s))
 
     def parameter(self, name: str, value: ParameterValue) -> None:
-        """Journal a parameter that has changed."""
+        """Journal a changed parameter."""
         self.session.apply(Parameter(name, value))
 
     def spread(self, stamp_ns: int, deviation: Sequence[float]) -> None:
-        """Journal the standard deviations of the load from a stamp on: Fx, Fy [N], M [N m]."""
+        """Journal the standard deviations of the load (Fx, Fy [N], M [N m]) that apply from a stamp on."""
         self.session.apply(Spread(stamp_ns, tuple(deviation)))
 
     def mark(self, stamp_ns: int, text: str) -> None:
@@ -311,13 +325,13 @@ class Driver:
         self.session.apply(Mark(stamp_ns, text))
 
     def snapshot(self) -> Snapshot:
-        """Journal and return the exact state; older samples can no longer be inserted."""
+        """Journal and return the exact state; samples older than this state can no longer be inserted."""
         snapshot = self.session.renew()
         self.session.emit(snapshot)
         return snapshot
 
     def restore(self, stamp_ns: int, snapshot: Snapshot) -> None:
-        """Return to a snapshot's motion; the next sample, whatever its stamp, is at the snapshot's time."""
+        """Return to the motion of a snapshot; the next sample, with any stamp, marks the model time of the snapshot."""
         self.failed.end()
         self.session.apply(Restore(stamp_ns, snapshot.data))
         self._begin_again()
@@ -325,24 +339,26 @@ class Driver:
         self.clock.restart()
 
     def set_model(self, stamp_ns: int, changes: Mapping[str, float]) -> None:
-        """Continue with `changes` to scene numbers, by key; all other numbers are as in the scene file.
+        """Continue with changed numbers of the scene; a number without a key in `changes` has the value of the scene
+        file.
 
         Raises
         ------
         ArgumentError
-            The change is impossible while the twin runs; the twin is unchanged.
+            If a change is impossible while the twin runs. The twin is unchanged.
         """
         self.session.check_model(changes)
         if dict(changes) != self.session.changes:
             self.session.apply(SetModel(stamp_ns, json.dumps(dict(changes))))
 
     def set_wear(self, stamp_ns: int, depth_m: Sequence[float], reason: str) -> None:
-        """Set the wear depth of each pad [m], after new pads or a measurement; the motion restarts.
+        """Set the wear depth of each pad [m], for example after a measurement or after pads were replaced; the motion
+        restarts.
 
         Raises
         ------
         ValueError
-            `depth_m` is not 8 finite depths of at least 0; the twin is unchanged.
+            If `depth_m` does not contain 8 finite depths of at least 0. The twin is unchanged.
         """
         depth = tuple(float(value) for value in depth_m)
         if len(depth) != PAIR_COUNT or not all(0.0 <= value < math.inf for value in depth):
@@ -354,23 +370,23 @@ class Driver:
         self.clock.restart()
 
     def unsteady(self, now_ns: int) -> bool:
-        """Return whether stamps have jumped repeatedly: resets were refused, or many stamps were stray."""
+        """Return whether stamps have jumped repeatedly, so that resets were refused or many stamps were stray."""
         refused = self._unsteady_ns is not None and now_ns - self._unsteady_ns < _RESET_WINDOW_NS
         return refused or self._steps.unsteady(now_ns)
 
     def reset(self, stamp_ns: int, reason: str) -> None:
-        """Reset the motion to its initial state, keep the wear; the next stamp is the new time origin."""
+        """Reset the motion to its initial state without a change of the wear; the next stamp is the new time origin."""
         self._restart_model(stamp_ns, reason, None)
         self.intake.restart()
         self.clock.restart()
 
     def resume(self, now_ns: int) -> None:
-        """Restart the measurement of silence and of the clock; the model does not catch up the time spent inactive."""
+        """Continue after a pause of the node; silence is measured from now on, and the model leaves out the pause."""
         self._received_ns = now_ns
         self._resumed = True
 
     def pause(self) -> None:
-        """Count a held-back sample as stray, because no sample will come at present."""
+        """Count a waiting sample as stray, because no sample will confirm it while the node is inactive."""
         self._steps.end()
 
     def close(self) -> None:
@@ -395,7 +411,11 @@ class Driver:
         return len(self._resets_ns) < _MOST_RESETS
 
     def _restart_model(self, stamp_ns: int, reason: str, now_ns: int | None) -> None:
-        """Reset the model; a reset by a jump of the clock has a `now_ns`, and counts towards the limit."""
+        """Reset the model.
+
+        `now_ns` is the time of a reset by a jump of the clock, which counts towards `_MOST_RESETS`; None for other
+        resets.
+        """
         if now_ns is not None:
             self._resets_ns.append(now_ns)
         self.failed.end()
@@ -416,7 +436,7 @@ class Driver:
             if len(published.rows):
                 yield published
         if self._newest_ns is None:
-            # a silence directly after a reset is measured from the stamp that the model has reached
+            # after a reset, a silence is measured from the stamp that the model has reached
             self._newest_ns = self.session.stamp_ns
 
     def _apply(self, samples: Sequence[Sample], now_ns: int) -> Published:
@@ -445,7 +465,7 @@ class Driver:
         self._counted_ns = reached_ns
 
     def _judge_rows(self, rows: Rows) -> None:
-        """Judge each of several advances, of which at least one has failed."""
+        """Update state and failures after several advances, of which at least one has failed."""
         stamps = (self.session.origin_ns or 0) + np.rint(rows["t"] * NS_PER_S).astype(np.int64)
         for status, stamp_ns in zip(rows["status"].tolist(), stamps.tolist(), strict=True):
             self._judge_advance(status, stamp_ns, StreamState.RUNNING)
@@ -467,7 +487,7 @@ class Driver:
 
 
 def counters(driver: Driver) -> dict[str, int]:
-    """Return every counter of a driver by its published name."""
+    """Return all counters of a driver, by the names under which they are published."""
     intake = driver.intake
     return {
         "samples_in": intake.arrived,

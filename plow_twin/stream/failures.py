@@ -1,4 +1,4 @@
-"""Failed advances, counted and journalled in stretches of consecutive failures, and restarts after them."""
+"""Count and journal failed advances, and decide when the motion restarts after failures."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from plow_twin.stream.journal import Failed
 class Failures:
     """Failed advances of a run.
 
-    `emit` receives a `Failed` entry at the first failure of a stretch and, if more failures follow, another for them at
-    the end of the stretch.
+    A *stretch* consists of consecutive failures. `emit` receives a `Failed` entry at the first failure of a stretch. If
+    more failures follow, it receives a second entry, which counts these failures, at the end of the stretch.
     """
 
     def __init__(self, emit: Callable[[Failed], object]) -> None:
         self._emit = emit
-        #: numbers of failed advances, and of stretches
+        #: number of failed advances, and number of stretches
         self.count = self.stretches = 0
         self.reason = ""
         #: stamps of the first and the last failed advance of the newest stretch [ns]
@@ -44,17 +44,17 @@ class Failures:
             self._emit(Failed(stamp_ns, stamp_ns, 1, reason))
 
     def end(self) -> None:
-        """End a stretch, if there is one, because an advance succeeded or the motion restarts."""
+        """End the present stretch, if any, because an advance has succeeded or the motion restarts."""
         if self._in_a_row > 1:
             self._emit(Failed(self.until_ns, self.since_ns, self._in_a_row - 1, self.reason))
         self._in_a_row = 0
 
     def wants_restart(self, limit: int) -> bool:
-        """Return whether the model should restart, after `limit` failed advances in a row; 0: never.
+        """Return whether the model should restart; it never restarts if `limit` is 0.
 
-        If the model fails again soon after a restart, the next restart waits until the new stretch is twice as long as
-        the previous stretch. The number of restarts then grows only with the logarithm of time, and at most half of the
-        time is lost in which the model could move.
+        The first restart comes after `limit` consecutive failed advances. If the model fails again soon after a
+        restart, the next restart waits until the new stretch is twice as long as the stretch before. The number of
+        restarts therefore grows only with the logarithm of time.
         """
         if not 0 < limit <= self._in_a_row:
             return False
@@ -62,7 +62,7 @@ class Failures:
         return self.until_ns - self.since_ns >= (2 * self._before_ns if at_once else 0)
 
     def restarted(self) -> str:
-        """Note that the model restarts; return the reason."""
+        """Record that the model restarts; return the reason as text."""
         self.restarts = True
         self._before_ns, self._restarted_ns = self.until_ns - self.since_ns, self.until_ns
         return f"{self._in_a_row} failed advances: {self.reason}"

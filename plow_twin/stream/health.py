@@ -1,4 +1,4 @@
-"""Figures of the running system in bounded memory: quantiles of durations, and the ratio of model time to wall time."""
+"""Performance statistics of the running twin, such as quantiles of durations and the real-time factor."""
 
 from __future__ import annotations
 
@@ -15,21 +15,23 @@ _BINS: Final = _BINS_PER_DECADE * _DECADES
 
 
 class DurationHistogram:
-    """Durations from 1 us to 100 s in bins of equal ratio, 50 per decade, so that a quantile is accurate to 2.4 %."""
+    """Histogram of durations from 1 us to 100 s, with 50 bins per decade, so that a quantile is accurate to 2.4 %."""
 
     def __init__(self) -> None:
-        # incrementing an item of a list takes a tenth of the time that an item of an array takes
+        # a list, because incrementing an item of a NumPy array takes ten times as long
         self._counts = [0] * _BINS
         self._counted = np.zeros(len(self._counts), np.int64)
         self.largest_s = 0.0
 
     @property
     def count(self) -> int:
-        """Number of durations seen."""
+        """Number of durations counted."""
         return sum(self._counts)
 
     def add(self, duration_s: float, count: int = 1) -> None:
-        """Count a duration [s], in the nearest bin if it is outside the range; a negative duration is ignored."""
+        """Count a duration [s] `count` times; durations beyond the range go to the nearest bin, negative ones are
+        ignored.
+        """
         if not duration_s >= 0.0:
             return
         if duration_s > self.largest_s:
@@ -38,11 +40,11 @@ class DurationHistogram:
         self._counts[index if index < _BINS else -1] += count
 
     def quantile(self, share: float) -> float:
-        """Return the duration [s] that the given share of all durations does not exceed; NaN without durations."""
+        """Return the quantile `share` of all durations [s]; NaN without durations."""
         return self._quantile(np.array(self._counts), share)
 
     def recent(self, share: float) -> float:
-        """Return this quantile for the durations added since the last call of this method."""
+        """Return the quantile `share` of the durations [s] added since the last call of this method."""
         counts = np.array(self._counts)
         before, self._counted = self._counted, counts
         return self._quantile(counts - before, share)
@@ -57,7 +59,7 @@ class DurationHistogram:
 
 
 class Periods:
-    """Times between the turns of a loop, and the number of missed periods."""
+    """Times between successive iterations of a periodic loop, and the number of missed periods."""
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
@@ -66,24 +68,24 @@ class Periods:
         self._recent: list[float] = []
 
     def begin(self) -> None:
-        """Start afresh, so that the next turn has no predecessor."""
+        """Forget the last iteration, so that the time to the next iteration is not measured."""
         self._before_s = math.nan
 
     def turn(self, now_s: float) -> None:
-        """Note a turn of the loop at the time `now_s` [s] of the steady clock."""
+        """Record an iteration of the loop at the time `now_s` [s] of the steady clock."""
         passed_s, self._before_s = now_s - self._before_s, now_s
         if passed_s >= 0.0:
             self._recent.append(passed_s)
             self.missed += max(0, round(passed_s / self._period_s) - 1)
 
     def recent(self) -> tuple[float, float, float]:
-        """Return mean, standard deviation and largest time [s] since the last call; NaN without turns."""
+        """Return mean, standard deviation and maximum of the times [s] since the last call; NaN without iterations."""
         found, self._recent = np.array(self._recent), []
         return (float(found.mean()), float(found.std()), float(found.max())) if found.size else (math.nan,) * 3
 
 
 class RealTimeFactor:
-    """Model seconds per wall second, since the start and since the last reading."""
+    """Real-time factor: model time divided by wall time."""
 
     def __init__(self) -> None:
         self.model_s = 0.0
@@ -100,13 +102,13 @@ class RealTimeFactor:
         self.model_s += duration_s
 
     def mean(self) -> float:
-        """Return model time over real time from the first to the newest advance; 0 before the first advance."""
+        """Return the factor from the first to the newest advance; 0 before the first advance."""
         if self._start_ns is None or self._newest_ns <= self._start_ns:
             return 0.0
         return self.model_s / ((self._newest_ns - self._start_ns) * 1e-9)
 
     def recent(self, now_ns: int) -> float:
-        """Return model time over real time since the last call of this method; 0 before the first advance."""
+        """Return the factor since the last call of this method; 0 before the first advance."""
         last_ns, last_model_s = self._last
         if self._start_ns is None or now_ns <= last_ns:
             return 0.0

@@ -1,8 +1,8 @@
-"""The last seconds of a session, kept for late samples: snapshots, and all entries since the oldest snapshot.
+"""The last seconds of a session, stored so that the motion can be computed again with a late sample.
 
-A history divides the kept time into *cells*. A session that applies samples one by one has a snapshot at the first
-sample of each cell. A session that applies many samples at once has fewer snapshots, but notes the same stamps. These
-stamps decide whether a sample is too old, so the decision depends on the journal alone.
+A history divides the stored time into *cells*. A session that applies samples one by one takes a snapshot at the first
+sample of each cell. A session that applies many samples at once takes fewer snapshots, but records the same stamps.
+Whether a sample is too old is decided from these stamps, so that the decision depends on the journal alone.
 """
 
 from __future__ import annotations
@@ -16,55 +16,57 @@ from numpy.typing import NDArray
 
 from plow_twin.stream.journal import Sample, Travel
 
-#: Number of cells in the kept time.
+#: Number of cells in the stored time.
 SNAPSHOTS: Final = 100
 
 
 class History:
-    """Snapshots at intervals, with the samples and speeds since the oldest snapshot.
+    """Snapshots at intervals, and the samples and travel speeds since the oldest snapshot.
 
-    Everything older than `span_ns` [ns] before the newest sample is forgotten; with 0 nothing is kept.
+    Data that are older than the newest sample by more than `span_ns` [ns] are dropped. With a span of 0, nothing is
+    stored.
     """
 
     def __init__(self, span_ns: int) -> None:
         self._span_ns = span_ns
         self._cell_ns = max(1, span_ns // SNAPSHOTS)
         self._snapshots: list[tuple[int, bytes]] = []
-        #: stamp of the first sample of each cell
+        #: stamp of the first sample of each cell [ns]
         self._kept_ns: list[int] = []
-        #: largest stamp in `_kept_ns` so far; after going back, no stamp is dropped until this stamp is reached again
+        #: largest stamp that `_kept_ns` has contained [ns]; after `rewind`, old stamps are dropped only beyond this
+        #: stamp
         self._newest_kept_ns: int | None = None
         self._samples: list[Sample] = []
         self._stamps_ns: list[int] = []
         self._travels: list[Travel] = []
-        #: applied samples as arrays; `_make_samples` turns them into `Sample` objects
+        #: applied samples as arrays, which `_make_samples` converts to `Sample` objects when they are needed
         self._later: deque[tuple[NDArray[np.int64], NDArray[np.float64]]] = deque()
         self._due = True
 
     @property
     def is_due(self) -> bool:
-        """Whether a snapshot is wanted before the next sample."""
+        """Whether the session should add a snapshot before the next sample."""
         return self._due and self._span_ns > 0
 
     @property
     def oldest_ns(self) -> int | None:
-        """Stamp [ns] of the oldest kept state, after which late samples can be inserted; None without a state."""
+        """Stamp [ns] after which late samples can be inserted; None if no late sample can be inserted."""
         return self._kept_ns[0] if self._kept_ns else None
 
     @property
     def earliest_ns(self) -> int | None:
-        """Stamp of the earliest kept state [ns]; the session cannot go back further."""
+        """Stamp of the oldest snapshot [ns], or None."""
         return self._snapshots[0][0] if self._snapshots else None
 
     @property
     def newest_sample_ns(self) -> int | None:
-        """Stamp of the newest sample [ns]."""
+        """Stamp of the newest stored sample [ns], or None."""
         if self._later:
             return int(self._later[-1][0][-1])
         return self._stamps_ns[-1] if self._stamps_ns else None
 
     def __contains__(self, stamp_ns: int) -> bool:
-        """Return whether there is a sample with this stamp."""
+        """Return whether a stored sample has this stamp."""
         self._make_samples()
         index = bisect_left(self._stamps_ns, stamp_ns)
         return self._stamps_ns[index : index + 1] == [stamp_ns]
@@ -77,7 +79,9 @@ class History:
         self._newest_kept_ns, self._due = None, True
 
     def add(self, stamps_ns: NDArray[np.int64], wrench: NDArray[np.float64]) -> None:
-        """Add applied samples, shapes (n,) and (n, 3); the arrays must not change afterwards."""
+        """Add applied samples: stamps [ns], shape (n,), and wrenches, shape (n, 3). The arrays must not change
+        afterwards.
+        """
         if not self._span_ns:
             return
         self._later.append((stamps_ns, wrench))
@@ -93,7 +97,7 @@ class History:
         self._keep(stamps_ns[begins])
 
     def _keep(self, stamps_ns: NDArray[np.int64]) -> None:
-        """Append rising stamps to `_kept_ns`, and forget everything older than the kept time."""
+        """Append rising stamps to `_kept_ns`, and drop data that are older than the stored time."""
         if not len(stamps_ns):
             return
         newest_ns, before_ns = int(stamps_ns[-1]), self._newest_kept_ns
@@ -132,7 +136,7 @@ class History:
         self._later.clear()
 
     def add_travel(self, travel: Travel) -> None:
-        """Add an applied speed; of speeds with equal stamps the last is kept."""
+        """Add an applied travel speed; it replaces a speed with the same stamp."""
         if not self._span_ns:
             return
         place = bisect_right(self._travels, travel.stamp_ns, key=lambda item: item.stamp_ns)
@@ -142,7 +146,7 @@ class History:
         self._travels.insert(place, travel)
 
     def add_snapshot(self, stamp_ns: int, data: bytes, *, kept: bool = True) -> None:
-        """Add a snapshot at `stamp_ns`; with `kept`, its stamp counts like that of a cell's first sample."""
+        """Add a snapshot at `stamp_ns`; with `kept`, the stamp also counts as the first stamp of a cell."""
         if not self._span_ns:
             return
         if not self._snapshots or self._snapshots[-1][0] < stamp_ns:
@@ -152,8 +156,8 @@ class History:
             self._keep(np.array([stamp_ns]))
 
     def rewind(self, stamp_ns: int) -> tuple[bytes, list[Sample], list[Travel]]:
-        """Drop everything after the last snapshot before `stamp_ns`; return the snapshot, and the dropped samples and
-        speeds.
+        """Go back to the last snapshot before `stamp_ns`; return the snapshot, and the samples and speeds dropped after
+        it.
         """
         self._make_samples()
         while self._snapshots[-1][0] >= stamp_ns:
@@ -169,7 +173,7 @@ class History:
 
 
 class RecentStamps:
-    """Stamps of a stream whose values only need sorting: a value may be late by up to `span_s`."""
+    """Stamps of measurements that may arrive out of order, up to `span_s` [s] late, and need no computation again."""
 
     def __init__(self, span_s: float) -> None:
         self._span_ns = round(span_s * 1e9)
@@ -177,7 +181,7 @@ class RecentStamps:
 
     @property
     def oldest_ns(self) -> int | None:
-        """Stamp before which no sample can be used [ns]; None before the first sample."""
+        """Stamp before which no measurement can be used [ns]; None before the first measurement."""
         return self._stamps_ns[-1] - self._span_ns if self._stamps_ns else None
 
     def __contains__(self, stamp_ns: int) -> bool:
@@ -190,7 +194,7 @@ class RecentStamps:
         self._stamps_ns.clear()
 
     def add(self, stamp_ns: int) -> None:
-        """Add a stamp, and drop the stamps that are now too old."""
+        """Add a stamp, and drop stamps that have become too old."""
         insort(self._stamps_ns, stamp_ns)
         if self._stamps_ns[0] < self._stamps_ns[-1] - 2 * self._span_ns:
             del self._stamps_ns[: bisect_left(self._stamps_ns, self._stamps_ns[-1] - self._span_ns)]

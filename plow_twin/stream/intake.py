@@ -1,6 +1,7 @@
 """The decision whether an arriving sample is used, and counts of unused samples by reason.
 
-Stamps *jump* if they differ by more than a late or missing sample explains: the sender's clock has stepped.
+A stamp *jumps* if it differs from the stamps before by more than late or missing samples can explain. The cause is
+usually a step of the sender's clock.
 """
 
 from __future__ import annotations
@@ -19,39 +20,39 @@ NS_PER_S = 1_000_000_000
 
 
 class KnownStamps(Protocol):
-    """Stamps of the past, among which a late sample can be inserted."""
+    """Stamps of earlier samples, among which a late sample can be inserted."""
 
     @property
     def oldest_ns(self) -> int | None:
-        """Stamp after which late samples can be inserted [ns]; None: no late sample can be inserted."""
+        """Stamp [ns] after which late samples can be inserted; None if no late sample can be inserted."""
 
     def __contains__(self, stamp_ns: int) -> bool:
-        """Return whether there is a sample with this stamp."""
+        """Return whether an earlier sample has this stamp."""
 
 
 class Verdict(Enum):
-    """Result of the judgement of a sample; the value is the name of its counter."""
+    """Decision on a sample; the value is the name of its counter."""
 
     ACCEPTED = "accepted"
-    #: accepted after a reset: the stamps stepped back by more than `jump_back_s`
+    #: accepted after a reset, because the stamps stepped back by more than `jump_back_s`
     JUMP_BACK = "jump_back"
-    #: accepted after a reset: the stamps stepped forward by more than `jump_forward_s`
+    #: accepted after a reset, because the stamps stepped forward by more than `jump_forward_s`
     JUMP_FORWARD = "jump_forward"
     NON_FINITE = "non_finite"
     UNSTAMPED = "unstamped"
     DUPLICATE = "duplicate"
     OUT_OF_ORDER = "out_of_order"
-    #: the model has passed the stamp, and no kept state is older than the stamp
+    #: older than the time reached by the model and than all stored states, so the sample cannot be inserted
     LATE = "late"
-    #: the model has passed the stamp, and the sample is inserted at its place
+    #: older than the time reached by the model, and inserted at its place in time
     WORKED_IN = "worked_in"
-    #: a value is impossibly large, or changes impossibly fast
+    #: a value or its rate of change exceeds the `Limits`
     IMPLAUSIBLE = "implausible"
-    #: the stamps jump repeatedly, so this jump does not reset the model
+    #: the stamps have jumped too often, so this jump does not reset the model
     UNSTEADY = "unsteady"
-    #: the stamp jumped but the next stamp did not, so only this stamp was wrong
+    #: the next sample did not confirm the jump of the stamp, so the stamp was wrong
     STRAY = "stray"
-    #: names or lengths of the message do not fit the scene
+    #: names or array lengths of the message do not match the scene
     MALFORMED = "malformed"
     #: arrived on a topic that is not the selected excitation source
     NOT_SELECTED = "not_selected"
@@ -60,11 +61,11 @@ class Verdict(Enum):
     #: arrived before the first message on /clock
     NO_CLOCK = "without_clock"
 
-    # the hash of an enumeration is slow, so verdicts are hashed by identity
+    # `Enum.__hash__` hashes the name on each call; hashing by identity is faster
     __hash__ = object.__hash__
 
     def __init__(self, name: str) -> None:
-        #: whether the model is reset before the sample is used
+        #: whether the model must be reset before it uses the sample
         self.resets = name in ("jump_back", "jump_forward")
         self.used = self.resets or name in ("accepted", "worked_in")
 
@@ -73,18 +74,18 @@ def _ignore(verdict: Verdict, stamp_ns: int, values: Sequence[float]) -> None: .
 
 
 class Intake:
-    """Judge one stream of stamped samples, in order of arrival.
+    """Judge the samples of one stream in order of arrival.
 
     Parameters
     ----------
     jump_back_s
-        A stamp that is older than the newest stamp by more than this [s] is a jump; otherwise the sample is late.
+        Largest age [s] of a late sample relative to the newest stamp; an older stamp is a jump.
     jump_forward_s
-        A stamp that is newer than the model's time by more than this [s] is a jump.
+        Largest time [s] by which a stamp may be ahead of the model; a later stamp is a jump.
     expected_rate_hz
-        Rate of the samples [Hz], from which missing samples are counted; 0: unknown.
+        Expected rate of the samples [Hz], from which missing samples are counted; with 0, they are not counted.
     limits
-        Largest plausible values and rates of change; None: any finite value is plausible.
+        Largest plausible values and rates of change; with None, every finite value is plausible.
     on_unused
         Function that receives the reason, stamp [ns] and values of each unused sample.
     """
@@ -104,15 +105,14 @@ class Intake:
         self.expected_rate_hz = expected_rate_hz
         self.limits = limits
         self.counts: dict[Verdict, int] = dict.fromkeys(Verdict, 0)
-        #: number of used samples with a component outside the plane
+        #: number of used samples whose wrench has a component outside the plane of the motion
         self.out_of_plane = 0
         self._newest_ns: int | None = None
         self._newest_values: Sequence[float] = ()
         self._before_jump_ns: int | None = None
-        #: whether the last sample returned to the stamps from before a jump, so that the stamps since the jump were
-        #: wrong
+        #: whether the last sample continued the stamps from before a jump, so that the stamps since the jump were wrong
         self.returned = False
-        #: number of samples missing up to the last jump
+        #: number of missing samples before the last jump
         self._missing_before = 0
         self._first_ns = 0
         self._since_first = 0
@@ -124,8 +124,8 @@ class Intake:
 
     @property
     def missing(self) -> int:
-        """Number of missing samples, at the expected rate, from first to newest stamp; extra samples make up for
-        gaps.
+        """Number of missing samples: the number expected from the first to the newest stamp, minus the samples
+        received.
         """
         if self._newest_ns is None or self.expected_rate_hz <= 0.0:
             return self._missing_before
@@ -145,7 +145,7 @@ class Intake:
         history: KnownStamps | None = None,
         may_reset: bool = True,
     ) -> Verdict:
-        """Judge one sample, count it and return the verdict.
+        """Judge one sample, count it under its verdict, and return the verdict.
 
         Parameters
         ----------
@@ -154,12 +154,12 @@ class Intake:
         values
             All numbers of the sample.
         reached_ns
-            Time that the model has reached [ns], None before its first sample.
+            Stamp that the model has reached [ns], None before the first sample.
         history
-            The stamps of the past, among which late samples are inserted.
+            Stamps of earlier samples, among which late samples are inserted.
         may_reset
-            Whether a jump may reset the model now. A return to the stamps from before the last jump always may;
-            otherwise a single wrong stamp could exclude all correct stamps.
+            Whether a jump may reset the model now. A jump that continues the stamps from before the last jump always
+            resets the model. Otherwise a single wrong stamp could exclude all correct stamps.
         """
         verdict = self._judge(stamp_ns, values, reached_ns, history)
         self.returned = verdict.resets and self._goes_on_from_before(stamp_ns)
@@ -171,7 +171,7 @@ class Intake:
             return verdict
         if self._newest_ns is None or verdict.resets:
             self._missing_before, self._first_ns, self._since_first = self.missing, stamp_ns, 0
-            # after a return the newest stamp is wrong, and no later sample may return to it
+            # after such a return the newest stamp is known to be wrong, so no later sample may continue from it
             self._before_jump_ns = None if self.returned else self._newest_ns
         self._since_first += 1
         if self._newest_ns is None or verdict.resets or stamp_ns > self._newest_ns:
@@ -179,21 +179,21 @@ class Intake:
         return verdict
 
     def jumps(self, stamp_ns: int, reached_ns: int | None = None) -> bool:
-        """Return whether `judge` would find that a stamp jumps."""
+        """Return whether `judge` would treat a stamp as a jump."""
         newest_ns = self._newest_ns if self._newest_ns is not None else reached_ns
         if newest_ns is None or stamp_ns <= 0:
             return False
         return not self.near(stamp_ns, newest_ns, reached_ns)
 
     def near(self, stamp_ns: int, newest_ns: int, reached_ns: int | None = None) -> bool:
-        """Return whether a stamp follows the newest stamp and the model's time without a jump."""
+        """Return whether a stamp is no jump relative to the stamp `newest_ns` and to the time `reached_ns` of the
+        model.
+        """
         ahead_ns = stamp_ns - (newest_ns if reached_ns is None else max(newest_ns, reached_ns))
         return ahead_ns <= self.jump_forward_s * NS_PER_S and newest_ns - stamp_ns <= self.jump_back_s * NS_PER_S
 
     def goes_on(self, stamp_ns: int, values: Sequence[float], reached_ns: int) -> bool:
-        """Return whether a sample, like most samples, is certain to be accepted; otherwise `jumps` and `judge`
-        decide.
-        """
+        """Return whether a quick check shows that a sample will be accepted; otherwise `jumps` and `judge` decide."""
         newest_ns = self._newest_ns
         if newest_ns is None or self.limits is None:
             return False
@@ -203,7 +203,7 @@ class Intake:
         return self.limits.keep(self._newest_values, values, (stamp_ns - newest_ns) * 1e-9)
 
     def go_on(self, stamps_ns: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return `goes_on` for each sample after the first, with the previous sample as newest."""
+        """Return `goes_on` of each sample relative to the sample before, shape (n-1,), for n samples."""
         if self.limits is None:
             return np.zeros(len(stamps_ns) - 1, bool)
         ahead_ns = np.diff(stamps_ns)
@@ -211,21 +211,27 @@ class Intake:
         return near & self.limits.kept(values, ahead_ns * 1e-9)
 
     def accept(self, stamp_ns: int, values: Sequence[float], count: int = 1) -> None:
-        """Count a sample for which `goes_on` is True, or the last of `count` such samples."""
+        """Count `count` samples for which `goes_on` is True; stamp and values are of the last of these samples."""
         self.returned = False
         self.counts[Verdict.ACCEPTED] += count
         self._since_first += count
         self._newest_ns, self._newest_values = stamp_ns, values
 
     def refuse(self, verdict: Verdict, stamp_ns: int = 0, values: Sequence[float] = ()) -> None:
-        """Count a sample that was dropped before it could be judged; an unreadable sample has no values."""
+        """Count a sample that is dropped without a call of `judge`.
+
+        Raises
+        ------
+        ValueError
+            If the verdict is not a reason to drop a sample.
+        """
         if verdict.used:
             raise ValueError(f"verdict: got {verdict.value}, expected a reason to drop")
         self.counts[verdict] += 1
         self._on_unused(verdict, stamp_ns, values)
 
     def restart(self) -> None:
-        """Forget the newest stamp, so that the next sample is treated as the first; the counts are kept."""
+        """Forget the newest stamp, so that the next sample is treated as the first sample; the counts do not change."""
         self._missing_before = self.missing
         self._newest_ns = None
 
@@ -248,7 +254,7 @@ class Intake:
             return Verdict.JUMP_FORWARD
         if ahead_ns > 0:
             return Verdict.IMPLAUSIBLE if self._too_fast(stamp_ns, values) else Verdict.ACCEPTED
-        # the sender's own stamps show a jump back; the hold policy may have moved the model ahead of them
+        # the newest stamp decides here, because during a silence the model may have moved ahead of the stamps
         if newest_ns - stamp_ns > self.jump_back_s * NS_PER_S:
             return Verdict.JUMP_BACK
         if history is not None and history.oldest_ns is not None and stamp_ns > history.oldest_ns:

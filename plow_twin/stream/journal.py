@@ -1,6 +1,7 @@
-"""Entries that the twin accepted, in order of use; from them a second run repeats the first run exactly.
+"""Entries of the journal, which records the inputs of a twin in order of use.
 
-Stamps are integer nanoseconds on the clock of the samples; they are never rounded through a float.
+A replay of the entries repeats the run exactly. Stamps are integer nanoseconds on the clock of the samples. They are
+never converted to floats, which would round them.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ ParameterValue = bool | int | float | str
 class Sample:
     """Advance to `stamp_ns`; the load varies linearly from the previous sample to this sample.
 
-    `wrench` is Fx, Fy [N] and M [N m] about the cavity's centre, without gravity. A stamp that the model has passed
-    belongs to a late sample, which is inserted at its place in time.
+    `wrench` is Fx, Fy [N] and M [N m] about the cavity's centre, without gravity. A sample older than the time reached
+    by the model is inserted at its place in time.
     """
 
     stamp_ns: int
@@ -25,7 +26,9 @@ class Sample:
 
 @dataclass(frozen=True)
 class Hold:
-    """Advance to `stamp_ns` with the last load held, or under the scene's own loads if they are the excitation."""
+    """Advance to `stamp_ns` under a constant load, the last load, or under the scene's own loads if they excite the
+    head.
+    """
 
     stamp_ns: int
 
@@ -47,7 +50,7 @@ class Travel:
 
 @dataclass(frozen=True)
 class Reset:
-    """The motion returns to the initial state and the wear stays; the next stamp is the new origin of model time."""
+    """Return to the initial state without a change of the wear; the next stamp is the new origin of model time."""
 
     stamp_ns: int
     reason: str
@@ -55,7 +58,7 @@ class Reset:
 
 @dataclass(frozen=True)
 class SetWear:
-    """The wear depths become `depth_m` (8 numbers), after new pads or a measurement; the motion is reset."""
+    """Set the wear depths [m] of the 8 pads, after a measurement or after pads were replaced, and reset the motion."""
 
     stamp_ns: int
     depth_m: tuple[float, ...]
@@ -64,10 +67,9 @@ class SetWear:
 
 @dataclass(frozen=True)
 class SetModel:
-    """Numbers of the scene change: `changes` is a JSON object of numbers by their keys in the scene file.
+    """Change numbers of the scene, but not pose, rates and wear; contacts start without history.
 
-    `changes` has all numbers that differ from the scene of the run. Pose, rates and wear are kept; contacts start
-    without history.
+    `changes` is a JSON object with all numbers that differ from the scene of the run, by their keys in the scene file.
     """
 
     stamp_ns: int
@@ -76,7 +78,9 @@ class SetModel:
 
 @dataclass(frozen=True)
 class Restore:
-    """The motion continues from the snapshot `data`, and the wear stays; the next stamp is at the snapshot's time."""
+    """Continue from the motion in the snapshot `data` with the present wear; the next stamp is at the snapshot's
+    time.
+    """
 
     stamp_ns: int
     data: bytes
@@ -84,7 +88,7 @@ class Restore:
 
 @dataclass(frozen=True)
 class Mark:
-    """A mark set by the operator."""
+    """A remark that the operator has attached to a time."""
 
     stamp_ns: int
     text: str
@@ -92,9 +96,10 @@ class Mark:
 
 @dataclass(frozen=True)
 class Failed:
-    """`advances` advances up to `stamp_ns` have failed, in a stretch that began at `since_ns`; no effect on the motion.
+    """Report that `advances` advances up to `stamp_ns` failed; the entry has no effect on the motion.
 
-    A stretch of failures has one entry at its first failure, and another at its end for all further failures.
+    Consecutive failures form a stretch, which began at `since_ns`. The first failure of a stretch has an entry of its
+    own. A second entry, at the end of the stretch, counts all further failures.
     """
 
     stamp_ns: int
@@ -105,7 +110,7 @@ class Failed:
 
 @dataclass(frozen=True)
 class Spread:
-    """Standard deviations of the load, Fx, Fy [N] and M [N m], from `stamp_ns` on; no effect on the motion."""
+    """Standard deviations of the load (Fx, Fy [N], M [N m]) from `stamp_ns` on, without effect on the motion."""
 
     stamp_ns: int
     deviation: tuple[float, ...]
@@ -113,7 +118,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter that affects the model has the new `value`."""
+    """Change of a parameter that affects the model, to `value`."""
 
     name: str
     value: ParameterValue
@@ -121,9 +126,9 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Pose:
-    """The head was measured at `pose` (x, y [m], theta [rad]) at `stamp_ns`; kept for the estimate.
+    """Measured pose of the head (x, y [m], theta [rad]), an input of the estimate.
 
-    `deviation` has the three standard deviations that came with the pose, or is empty.
+    `deviation` contains the standard deviations [m, m, rad] that were sent with the pose, or is empty.
     """
 
     stamp_ns: int
@@ -133,7 +138,11 @@ class Pose:
 
 @dataclass(frozen=True)
 class PartOfPose:
-    """Only `components` (0, 1, 2: x, y, theta) of a pose were measured: `values` [m, rad], kept for the estimate."""
+    """Measured pose with missing components, an input of the estimate.
+
+    `components` contains the indices of the measured components (0: x, 1: y, 2: theta), and `values` their values [m,
+    rad].
+    """
 
     stamp_ns: int
     components: tuple[int, ...]
@@ -142,7 +151,7 @@ class PartOfPose:
 
 @dataclass(frozen=True)
 class Gaps:
-    """Sensors have measured the `gaps` [m] of the pairs numbered `pairs` at `stamp_ns`; kept for the estimate."""
+    """Measured gaps [m] of the pairs with the indices `pairs`, an input of the estimate."""
 
     stamp_ns: int
     pairs: tuple[int, ...]
@@ -151,12 +160,12 @@ class Gaps:
 
 @dataclass(frozen=True)
 class Unused:
-    """`count` messages of `sender` arrived on the input `topic` and were not used; no effect on the motion.
+    """Messages of `sender` on the input `topic` that were not used; the entry has no effect on the motion.
 
-    `reason` is the name in a counter `dropped_<reason>`, or `not_followed`, or `lost` for messages that never arrived
-    (a negative `count` means that they arrived after all). `stamps_ns` and `values` have an item for each message, or
-    only for the first of very many messages. An unreadable message has no values and stamp 0. Values need not be
-    finite.
+    `reason` is `not_followed`, `lost` (for messages that never arrived), or the name of a reason in a counter
+    `dropped_<reason>`. A negative `count` withdraws a loss, because the messages arrived after all. `stamps_ns` and
+    `values` have an item for each message, or only for the first of very many messages. An unreadable message has the
+    stamp 0 and no values. Values need not be finite.
     """
 
     topic: str
@@ -169,12 +178,21 @@ class Unused:
 
 @dataclass(frozen=True)
 class Estimated:
-    """The estimate from the window that begins at `start_ns` and ends just before `end_ns` is finished.
+    """A finished estimate, from the measurements of a window.
 
-    `samples` and `poses` count the load samples and poses in the window; the fit began at `guess`, or with a search if
-    `guess` is empty. From this entry on, the 6 numbers of `shift` [m] are added to the model's horizontal clearance
-    (with wear) and its 5 % and 95 % quantiles, and to the same three numbers of the vertical clearance. `result` is the
-    whole estimate (JSON).
+    Attributes
+    ----------
+    start_ns, end_ns : int
+        Beginning and end of the window; the end is not part of the window.
+    samples, poses : int
+        Numbers of load samples and of poses in the window.
+    guess : tuple of float
+        Starting point of the fit; empty if the fit began with a search.
+    shift : tuple of float, length 6
+        Shifts [m] that are added to the model's clearances from this entry on. Three shifts are for the horizontal
+        clearance (with wear), its 5 % and its 95 % quantile; three are for the vertical clearance.
+    result : str
+        The whole estimate (JSON).
     """
 
     start_ns: int
@@ -188,7 +206,7 @@ class Estimated:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The exact state of the session at `stamp_ns`, from which a run can be resumed."""
+    """Exact state of the session at `stamp_ns`, from which a run can be resumed."""
 
     stamp_ns: int
     data: bytes
@@ -204,7 +222,7 @@ class Digest:
 
 @dataclass(frozen=True)
 class Loss:
-    """`count` entries before this entry were lost; a `Snapshot` follows."""
+    """Loss of `count` entries before this entry; a `Snapshot` follows."""
 
     count: int
 
@@ -234,6 +252,6 @@ Entry = (
 
 
 def whole_pose(part: PartOfPose) -> tuple[float, ...]:
-    """Return x, y [m] and theta [rad], NaN for a component that was not measured."""
+    """Return x, y [m] and theta [rad] of a pose, with NaN for each component that was not measured."""
     known = dict(zip(part.components, part.values, strict=True))
     return tuple(known.get(index, math.nan) for index in range(3))

@@ -1,4 +1,4 @@
-"""Numbers of a scene that can change while its twin runs, because they need no new compiled code."""
+"""Changes of a scene's numbers while its twin runs, limited to numbers that need no new compiled code."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from plow_twin.errors import ArgumentError
 from plow_twin.model.scene import Scene
 from plow_twin.stream.driven import Driven
 
-#: Keys in the scene file of the numbers that can change, each with its smallest value.
+#: Smallest value of each number that can change, by its key in the scene file.
 CHANGEABLE: Final[Mapping[str, float]] = {
     "clearance.horizontal_m": 0.0,
     "clearance.vertical_m": 0.0,
@@ -29,7 +29,7 @@ def changed_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
     Raises
     ------
     ArgumentError
-        A key or a number cannot be used.
+        If a key is not in `CHANGEABLE`, or a number is not allowed in the scene.
     """
     for key, value in changes.items():
         if key not in CHANGEABLE:
@@ -48,12 +48,12 @@ def changed_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
 
 
 def changed_twin(twin: Driven, scene: Scene, changes: Mapping[str, float]) -> Driven:
-    """Return a twin of `scene` with `changes`, at the scene's initial state, with the settings of `twin`.
+    """Return a twin of the changed scene, in the initial state of the scene and with the settings of `twin`.
 
     Raises
     ------
     ArgumentError
-        As for `changed_scene`, or the changed scene needs new compiled code, which a live twin has no time to compile.
+        As for `changed_scene`, or if the changed scene needs new compiled code. A live twin has no time to compile.
     """
     found = twin.like(changed_scene(scene, changes))
     if found.signature != twin.signature:
@@ -65,12 +65,12 @@ def changed_twin(twin: Driven, scene: Scene, changes: Mapping[str, float]) -> Dr
 
 
 def read_changes(text: str) -> dict[str, float]:
-    """Return changes from their JSON text.
+    """Return the changes, by key of the scene file, from their JSON text.
 
     Raises
     ------
     ArgumentError
-        The text is not a JSON object of numbers by key.
+        If the text is not a JSON object of numbers.
     """
     try:
         found = json.loads(text)

@@ -1,8 +1,8 @@
-"""Publications of the motion: each row sums up the motion since the previous row.
+"""Publications of the motion; each row summarises the motion since the previous row.
 
-The *window* is the motion since the previous publication. A *slow part* has clearances and wear rates, which change
-slowly: at most one publication in 0.1 s has a slow part. Publications depend on the journal alone, so a replay forms
-the same publications bit for bit.
+The *window* is the motion since the previous publication. A *slow part* contains clearances and wear rates. These
+change slowly, so at most one publication in 0.1 s has a slow part. Publications depend on the journal alone, so a
+replay gives bit-identical publications.
 """
 
 from __future__ import annotations
@@ -24,20 +24,21 @@ from plow_twin.solve.totals import publish, publish_window, summary
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 
-#: Length of a span of stamps [ns]; only the first publication in a span has a slow part.
+#: Period of the slow parts [ns]; only the first publication in each period has a slow part.
 SLOW_PERIOD_NS: Final = 100_000_000
 
 PAD_NAMES: Final = tuple(f"pad_{name}" for name in PAIR_NAMES)
 _CLEARANCES: Final = ("horizontal", "vertical", *PAD_NAMES)
-#: Names of the numbers in `clearance`: the best values, then the 5 % and 95 % quantiles of each value.
+#: Names of the numbers in the field `clearance`: all best values, then the 5 % and 95 % quantiles of each value.
 CLEARANCE_NAMES: Final = (*_CLEARANCES, *(f"{name}/{point}" for name in _CLEARANCES for point in ("p05", "p95")))
 
-#: The two pads on each side: left, right, top, bottom.
+#: Indices of the two pads on each side, in the order left, right, top, bottom.
 _ON_SIDES: Final = np.array(
     [np.flatnonzero(side) for side in (NORMAL_X < 0.0, NORMAL_X > 0.0, NORMAL_Y > 0.0, NORMAL_Y < 0.0)]
 )
 _STATE_SIZE: Final = 4 * PAIR_COUNT
-#: A slow part: clearances in the order of `CLEARANCE_NAMES` [m], growth of each pad's wear [m/s].
+#: Record of a slow part. `clearance` is in the order of `CLEARANCE_NAMES` [m]; `wear_rate` is the growth of each wear
+#: depth [m/s].
 SLOW: Final = np.dtype(
     [
         ("stamp_ns", "i8"),
@@ -46,9 +47,9 @@ SLOW: Final = np.dtype(
         ("wear_rate", "f8", (PAIR_COUNT,)),
     ]
 )
-#: Indices of the rows to publish: the only row.
+#: Indices of the rows to publish if there is a single row.
 THE_ONE: Final = np.zeros(1, np.int64)
-#: Indices of the rows to publish: no row.
+#: Indices of the rows to publish if no row is published.
 NONE: Final = np.zeros(0, np.int64)
 _NO_ROWS: Final = np.zeros(0, ROW)
 _NO_SLOW: Final = np.zeros(0, SLOW)
@@ -56,16 +57,16 @@ FOLLOWED_FIELDS: Final = (
     "followed", "known_clearance", "force_low", "force_high", "peak_low", "peak_high", "impulse_low", "impulse_high",
 )  # fmt: skip
 _MOTION: Final = ("t", "stamp_ns", "held", "q", "v", "penetration", "rate", "force", "wear_depth", *FOLLOWED_FIELDS)
-#: Fields that `summary` sums up, to find numbers that are not finite.
+#: Fields that are checked for numbers that are not finite.
 _SUMMED: Final = ("q", "v", "penetration", "rate", "force", "impulse", "peak")
-#: Indexes in `clearance` of the numbers of `known_clearance`, and of an estimate's six shifts.
+#: Indices in `clearance` of the six numbers in `known_clearance`, which are also those that an estimate shifts.
 _KNOWN: Final = np.array([0, len(_CLEARANCES), len(_CLEARANCES) + 1, 1, len(_CLEARANCES) + 2, len(_CLEARANCES) + 3])
-#: Number of rows made at once, because numpy makes many rows in the time of a single row.
+#: Number of rows allocated at once; NumPy allocates them in about the time of a single row.
 _STOCK: Final = 256
 
 
 class Published(NamedTuple):
-    """A publication: rows of type `ROW`, shape (n,), and slow parts of some of them, of type `SLOW`, shape (m,)."""
+    """A publication: `rows` of type `ROW`, shape (n,), and the slow parts of some rows, of type `SLOW`, shape (m,)."""
 
     rows: Rows
     slow: Rows
@@ -83,23 +84,23 @@ class Published(NamedTuple):
 
     @property
     def with_intervals(self) -> bool:
-        """Whether the first row has intervals of its forces."""
+        """Whether the first row contains intervals of its forces."""
         return len(self.rows) > 0 and int(self.rows["followed"][0]) == WITH_INTERVALS
 
     def at(self, index: int) -> Published:
-        """Return one row and its slow part."""
+        """Return the row with the given index, and its slow part if it has one."""
         slow = self.slow[self.slow["row"] == index]
         return Published(self.rows[index : index + 1], _numbered_from(slow, index))
 
     def of(self, index: NDArray[np.int64]) -> Published:
-        """Return the rows with the given rising indices, and their slow parts."""
+        """Return the rows with the given indices, which must rise, and the slow parts of these rows."""
         slow = self.slow[np.isin(self.slow["row"], index)]
         slow["row"] = np.searchsorted(index, slow["row"])
         return Published(self.rows[index], slow)
 
     @classmethod
     def joined(cls, parts: Sequence[Published]) -> Published:
-        """Return several publications joined to one."""
+        """Return the concatenation of several publications."""
         if len(parts) == 1:
             return parts[0]
         begins = np.cumsum([0, *(len(part.rows) for part in parts)]).tolist()
@@ -112,7 +113,7 @@ NOTHING: Final = Published(_NO_ROWS, _NO_SLOW)
 
 
 def _numbered_from(slow: Rows, first: int) -> Rows:
-    """Return slow parts with row indices relative to the row `first`."""
+    """Return a copy of slow parts whose row indices count from the row `first`."""
     if len(slow):
         slow = slow.copy()
         slow["row"] -= first
@@ -120,13 +121,13 @@ def _numbered_from(slow: Rows, first: int) -> Rows:
 
 
 class Stock:
-    """Supply of new rows; each row is handed out once, so that a kept publication never changes."""
+    """Allocator of rows. Each row is used only once, so that a stored publication never changes."""
 
     def __init__(self) -> None:
         self._rows, self._used = _NO_ROWS, 0
 
     def new(self, count: int) -> Rows:
-        """Return unused rows."""
+        """Return `count` rows that have not been used before."""
         if self._used + count > len(self._rows):
             self._rows, self._used = np.zeros(max(count, _STOCK), ROW), 0
         begin, self._used = self._used, self._used + count
@@ -134,10 +135,10 @@ class Stock:
 
 
 def clearances(scene: Scene, wear_depth: Array) -> Array:
-    """Return the horizontal and the vertical clearance and the eight pad depths, (..., 10) [m], from wear depths (...,
-    8).
+    """Return the horizontal and vertical clearance, followed by the eight wear depths, shape (..., 10) [m].
 
-    The wall of a side is assumed to move out by the mean wear depth of its two pads.
+    `wear_depth` has the shape (..., 8). The wall of a side is assumed to move out by the mean wear depth of its two
+    pads.
     """
     moved = 0.5 * (wear_depth[..., _ON_SIDES[:, 0]] + wear_depth[..., _ON_SIDES[:, 1]])
     found = np.empty((*wear_depth.shape[:-1], len(_CLEARANCES)))
@@ -148,10 +149,12 @@ def clearances(scene: Scene, wear_depth: Array) -> Array:
 
 
 def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
-    """Return the 5 % and 95 % quantiles of the pad depths under the wear prior, shape (8,) each [m].
+    """Return the 5 % and 95 % quantiles of the wear depths under the prior of the wear coefficient, shape (8,) each
+    [m].
 
-    The growth of a depth, with running-in removed, is assumed to be proportional to the wear coefficient k_s. This
-    holds while the growth is small compared with the clearance. Without wear both quantiles equal the wear depth.
+    The growth of a depth, without running-in, is assumed to be proportional to the wear coefficient k_s. This
+    approximation holds while the growth is small compared with the clearance. Without wear, both quantiles equal the
+    wear depth.
     """
     if scene.wear is None or scene.wear.coefficient_m2_n == 0.0:
         return wear_depth, wear_depth
@@ -165,53 +168,54 @@ def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
 
 
 class Outputs:
-    """Sum up advances to publications, which keep the peaks, impulses and touches of any number of advances."""
+    """Combine advances into publications without losing a peak, an impulse or a touch."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._publish = scene, _publish()
-        #: the window; while `_waits` is 1, it includes the newest advance, which is not published yet
+        #: the window, which includes the newest advance while `_waits` is 1
         self._window = np.zeros(1, ROW)
         self._waits = 0
         self._stock = Stock()
-        #: stamp and pad depths of the last slow part
+        #: stamp [ns] and wear depths [m] of the last slow part
         self._slow_ns: int | None = None
         self._slow_wear_depth = np.zeros(PAIR_COUNT)
-        #: stamp from which the motion was computed again [ns]; valid while the window is marked as corrected
+        #: stamp from which the motion was computed again [ns], valid while the field `corrected` of the window is 1
         self._corrected_ns = 0
-        #: the window before this correction, if an advance waited in it
+        #: the window before the motion was computed again, if it contained an unpublished advance
         self._before: Rows | None = None
-        #: shifts of the numbers in `CLEARANCE_NAMES` by an estimate
+        #: shifts by an estimate, in the order of `CLEARANCE_NAMES` [m]; None if all are zero
         self._shift: Array | None = None
 
     def set_shift(self, shift: Sequence[float]) -> None:
-        """Shift the horizontal and vertical clearance, and their quantiles, from now on.
+        """Shift the published clearances and their quantiles by an estimate, from now on.
 
-        `shift` has 6 numbers [m]: for the horizontal clearance, for its 5 % and 95 % quantiles, and the same for the
-        vertical clearance. A shift is not part of `state`, so it stays in force when late samples are inserted.
+        `shift` has 6 numbers [m]: three for the horizontal clearance, its 5 % and its 95 % quantile, and three for the
+        vertical clearance. A shift is not part of `state`, so the insertion of late samples does not change it.
         """
         values = np.zeros(len(CLEARANCE_NAMES))
         values[_KNOWN] = shift
         self._shift = values if values.any() else None
 
     def set_scene(self, scene: Scene) -> None:
-        """Use `scene`, in which numbers have changed, from now on."""
+        """Use a scene with changed numbers from now on."""
         self._scene = scene
 
     def clear_shift(self) -> None:
-        """Return to the model's own clearances."""
+        """Publish the clearances of the model from now on, without a shift."""
         self._shift = None
 
     def add(self, rows: Rows, stamps: NDArray[np.int64], taken: NDArray[np.int64], *, held: bool = False) -> Published:
-        """Add advances, and publish after some of them.
+        """Add advances to the window, and publish after some of them.
 
         Parameters
         ----------
         rows : ndarray of `ROW`, shape (n,)
-            The advances; the rows chosen by `taken` become the publications.
+            The advances. The rows with the indices `taken` are overwritten by the publications.
         stamps : ndarray of int64, shape (n,)
             Stamps of the advances [ns].
         taken : ndarray of int64, shape (m,)
-            Rising indices of the advances after which to publish; a publication without a good advance has the stamp 0.
+            Rising indices of the advances after which to publish. If all advances before a publication have failed, its
+            stamp is 0.
         held : bool
             Whether the advances were computed without samples.
 
@@ -227,7 +231,7 @@ class Outputs:
         return Published(chosen, self._slow(chosen))
 
     def pop(self) -> Published:
-        """Publish all advances since the previous publication, if there are any."""
+        """Publish all advances since the previous publication; `NOTHING` if there are none."""
         if not self._waits:
             return NOTHING
         rows, self._waits = self._stock.new(1), 0
@@ -235,9 +239,10 @@ class Outputs:
         return Published(rows, self._slow(rows))
 
     def correct(self, stamp_ns: int, oldest_ns: int) -> int:
-        """Note that the motion is computed again from `stamp_ns`; return the earliest such stamp in the window.
+        """Register that the motion will be computed again from `stamp_ns`, and mark the window as corrected.
 
-        A correction from `oldest_ns` or earlier is over; this call then begins a new correction.
+        Return the earliest stamp of all such calls since the previous publication. Calls with stamps up to `oldest_ns`,
+        the age limit of late samples, no longer count.
         """
         window = self._window[0]
         if not window["corrected"] or self._corrected_ns <= oldest_ns:
@@ -249,9 +254,9 @@ class Outputs:
         return self._corrected_ns
 
     def begin_correction(self) -> None:
-        """Restart impulses and peaks at the time that `correct` returned.
+        """Restart impulses and peaks at the stamp that `correct` returned.
 
-        Advances that were published before are not published again, even if every later advance fails.
+        The newest unpublished advance before this stamp, if any, is still published if all later advances fail.
         """
         self._clear()
         if self._before is not None:
@@ -261,23 +266,23 @@ class Outputs:
 
     @property
     def waits(self) -> bool:
-        """Whether an advance has not been published."""
+        """Whether an advance is waiting to be published."""
         return bool(self._waits)
 
     @property
     def is_clear(self) -> bool:
-        """Whether nothing waits to be published: neither an advance nor a mark."""
+        """Whether neither an advance nor a mark is waiting to be published."""
         window = self._window
         return not (self._waits or window["corrected"][0] or window["marked"][0])
 
     @property
     def makes(self) -> NDArray[np.int64]:
-        """Touches of each pair so far, shape (8,)."""
+        """Number of touches of each pair so far, shape (8,)."""
         makes: NDArray[np.int64] = self._window["makes"][0].copy()
         return makes
 
     def restart(self) -> None:
-        """Drop everything that has not been published; the count of touches is kept."""
+        """Drop all unpublished data; the numbers of touches do not change."""
         self._clear()
         self._window["corrected"] = 0
         self._slow_ns = self._before = None
@@ -289,7 +294,7 @@ class Outputs:
 
     @property
     def slow_before(self) -> tuple[int | None, Array]:
-        """Stamp and pad depths of the last slow part that was published."""
+        """Stamp [ns] and wear depths [m] of the last published slow part; the stamp is None before the first."""
         return self._slow_ns, self._slow_wear_depth
 
     @slow_before.setter
@@ -336,25 +341,29 @@ class Outputs:
         return found
 
     def modelled(self, wear_depth: Array) -> Array:
-        """Return the model's horizontal clearance and two quantiles, then the vertical, shape (6,) [m]."""
+        """Return the clearances of the model without a shift, shape (6,) [m].
+
+        The first three are the horizontal clearance, its 5 % and its 95 % quantile; the others are for the vertical
+        clearance.
+        """
         middle = clearances(self._scene, wear_depth)
         low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
         return np.stack((middle, low, high), axis=1)[:2].ravel()
 
     def state(self) -> bytes:
-        """Return the exact state from which, with later advances, the next publication follows."""
+        """Return the exact state as bytes; state and later advances determine all later publications."""
         slow_ns, window = -1 if self._slow_ns is None else self._slow_ns, self._window
         numbers = (window["makes"], window["impulse"], window["peak"], self._slow_wear_depth, np.array([slow_ns]))
         return b"".join(part.tobytes() for part in numbers)
 
     def set_state(self, data: bytes) -> None:
-        """Continue from a state that `state` returned."""
+        """Continue from a state that the method `state` has returned."""
         parts = np.frombuffer(data, np.float64, _STATE_SIZE).reshape(4, PAIR_COUNT)
         self._clear()
         self._window["makes"] = parts[0].view(np.int64)
         self._window["impulse"], self._window["peak"] = parts[1:3]
-        # a state has no `measured_peak` (the peak in advances with samples), so the peak of all advances takes its
-        # place
+        # the state does not contain `measured_peak`, the peak over advances with samples; the peak over all advances
+        # replaces it
         self._window["measured_peak"] = parts[2]
         self._slow_wear_depth = parts[3].copy()
         slow_ns = int(np.frombuffer(data, np.int64, 1, offset=8 * _STATE_SIZE)[0])
@@ -362,12 +371,12 @@ class Outputs:
 
     @staticmethod
     def state_size() -> int:
-        """Length of `state()` in bytes."""
+        """Return the length in bytes of the result of `state`."""
         return 8 * (_STATE_SIZE + 1)
 
 
 def warm_up() -> None:
-    """Compile the functions of a publication, or load them from the cache on disk."""
+    """Compile the functions that make publications, or load them from the cache on disk."""
     _publish()
     rows = np.zeros(1, ROW)
     publish_window(rows.copy(), rows)
@@ -376,6 +385,6 @@ def warm_up() -> None:
 
 @cache
 def _publish() -> Callable[..., int]:
-    """Return `publish` compiled for its argument types, since a check of types would take longer than the call."""
+    """Return `publish` compiled for its argument types, because the check of the types takes longer than the call."""
     rows = np.zeros(1, ROW)
     return for_arguments(publish, (rows, THE_ONE, 0, THE_ONE, rows, 0))

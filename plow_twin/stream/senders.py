@@ -1,6 +1,6 @@
-"""Selection of one sender when several send the same input, and the count of its lost samples.
+"""Selection of one sender when several senders publish the same input, and the count of its lost samples.
 
-The middleware numbers the messages of each publisher from 1, so a gap in these numbers means that messages were lost.
+The middleware numbers the messages of each publisher from 1, so a gap in the numbers shows lost messages.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ from collections.abc import Collection
 
 #: Silence of the followed sender [ns] after which `OneSender` follows another sender.
 _SILENT_NS = 10_000_000_000
-#: Largest number of senders whose next number is stored; beyond it, the sender heard first is forgotten.
+#: Largest number of senders whose next message number is stored; if there are more, the oldest entry is dropped.
 _MOST_SENDERS = 64
 
 
 class Senders:
-    """Follow the first sender heard until it disappears or a switch is requested."""
+    """Follow the sender of the first sample until it disappears or the operator requests a switch."""
 
     def __init__(self) -> None:
         #: the followed sender; None before the first sample, and after the sender has disappeared
         self.followed: bytes | None = None
-        #: number of samples of the followed sender that never arrived
+        #: number of lost samples of the followed sender
         self.lost = 0
         #: number of unused samples of other senders
         self.ignored = 0
@@ -29,17 +29,17 @@ class Senders:
         self._other: bytes | None = None
 
     def start(self, present: Collection[bytes]) -> None:
-        """Register existing senders; messages that they have sent until now do not count as lost."""
+        """Register the senders that exist now; messages that these senders have already sent do not count as lost."""
         self._before = frozenset(present)
 
     def start_late(self, sender: bytes) -> None:
-        """Register a sender; its messages before the first sample heard from it do not count as lost."""
+        """Register a sender whose messages before its first received sample do not count as lost."""
         self._before |= {sender}
 
     def hear(self, sender: bytes, number: int, count: int = 1) -> bool:
-        """Count the arrival of a sender's sample `number` (from 1), or of `count` samples from it on.
+        """Count the arrival of `count` samples of a sender, and return whether the sender is followed.
 
-        Returns whether the sender is followed.
+        `number` is the message number of the first of these samples, counted from 1.
         """
         expected = self._next.get(sender)
         if expected is None:
@@ -50,7 +50,7 @@ class Senders:
             self.followed = sender
         followed = sender == self.followed
         if followed:
-            # a late message was counted as lost before
+            # a message that arrives out of order was counted as lost before
             self.lost += number - expected if number >= expected else -1 if self.lost else 0
         else:
             self.ignored += count
@@ -59,9 +59,10 @@ class Senders:
         return followed
 
     def alive(self, present: Collection[bytes]) -> None:
-        """Update the present senders; if the followed sender is gone, follow the next sender heard.
+        """Update the set of present senders; if the followed sender has disappeared, follow the sender of the next
+        sample.
 
-        A sender that was never among the present senders is not gone: it may not have been discovered yet.
+        A sender that was in no earlier set has not disappeared, because the middleware may not have discovered it yet.
         """
         gone = self._listed.difference(present)
         self._listed = set(present)
@@ -71,7 +72,7 @@ class Senders:
             self._other = None
 
     def switch(self) -> bool:
-        """Follow the most recently heard other sender; return False if there is no other sender."""
+        """Follow the other sender that sent most recently; return False if there is no other sender."""
         if self._other is None:
             return False
         self._other, self.followed = self.followed, self._other
@@ -79,7 +80,9 @@ class Senders:
 
 
 class OneSender:
-    """Follow the first sender heard until it disappears, or is silent for 10 s while another sender sends."""
+    """Follow the sender of the first message until it disappears or sends nothing for 10 s while another sender
+    sends.
+    """
 
     def __init__(self) -> None:
         self.followed: bytes | None = None
@@ -88,7 +91,7 @@ class OneSender:
         self._listed: set[bytes] = set()
 
     def hear(self, sender: bytes, now_ns: int) -> bool:
-        """Register a message at a time [ns] of the steady clock; return whether its sender is followed."""
+        """Register a message that arrived at `now_ns` of the steady clock; return whether its sender is followed."""
         if self.followed is None or now_ns - self._heard_ns > _SILENT_NS:
             self.followed = sender
         if sender != self.followed:
@@ -98,7 +101,7 @@ class OneSender:
         return True
 
     def alive(self, present: Collection[bytes]) -> None:
-        """Update the present senders, as in `Senders`."""
+        """Update the set of present senders, as `Senders.alive` does."""
         if self.followed in self._listed.difference(present):
             self.followed = None
         self._listed = set(present)

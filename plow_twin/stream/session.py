@@ -1,11 +1,11 @@
-"""The deterministic core of the live node and of a replay: a session computes the motion from journal entries.
+"""The session, which computes the motion deterministically from journal entries, in the live node and in a replay.
 
 Terms of this module:
 
 - An *advance* moves the model to a stamp, usually the stamp of a sample. Its result is a *row*.
 - The load is *held* while the motion advances without samples.
-- A sample is *late* if the model has passed its stamp. The session then goes back to a snapshot in its *history*,
-  inserts the sample, and computes the motion again.
+- A sample is *late* if the model has already advanced beyond its stamp. The session then goes back to a snapshot in its
+  *history*, inserts the sample, and computes the motion again.
 """
 
 from __future__ import annotations
@@ -56,12 +56,12 @@ from plow_twin.stream.outputs import NONE, NOTHING, THE_ONE, Outputs, Published,
 
 #: Number of advances from one digest to the next.
 DIGEST_INTERVAL: Final = 100
-#: Header of a snapshot: whether a stamp is known, stamp of model time 0, stamp reached, number of advances, whether the
-#: load is held, speed along the face, number of waiting speeds.
+#: Header of a snapshot. The fields are: whether a stamp has been reached, stamp of model time 0, stamp reached, number
+#: of advances, whether the load is held, travel speed, number of travel speeds that wait for their stamps.
 _HEADER: Final = struct.Struct("<?qqq?dq")
 _TRAVEL: Final = struct.Struct("<qd")
-#: Largest time [ns] by which a pose may be ahead of the model. When a bag is played fast, poses arrive long before the
-#: samples of the same time; a pose further ahead must come from another clock.
+#: Largest time [ns] by which a pose may be ahead of the model. If a bag is played fast, poses arrive long before the
+#: samples with the same stamps. A pose beyond the limit must come from another clock.
 _AHEAD_NS: Final = 3_600_000_000_000
 _WEAR_SIZE: Final = 8 * PAIR_COUNT
 _NO_LOAD: Final = np.zeros((1, 3))
@@ -72,9 +72,10 @@ def _ignore(entry: Entry) -> None: ...
 
 
 class _Measured(NamedTuple):
-    """A pose or an estimate given to the twin, with its index, its stamp and the time then reached [ns].
+    """A pose or an estimate that was passed to the twin, with the stamp that the model had reached at that time [ns].
 
-    It acts from model time `known` [s] on, even if the session has gone back behind this time.
+    `number` counts the poses and estimates of the twin. The entry has no effect before model time `known` [s], even if
+    the session goes back to an earlier time.
     """
 
     number: int
@@ -85,7 +86,9 @@ class _Measured(NamedTuple):
 
 
 class Applied(NamedTuple):
-    """Result of applying samples: a row for each sample, the publications and digests, and counts."""
+    """Result of applying samples: a row for each sample, publications, digests, and counts of failed and late
+    samples.
+    """
 
     rows: Rows
     published: Published
@@ -95,10 +98,20 @@ class Applied(NamedTuple):
 
 
 class Series(NamedTuple):
-    """Samples that were applied together and are not in the journal yet.
+    """Samples that were applied together and have not been journalled yet.
 
-    `stamps` [ns] has shape (n,), `wrench` (n, 3), and `digest_after` (m,) has the number of samples before each digest.
-    `published` has a row after each sample, or no rows.
+    Attributes
+    ----------
+    stamps : ndarray of int64, shape (n,)
+        Stamps [ns].
+    wrench : ndarray, shape (n, 3)
+        Loads Fx, Fy [N] and M [N m].
+    published : Published
+        A row for each sample, or no rows.
+    digests : sequence of str
+        The m digests.
+    digest_after : ndarray of int64, shape (m,)
+        Number of samples before each digest.
     """
 
     stamps: NDArray[np.int64]
@@ -108,7 +121,7 @@ class Series(NamedTuple):
     digest_after: NDArray[np.int64]
 
     def part(self, begin: int, end: int) -> Series:
-        """Return the samples from `begin` to before `end`, with their publications and digests."""
+        """Return the samples with indices from `begin` to `end` - 1, with their publications and digests."""
         marked = (self.digest_after > begin) & (self.digest_after <= end)
         published = self.published
         if len(published.rows):
@@ -123,34 +136,33 @@ class Series(NamedTuple):
 
 
 class _UndoneError(Exception):
-    """An advance failed, and the twin is back in its state before the samples."""
+    """An advance failed, and the twin has been restored to its state before the samples."""
 
 
 class Session:
     """One run of a twin whose inputs are entries of a journal.
 
-    The same entries in the same order give the same motion, publications and digests, bit for bit and at any speed.
+    The same entries in the same order give bit-identical motion, publications and digests.
 
-    Model time is (stamp - origin); by default the origin is the first stamp. A `Reset` restores the initial motion but
-    keeps the wear, which only `SetWear` sets. While the load is held or removed, the true load is unknown, so the pads
-    do not wear. If the scene itself defines the loads, a `Hold` only advances the time.
+    Model time is the stamp minus the origin, which is the first stamp by default. A `Reset` restores the initial motion
+    but not the wear, which only `SetWear` changes. While the load is held or removed, the true load is unknown, so the
+    pads do not wear. If the scene itself defines the loads, a `Hold` only advances the time.
 
-    For a late sample, the session goes back to the newest snapshot before its stamp and computes up to the newest
-    sample again. Motion after the newest sample is dropped.
+    To insert a late sample, the session goes back to the newest snapshot before its stamp. From there it computes the
+    motion up to the newest sample again. Motion beyond the newest sample is dropped.
 
     Parameters
     ----------
     twin
-        The twin to drive; only the session may advance it. A twin that follows measurements also gets the measured
-        poses and the estimates.
+        The twin, which only the session may advance. A twin that follows measurements also receives the measured poses
+        and the estimates.
     origin_ns
-        Stamp of model time 0, or None: the first stamp.
+        Stamp of model time 0 [ns]; None for the first stamp.
     on_entry
-        Function that receives each entry before it is applied, and each digest after the advance that it covers. It
-        also receives an entry that the twin then refuses because a number is not finite; a replay refuses this entry
-        too.
+        Function that receives each entry before the session applies it, and each digest after its advance. An entry
+        with a number that is not finite is also passed on, before the twin refuses it. A replay refuses this entry too.
     rollback_span_s
-        Largest age of a late sample relative to the newest sample [s]; 0: late samples are refused.
+        Largest age of a late sample relative to the newest sample [s]; with 0, late samples are refused.
     wear_depth
         Initial wear depth of each pad [m], shape (8,); None for the wear depth of the scene.
     """
@@ -165,19 +177,19 @@ class Session:
         wear_depth: Sequence[float] | None = None,
     ) -> None:
         self._use(twin)
-        #: measurements since the earliest state that is kept
+        #: poses and estimates since the oldest snapshot
         self._measured: deque[_Measured] = deque()
-        #: number of poses that came too far ahead of the load, or beyond `MOST_MEASURED`
+        #: number of poses that were too far ahead of the model, or exceeded the number `MOST_MEASURED`
         self.poses_dropped = 0
         self._scene = twin.scene
         #: changed numbers of the scene: new value by key
         self.changes: dict[str, float] = {}
         self.origin_ns = origin_ns
-        #: the time that the model has reached [ns], None before the first stamp
+        #: stamp that the model has reached [ns], None before the first stamp
         self.stamp_ns: int | None = None
         self.outputs = Outputs(twin.scene)
         self._stock = Stock()
-        #: row of the latest advance, until the wear at its end is read
+        #: rows of the latest advances, from which `wear_depth` is read when needed
         self._row: Rows | None = None
         scene, self._sampled = twin.scene, twin.excitation == "sampled"
         self.history = History(round(rollback_span_s * 1e9) if self._sampled else 0)
@@ -200,7 +212,9 @@ class Session:
         self.following = twin if isinstance(twin, Following) else None
 
     def catch_up(self) -> None:
-        """Let a following twin finish the work of its newest row, and save the state if a late sample may need it."""
+        """Finish the computation that a following twin has deferred, and add a snapshot to the history if one is
+        due.
+        """
         if self.following is not None:
             self.following.catch_up()
             if self.history.is_due and self.stamp_ns is not None and not self.held:
@@ -216,14 +230,14 @@ class Session:
             self._on_entry(Digest(self.stamp_ns, self.twin.digest()))
 
     def apply(self, entry: Entry) -> Rows | None:
-        """Emit one entry, apply it, and return the row of its advance, shape (1,), or None without an advance.
+        """Emit an entry and apply it; return the row of its advance, shape (1,), or None if the entry makes no advance.
 
-        A digest or a loss only describes the journal from which it was read: it has no effect and is not emitted.
+        A `Digest` or a `Loss` describes the journal from which it was read. It is neither applied nor emitted.
 
         Raises
         ------
         ValueError
-            The stamp is too far behind the time reached, or a number is not finite; the motion is unchanged.
+            If the stamp is older than all stored states, or a number is not finite. The motion is unchanged.
         """
         match entry:
             case Sample():
@@ -240,7 +254,7 @@ class Session:
             case SetWear(_, depth):
                 self._on_entry(entry)
                 self._restart(np.array(depth))
-                # the estimate belongs to the earlier pads
+                # the estimate was made with the wear of before
                 self.outputs.clear_shift()
             case Estimated(shift=shift):
                 self._on_entry(entry)
@@ -264,7 +278,7 @@ class Session:
                 self.following.follow_parameters()
                 self._forget()
             case Parameter() | Gaps() | Mark() | Failed() | Spread() | Unused():
-                # these entries act through later entries, or not at all
+                # these entries have no direct effect on the motion
                 self._on_entry(entry)
             case Snapshot(_, data):
                 self._on_entry(entry)
@@ -275,15 +289,15 @@ class Session:
         return None
 
     def parts(self, samples: Sequence[Sample], *, each: bool = False) -> Iterator[Sequence[Sample]]:
-        """Divide samples into parts for `apply_samples`; each part must be applied before the next.
+        """Yield parts of the samples for `apply_samples`; each part must be applied before the next part is requested.
 
-        A late sample and all samples after it are one part. Any other part ends at the next digest, or after one sample
-        if `each` is set.
+        A late sample and all samples after it form one part. Any other part ends at the next digest, or after one
+        sample if `each` is set.
 
         Raises
         ------
         ValueError
-            A stamp falls.
+            If the stamps fall.
         """
         for earlier, later in pairwise(samples):
             if later.stamp_ns < earlier.stamp_ns:
@@ -298,10 +312,11 @@ class Session:
             samples = samples[count:]
 
     def apply_samples(self, samples: Sequence[Sample], *, each: bool = False) -> Applied:
-        """Emit and apply one of the `parts` of samples; the result does not depend on the division into parts.
+        """Emit and apply a part of samples that `parts` has yielded; the motion does not depend on the division into
+        parts.
 
-        With `each`, each sample is published, or late samples together; otherwise `outputs` sums the samples up for the
-        next publication.
+        With `each`, each sample is published, but samples inserted late are published together. Otherwise `outputs`
+        collects the samples for the next publication.
 
         Raises
         ------
@@ -325,11 +340,19 @@ class Session:
         return applied
 
     def apply_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], *, each: bool) -> Series | None:
-        """Apply samples together without emitting entries; the caller journals the series.
+        """Apply samples together without emitting entries; the caller must journal the returned series.
 
-        The stamps, shape (n,) [ns], rise and the first is not late; the wrenches, shape (n, 3), are finite; `each` is
-        as for `apply_samples`. Returns None, with nothing changed, if the samples must be applied one by one, for
-        example because an advance fails.
+        The result is None, without any change, if the samples must be applied one by one, for example because an
+        advance fails.
+
+        Parameters
+        ----------
+        stamps : ndarray of int64, shape (n,)
+            Rising stamps [ns], of which the first is not late.
+        wrench : ndarray, shape (n, 3)
+            Finite loads Fx, Fy [N] and M [N m].
+        each : bool
+            As for `apply_samples`.
         """
         if self.stamp_ns is None or self.held or self._travels or not (self.outputs.is_clear or not each):
             return None
@@ -365,23 +388,23 @@ class Session:
         taken: NDArray[np.int64] = NONE,
         digest_after: NDArray[np.int64] = NONE,
     ) -> Applied:
-        """Advance to samples of a journal without emitting an entry.
+        """Advance to samples that are already in a journal, without emitting entries.
 
         Parameters
         ----------
         stamps, wrench : ndarray, shapes (n,) and (n, 3)
-            Stamps that never fall [ns], of which the first is not late, and Fx, Fy [N] and M [N m] at each stamp.
+            Rising or equal stamps [ns], of which the first is not late, and the loads Fx, Fy [N] and M [N m].
         rows : ndarray of `ROW`, shape (n,), or None
-            Receives the rows; with None, rows are neither made nor published.
+            Array that receives the rows; with None, rows are neither computed nor published.
         taken : ndarray of int64
             As for `Outputs.add`.
         digest_after : ndarray of int64, shape (m,)
-            Rising counts of samples, from 1 to n, after which a digest is made.
+            Rising counts of samples, from 1 to n, after each of which a digest is computed.
 
         Raises
         ------
         ValueError
-            A number is not finite, or a stamp falls; the motion is unchanged.
+            If a number is not finite, or the stamps fall. The motion is unchanged.
         """
         if self._is_late(int(stamps[0])) or (stamps[1:] < stamps[:-1]).any():
             raise ValueError(
@@ -400,7 +423,9 @@ class Session:
         taken: NDArray[np.int64],
         digest_after: NDArray[np.int64],
     ) -> Applied:
-        """Advance in parts, which end at each waiting speed, and after the first sample that follows a held load."""
+        """Advance in parts, which end at the stamps of waiting travel speeds and after the first sample after a held
+        load.
+        """
         if not np.isfinite(wrench).all():
             raise ValueError(f"wrench: got {wrench!r}, expected finite numbers")
         resumed, begin, count = self._resume_wear(), 0, len(stamps)
@@ -412,7 +437,8 @@ class Session:
                 continue
             if travel is not None:
                 end = int(np.searchsorted(stamps, travel.stamp_ns, side="right"))
-            # the session never goes back before the first sample after a held load, so the state at this sample is kept
+            # a snapshot follows the first sample after a held load, so that the session never goes back to the held
+            # load
             if resumed:
                 end = begin + 1
             here = slice(begin, end)
@@ -428,26 +454,26 @@ class Session:
         return Applied(parts[-1].rows if rows is None else rows, published, digests, sum(part.failed for part in parts))
 
     def emit(self, entry: Entry) -> None:
-        """Emit an entry that only describes the present state."""
+        """Emit an entry that does not change the motion."""
         self._on_entry(entry)
 
     def check_model(self, changes: Mapping[str, float]) -> None:
-        """Raise an `ArgumentError` if these changes are impossible while the model runs."""
+        """Raise an `ArgumentError` if changes of the scene are impossible while the model runs."""
         self._changed_twin(changes)
 
     def pop_error_estimate(self) -> float:
-        """Return the largest estimated error [m] that `max_evaluations` has caused since the last call."""
+        """Return the largest error estimate [m] of advances that `max_evaluations` has limited since the last call."""
         largest, self._largest_error_m = self._largest_error_m, 0.0
         return largest
 
     def renew(self) -> Snapshot:
-        """Return a snapshot from which a journal can continue, and drop all earlier states."""
+        """Return a snapshot from which a journal can continue, and drop all stored earlier states."""
         snapshot = self.snapshot()
         self._forget()
         return snapshot
 
     def snapshot(self) -> Snapshot:
-        """Return the exact state of twin, outputs and session."""
+        """Return the exact state of the twin, the outputs and the session."""
         known = self.stamp_ns is not None
         header = _HEADER.pack(
             known,
@@ -460,7 +486,7 @@ class Session:
         )
         travels = b"".join(_TRAVEL.pack(travel.stamp_ns, travel.speed_m_s) for travel in self._travels)
         stamp_ns = self.stamp_ns if self.stamp_ns is not None else self.origin_ns or 0
-        # the changes are last, so that a snapshot without changes ends with the twin's
+        # changes of the scene are appended last, and only if there are any
         changes = json.dumps(self.changes).encode() if self.changes else b""
         data = header + travels + self.wear_depth.tobytes() + self.outputs.state() + self.twin.snapshot() + changes
         return Snapshot(stamp_ns, data)
@@ -482,10 +508,14 @@ class Session:
         resumed: bool = False,
         undo: bytes | None = None,
     ) -> Applied:
-        """Advance to samples without other entries between them.
+        """Advance to samples that no other entry separates.
 
-        `resumed` is True for the first sample after a held load. If an advance fails and `undo` is given, the twin
-        returns to this snapshot and `_UndoneError` is raised.
+        `resumed` is True for the first sample after a held load.
+
+        Raises
+        ------
+        _UndoneError
+            If an advance fails and the snapshot `undo` is given, from which the twin has been restored.
         """
         origin_ns = self._begin(int(stamps[0])) if self.origin_ns is None else self.origin_ns
         if self.history.is_due and not resumed:
@@ -510,7 +540,7 @@ class Session:
         return Applied(rows, self.outputs.add(rows, stamps, taken), digests, failed)
 
     def _follow(self, stamp_ns: int, entry: Pose | PartOfPose | Estimated, known: float = -math.inf) -> None:
-        """Pass a measurement to a twin that follows measurements."""
+        """Pass a pose or an estimate to the twin, if it follows measurements, and store it for repeated computation."""
         if self.following is None or self.origin_ns is None:
             return
         time = (stamp_ns - self.origin_ns) * 1e-9
@@ -528,7 +558,7 @@ class Session:
             self.poses_dropped += 1
 
     def _travel_on_the_way(self, travel: Travel, stamp_ns: int, wrench: NDArray[np.float64]) -> None:
-        """Advance to the stamp of a speed that is due before the next sample, and apply the speed."""
+        """Advance to the stamp of a travel speed before the next sample, and apply the speed."""
         self._travels.pop(0)
         if self.stamp_ns is not None and travel.stamp_ns > self.stamp_ns:
             share = (travel.stamp_ns - self.stamp_ns) / (stamp_ns - self.stamp_ns)
@@ -538,8 +568,9 @@ class Session:
         self._set_speed(travel)
 
     def _is_late(self, stamp_ns: int) -> bool:
-        """Return whether a stamp is before the time reached; at the time reached, a sample is late if the load is
-        held.
+        """Return whether a sample with this stamp is late.
+
+        A sample exactly at the stamp reached is late if the load was held up to this stamp.
         """
         if self.stamp_ns is None or stamp_ns > self.stamp_ns:
             return False
@@ -553,9 +584,9 @@ class Session:
             raise ValueError(f"stamp: got {stamp_ns} ns, expected at least {limit}, {bound_ns} ns")
 
     def _work_in(self, stamp_ns: int, late: Sequence[Sample], *travels: Travel) -> Applied:
-        """Go back to a state before a late stamp, and run again with late samples and speeds.
+        """Go back to a state before a late stamp, and compute the motion again with late samples and travel speeds.
 
-        The next publication covers the motion from the earliest stamp inserted since the previous publication.
+        The next publication covers the motion from the earliest late stamp since the previous publication.
         """
         corrected_ns = self.outputs.correct(stamp_ns, self.history.oldest_ns or 0)
         again = self._rewind(corrected_ns, *travels)
@@ -569,22 +600,23 @@ class Session:
     def _rewind(self, stamp_ns: int, *more: Travel) -> list[Sample]:
         """Go back to the newest snapshot before `stamp_ns`; return the samples after the snapshot.
 
-        The speeds after the snapshot and the speeds `more` wait for their stamps again.
+        The travel speeds after the snapshot and the speeds `more` are scheduled for their stamps again.
         """
         data, samples, travels = self.history.rewind(stamp_ns)
         advances, pending, slow = self._advances, self._travels, self.outputs.slow_before
         self._restore(data)
         self._advances, self.outputs.slow_before = advances, slow
         if self.following is not None:
-            # A measurement acts only from the time at which it became known. Otherwise the motion would depend on how
-            # far the session goes back, which the publications decide.
+            # A pose or estimate has no effect before the time at which it became known. Otherwise the motion would
+            # depend
+            # on how far the session goes back.
             measured, self._measured = self._measured, deque()
             for one in measured:
                 if one.number > self.following.added:
                     self._follow(one.stamp_ns, one.entry, one.known)
                 else:
                     self._measured.append(one)
-        # a speed with the stamp of the snapshot may be in both lists
+        # a speed whose stamp is that of the snapshot may occur twice
         known = {travel.stamp_ns: travel for travel in (*self._travels, *travels, *pending, *more)}
         self._travels = sorted(known.values(), key=lambda travel: travel.stamp_ns)
         return samples
@@ -609,7 +641,7 @@ class Session:
         return rows
 
     def _move(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], *, held: bool) -> Rows:
-        """Advance without a sample to one stamp, shape (1,)."""
+        """Advance to one stamp, shape (1,), without adding a sample to the history."""
         assert self.origin_ns is not None
         rows = self._stock.new(1)
         if self.following is not None:
@@ -629,25 +661,25 @@ class Session:
                 self.twin.set_travel_speed(0.0)
 
     def _resume_wear(self) -> bool:
-        """Let the pads wear again after a hold; return whether the load was held."""
+        """Resume the wear of the pads after a held load; return whether the load was held."""
         held, self.held = self.held, False
         if held and self._wears:
             self.twin.set_travel_speed(self._speed)
         return held
 
     def _apply_travel(self, travel: Travel) -> None:
-        """Apply a speed along the face: now, when its stamp is reached, or by going back to its stamp."""
+        """Apply a travel speed at its stamp, which may require waiting for the stamp or going back to the stamp."""
         newest_ns, oldest_ns = self.history.newest_sample_ns, self.history.oldest_ns
         if not self._wears:
             self._speed = travel.speed_m_s
         elif self.stamp_ns is None:
-            # the session never goes back before the first sample
+            # no advance has been made yet, so the speed takes effect at once
             self._use_speed(travel.speed_m_s)
         elif travel.stamp_ns > self.stamp_ns:
             insort(self._travels, travel, key=lambda item: item.stamp_ns)
         elif oldest_ns is not None and travel.stamp_ns <= oldest_ns:
-            # The speed is too old to act at its stamp. It acts from the newest sample on or, without samples, from the
-            # kept state on.
+            # The stamp of the speed is older than all stored states. The speed takes effect at the newest sample or,
+            # without samples, at the oldest stored state.
             self._set_speed(Travel(oldest_ns if newest_ns is None else newest_ns, travel.speed_m_s))
         elif newest_ns is None or oldest_ns is None or travel.stamp_ns >= newest_ns:
             self._set_speed(travel)
@@ -687,7 +719,7 @@ class Session:
         self.twin.reset(0.0, wear_depth=wear_depth)
 
     def _end_motion(self) -> None:
-        """End the present motion: waiting speeds act now, and the past and the unpublished sums are dropped."""
+        """End the present motion: apply all waiting travel speeds, and drop the history and all unpublished data."""
         self._resume_wear()
         for travel in self._travels:
             self._set_speed(travel)
@@ -697,11 +729,11 @@ class Session:
         self.origin_ns = self.stamp_ns = None
 
     def _begin(self, stamp_ns: int) -> int:
-        """Return the stamp of model time 0 for which the present model time has the stamp `stamp_ns`."""
+        """Return the origin for which the present model time has the stamp `stamp_ns`."""
         return stamp_ns - round(self.twin.time * 1e9)
 
     def _change_model(self, changes: dict[str, float]) -> None:
-        """Change numbers of the scene; contacts start without history, and earlier states are dropped."""
+        """Change numbers of the scene and drop the stored states; contacts start without history."""
         before, speed = self.twin, 0.0 if self.held else self._speed
         self._use(self._changed_twin(changes))
         self._carry(before)
@@ -713,21 +745,27 @@ class Session:
         self._forget()
 
     def _changed_twin(self, changes: Mapping[str, float]) -> Driven:
-        """Return a twin with changed numbers, if these allow the present and the waiting speeds."""
+        """Return a twin with changed numbers of the scene.
+
+        Raises
+        ------
+        ArgumentError
+            If the changes are impossible, or the changed scene does not allow the present or a waiting travel speed.
+        """
         found = changed_twin(self.twin, self._scene, changes)
         for speed in (self._speed, *(travel.speed_m_s for travel in self._travels)):
             check_travel_speed(found.scene, speed)
         return found
 
     def _carry(self, before: Driven) -> None:
-        """Take pose, rates, load and time from the twin `before`, and keep the present wear."""
+        """Copy pose, rates, load and time, but not the wear, from the twin `before` to the present twin."""
         now = before.advance(before.time)
         self.twin.reset(before.time, wear_depth=self.wear_depth, pose=(now.q, now.v))
         if self._sampled:
             self.twin.advance(before.time, before.wrench)
 
     def _restore_motion(self, data: bytes) -> None:
-        """Restore only the motion of a snapshot."""
+        """Restore the motion from a snapshot, but neither the wear nor changed numbers of the scene."""
         travels = _HEADER.unpack_from(data)[-1]
         end = _HEADER.size + travels * _TRAVEL.size
         depth = np.frombuffer(data, np.float64, PAIR_COUNT, offset=end)

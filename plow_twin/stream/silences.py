@@ -1,4 +1,4 @@
-"""Silences, which are stretches without samples, found from the stamps."""
+"""Detection of silences, which are long intervals without samples, from the stamps."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from plow_twin.stream.intake import NS_PER_S
 
 Indexes = NDArray[np.int64]
-#: A silence is longer than this many times the interval before it: a log with one sample a minute has no silences.
+#: A silence is longer than `_LONGER` times the interval before it, so a log with one sample per minute has no silences.
 _LONGER: Final = 5
 
 
 class Silences:
-    """Count silences: intervals between two stamps that are longer than the timeout of the excitation.
+    """Count the silences of a stream.
 
-    During a silence the motion continues, either under the hold policy or with a load that changes linearly up to the
-    next sample. `timeout_s` may be changed later.
+    A silence is an interval between two stamps that is longer than `timeout_s` [s] and than `_LONGER` times the
+    interval before it. The attribute `timeout_s` may be changed later.
     """
 
     def __init__(self, timeout_s: float) -> None:
@@ -28,13 +28,14 @@ class Silences:
         self.longest_ns = (0, 0)
         self._first_ns: int | None = None
         self._newest_ns: int | None = None
-        #: the newest interval that is not a silence [ns]
+        #: newest interval that is not a silence [ns]
         self._interval_ns: int | None = None
 
     def add(self, stamps_ns: Indexes) -> list[tuple[int, int, int]]:
         """Add the stamps of samples, shape (n,) [ns]; return the silences that end at these samples.
 
-        Each silence is (index of the sample that ends it, begin, end) [ns]. A late sample does not end a silence.
+        A silence is returned as the index of the sample at its end, its begin [ns] and its end [ns]. A sample that is
+        older than the newest stamp does not end a silence.
         """
         if not len(stamps_ns):
             return []
@@ -76,7 +77,7 @@ class Silences:
         self._newest_ns = None
 
     def text(self) -> str:
-        """Describe the silences in words, with times since the first sample; empty without a silence."""
+        """Return a description of the silences, with times since the first sample; empty without a silence."""
         if not self.count:
             return ""
         begin_s, end_s = ((at - (self._first_ns or 0)) * 1e-9 for at in self.longest_ns)
@@ -86,7 +87,11 @@ class Silences:
         return f"{self.total_ns * 1e-9:.3f} s without samples, {where}"
 
     def facts(self) -> dict[str, int | float]:
-        """Return number and total length [s] of silences, and start of the longest after the first sample [s]."""
+        """Return the number of silences, their total length [s], and the start of the longest [s] since the first
+        sample.
+
+        The dictionary is empty without a silence.
+        """
         begin_s = (self.longest_ns[0] - (self._first_ns or 0)) * 1e-9
         return {"count": self.count, "total_s": self.total_ns * 1e-9, "longest_from_s": begin_s} if self.count else {}
 

@@ -1,4 +1,4 @@
-"""Distinction between a step of the sender's clock and a single wrong (*stray*) stamp, by the next sample."""
+"""Distinction between a step of the sender's clock and a single wrong stamp, which is called *stray*."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Final
 
 from plow_twin.stream.intake import NS_PER_S, Intake, Verdict
 
-#: Number of stray stamps within `_WINDOW_NS` from which on the stamps count as unsteady.
+#: Number of stray stamps within `_WINDOW_NS` from which the clock of the samples is called unsteady.
 _MOST_STRAYS: Final = 5
 _WINDOW_NS: Final = 10 * NS_PER_S
 
@@ -16,30 +16,27 @@ Timed = tuple[int, tuple[float, float, float], int]
 
 
 class Steps:
-    """Keep a sample whose stamp jumps until the next sample confirms it, so that a stray stamp has no effect.
-
-    The intake judges the samples and counts stray samples.
-    """
+    """Delay a sample whose stamp jumps until the next sample confirms the jump, so that a stray stamp has no effect."""
 
     def __init__(self, intake: Intake) -> None:
         self._intake = intake
-        #: the sample that waits because its stamp jumped
+        #: the delayed sample
         self._jumped: Timed | None = None
         #: times of the latest stray stamps [ns]
         self._strays_ns: deque[int] = deque(maxlen=_MOST_STRAYS)
 
     @property
     def waits(self) -> bool:
-        """Whether a sample waits."""
+        """Whether a sample is being delayed."""
         return self._jumped is not None
 
     def settle(
         self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int, reached_ns: int | None
     ) -> tuple[Timed, ...]:
-        """Add a sample; return the samples that can be judged now, in order of arrival."""
+        """Add a sample; return the samples that the intake can judge now, in order of arrival."""
         jumped, jumps = self._jumped, self._intake.jumps(stamp_ns, reached_ns)
         arrival = stamp_ns, wrench, now_ns
-        if jumped is None or stamp_ns <= 0:  # a missing stamp shows nothing about the clock
+        if jumped is None or stamp_ns <= 0:  # a sample without a stamp gives no evidence about the clock
             if not jumps:
                 return (arrival,)
             self._jumped = arrival
@@ -58,7 +55,9 @@ class Steps:
         return ()
 
     def unopposed(self, now_ns: int, silence_ns: int) -> Timed | None:
-        """Return the waiting sample if no other sample has arrived for `silence_ns`."""
+        """Return the delayed sample if no other sample has arrived for `silence_ns`; the sample is no longer
+        delayed.
+        """
         jumped = self._jumped
         if jumped is None or now_ns - jumped[2] <= silence_ns:
             return None
@@ -66,13 +65,13 @@ class Steps:
         return jumped
 
     def end(self) -> None:
-        """Count a sample that still waits as stray, because no further sample will come."""
+        """Count a delayed sample as stray, because no further sample will come."""
         jumped, self._jumped = self._jumped, None
         if jumped is not None:
             self._intake.refuse(Verdict.STRAY, *jumped[:2])
 
     def unsteady(self, now_ns: int) -> bool:
-        """Return whether many recent stamps were stray."""
+        """Return whether `_MOST_STRAYS` recent stamps were stray."""
         strays_ns = self._strays_ns
         if not strays_ns:
             return False

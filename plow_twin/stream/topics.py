@@ -1,4 +1,4 @@
-"""The table of the topics that a live twin sends; sending, recording, replay and the documentation use it."""
+"""The table of topics that a live twin publishes. The node, the recorder, the replay and the documentation use it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES, SLOW, Published
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 STATUS: Final = "diagnostic_msgs/msg/DiagnosticStatus"
-#: Depth of a publisher's history: at 1 kHz, a reader that reads once a second misses no message.
+#: Depth of a publisher's history. With 1 kHz, a subscriber that reads once per second misses no message.
 _DEPTH: Final = 1000
 
 
@@ -27,7 +27,7 @@ class Cadence(Enum):
     EACH = "each publication"
     FOLLOWED = "each publication, with `follow: full`"
     SLOW = "every 0.1 s of stamps"
-    #: with each marked publication, and with the first publication after it
+    #: with each marked publication, and with the first publication that is no longer marked
     MARKED = "marked publications"
     ESTIMATE = "each estimate"
     CHANGE = "on change"
@@ -35,28 +35,28 @@ class Cadence(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Topic:
-    """One topic.
+    """Description of one topic.
 
     Attributes
     ----------
     name, type : str
         Base name, and ROS 2 message type.
     cadence : Cadence
-        When it is sent.
+        When a message is sent.
     content : str
-        Content of its message, with units.
+        Content of a message, with units.
     cumulative : bool
-        Whether its message depends on the previous publication, so that a replay cannot compare it after a lost
-        message.
+        Whether a message depends on the previous publication. After a lost message, a replay cannot compare such a
+        topic.
     latched : bool
-        Whether a late reader gets earlier messages (`transient_local`).
+        Whether a subscriber that joins late receives earlier messages (durability `transient_local`).
     depth : int
-        Number of messages that the publisher keeps.
+        Number of messages in the publisher's history.
     names : tuple of str
         Names in a `JointState`.
     columns : mapping
-        For each field of the message, the fields of the record that fill it, in order, each as (name, count of
-        numbers). Empty for a topic whose messages are not made from a record alone.
+        Fields of the record from which each field of the message is filled, in order, as (name, count of numbers).
+        Empty if a message needs other data than a record.
     """
 
     name: str
@@ -71,12 +71,12 @@ class Topic:
 
     @property
     def parts(self) -> tuple[tuple[str, int], ...]:
-        """Fields of the record with the count of their numbers, in the order of the message."""
+        """Fields of the record as (name, count of numbers), in the order of the message."""
         return tuple(part for parts in self.columns.values() for part in parts)
 
     @property
     def count(self) -> int:
-        """How many numbers of the message come from the record."""
+        """Count of numbers in the message that come from the record."""
         return sum(count for _, count in self.parts)
 
     def record_of(self, published: Published) -> NDArray[np.void]:
@@ -85,11 +85,13 @@ class Topic:
 
     @property
     def record_type(self) -> np.dtype[np.void]:
-        """Type of these records."""
+        """Type of the records that `record_of` returns."""
         return SLOW if self.cadence is Cadence.SLOW else ROW
 
     def numbers(self, records: NDArray[np.void]) -> list[NDArray[np.float64]]:
-        """Return the messages' numbers, an array (n, count) for each of `parts`; floats are not copied."""
+        """Return the numbers of messages, as one array (n, count) for each of `parts`; fields of floats are not
+        copied.
+        """
         columns = ((records[name], count) for name, count in self.parts)
         return [np.asarray(one[:, :count] if one.ndim > 1 else one[:, None], np.float64) for one, count in columns]
 
