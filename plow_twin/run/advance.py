@@ -1,4 +1,4 @@
-"""Results of advances as views of the rows that the kernels write: for one time, many times, or many twins."""
+"""Results of advances for one time, for many times or for many twins. A result is a view of the rows of a kernel."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class _Column(Generic[Number]):
 
 
 class _View:
-    """Columns of a row or of many rows; even for a single row, a column is an array."""
+    """Columns of one row or of many rows. A column of one row is an array, too."""
 
     __slots__ = ("rows",)
 
@@ -52,20 +52,20 @@ class _View:
 
 
 class Advance(_View):
-    """State at a time and sums since the previous advance, as a view of a row.
+    """State at one time, and sums since the previous advance, as a view of a row.
 
     Attributes
     ----------
     rows : numpy.void of `ROW`
-        The row.
+        The underlying row.
     t : float
         Model time in s.
     q, v : ndarray, shape (3,)
-        Pose x, y [m], theta [rad] of the cavity's centre, and its rate.
+        Pose x, y [m], theta [rad] of the cavity's centre, and the rates of the pose.
     penetration, rate, force : ndarray, shape (8,)
-        Signed penetration [m], its rate [m/s] and normal force [N] of each pair at `t`.
+        Signed penetration [m] of each pair at `t`, its rate [m/s], and the normal force [N].
     peak, impulse : ndarray, shape (8,)
-        Largest force [N] and impulse [N s] since the previous advance.
+        Largest force [N] of each pair, and its impulse [N s], since the previous advance.
     time_in_contact : ndarray, shape (8,)
         Time in contact since the previous advance [s].
     makes : ndarray of int64, shape (8,)
@@ -75,9 +75,9 @@ class Advance(_View):
     steps : int
         Number of steps that the solver took.
     status : Status
-        Status of the advance; if it is not `OK`, the state is the last good state.
+        Status of the advance. After a failure, the state is the last valid state.
     error_estimate_m : float
-        Estimated error of the pose in m if `max_evaluations` was too small for the tolerance, otherwise 0.
+        Estimated error of the pose in m if `max_evaluations` was too small for the tolerance. Otherwise it is 0.
     """
 
     __slots__ = ()
@@ -94,7 +94,7 @@ class Advance(_View):
 
     @property
     def status(self) -> Status:
-        """Status with which the advance ended."""
+        """Status of the advance."""
         return _STATUS[int(self.rows["status"])]
 
     @property
@@ -104,7 +104,7 @@ class Advance(_View):
 
 
 class _Rows(_View):
-    """Columns of many rows, with an array of integers for the status."""
+    """Columns of many rows. The status is an array of integers."""
 
     __slots__ = ()
 
@@ -117,7 +117,7 @@ class _Rows(_View):
 
 
 class AdvanceSeries(_Rows):
-    """Results of n advances: the fields of `Advance` with a leading axis of length n; `status` is an array of integers.
+    """Results of n advances. The fields are those of `Advance` with a leading axis of length n.
 
     Attributes
     ----------
@@ -130,12 +130,12 @@ class AdvanceSeries(_Rows):
     t = _Column[np.float64]()
 
     def __getitem__(self, index: int) -> Advance:
-        # the row is copied; without a copy the advance would keep all rows in memory
+        # without a copy, the advance would keep the memory of all rows alive
         return Advance(self.rows[index].copy())
 
 
 class AdvanceBatch(_Rows):
-    """Results of m twins: the fields of `AdvanceSeries`, all except `t` with a further leading axis of length m."""
+    """Results of m twins. All fields but `t` are those of `AdvanceSeries` with an additional leading axis, length m."""
 
     __slots__ = ()
 
@@ -153,7 +153,7 @@ _STATUS: Final = {int(status): status for status in Status}
 
 
 def check_times(now: float, times: NDArray[np.float64]) -> None:
-    """Raise `ArgumentError` if times are not finite or decrease."""
+    """Raise `ArgumentError` if the times are not finite, decrease, or begin before `now`."""
     if times.shape == (1,) and now <= times[0] < math.inf:
         return  # the general check takes 8 us
     if times.ndim != 1 or not np.isfinite(times).all():

@@ -1,4 +1,4 @@
-"""Many live twins under sampled loads, advanced together; scenes with equal terms share one compiled call."""
+"""Many live twins that are advanced together under sampled loads. Scenes with equal terms share one compiled call."""
 
 from __future__ import annotations
 
@@ -45,49 +45,52 @@ _Array = NDArray[np.float64]
 _NO_MARKS = np.zeros(0, np.int64)
 #: Size of a cache line in bytes.
 _LINE = 64
-#: Number of numbers that Python checks one by one in the time of a call of numpy.
+#: Largest number of values for which a check of each value in Python is faster than one call of numpy.
 _FEW = 32
-#: Terms that have no effect if their parameters are zero, so that a scene without such a term can run with compiled
-#: code that includes the term.
+#: Terms without effect if their parameters are zero. A scene without such a term can run with compiled code that
+#: includes the term.
 _OPTIONAL = ("hysteretic", "wear", "sliding", "running_in", "offset", "free", "slip")
 
 
 def _signature(parts: Parts, scene: Scene) -> tuple[bool, ...]:
-    """Return for each term and option whether the compiled code of a scene has it."""
+    """Return which terms and options the compiled code of a scene contains."""
     return (*(part is not None for part in (*parts.terms, parts.implicit)), *options(scene))
 
 
 class TwinBatch:
-    """Twins that are advanced together, each under its own sampled load: a live ensemble.
+    """A live ensemble: twins that are advanced together, each under its own sampled load.
 
     Parameters
     ----------
     scenes : sequence of Scene
-        A scene for each twin; the scenes' loads are not used. All contact laws must have the same terms: C d', a ramp,
-        or lambda (which is zero without damping). Their exponents must be all 1, all integers of at least 2, or all
+        Scene of each twin. The loads of the scenes are ignored. All contact laws must have the same terms: C d', a
+        ramp, or lambda, which is zero without damping. The exponents must be all 1, all integers of at least 2, or all
         fractions.
     tol : float
-        As for `Twin`.
+        Tolerance of the pose relative to the clearance.
     start : float
-        Model time of the scenes' initial states in s.
+        Model time in s of the initial states of the scenes.
     workers : int, optional
-        Number of threads; 1 by default, because waking a second thread costs more than an advance by one sample.
+        Number of threads. The default is 1, because waking a second thread takes longer than an advance by one sample.
     max_steps : int
-        As for `Twin`.
+        Largest number of steps of an advance of one twin (see `Twin`).
     max_wall_s : float
-        Time [s] that a call for advances may take.
+        Largest wall-clock time in s of a call that advances the twins.
 
     Raises
     ------
     ArgumentError
-        There are no scenes, or the terms of their laws differ.
+        There are no scenes, or the terms of their equations differ.
 
     Notes
     -----
-    At `max_wall_s` a call raises `LimitError`, and after Ctrl-C `RunInterrupted`; all twins then have the state from
-    before the call. If no scene has a ramp, wear, friction, support, locks, an offset centre of mass or overdamped
-    contact, each SIMD vector advances eight twins. Such a twin has the same bits alone and in any
-    batch, and agrees with a `Twin` to the tolerance. Other twins have the bits of a `Twin` with the same terms.
+    A call raises `LimitError` after `max_wall_s`, and `RunInterrupted` after Ctrl-C. All twins then have the state
+    before the call.
+
+    Each SIMD vector advances eight twins if no scene has a ramp, wear, friction, a support, locks, an offset centre of
+    mass or overdamped contact. The results of such a twin do not depend on the other twins of the batch, bit for bit,
+    and agree with a `Twin` within the tolerance. In all other batches, a twin gives results that are bit-identical to a
+    `Twin` with the same terms.
     """
 
     def __init__(
@@ -112,9 +115,9 @@ class TwinBatch:
             self._params[index] = compiled.params
         self._stick = terms.stick
         self._states = new_records(state_type(self._compiled[0].parts.terms), len(scenes))
-        #: states before the newest call, and memory for the states after the next
+        #: states before the last call; the next call writes its states to this memory
         self._before = new_records(self._states.dtype, len(scenes))
-        #: last samples, shape (m, 3), or (1, 3) for all twins
+        #: last samples of the load: shape (m, 3), or (1, 3) if all twins have the same sample
         self._wrench = np.zeros((1, 3))
         self._masses = np.array([inertias(scene) for scene in scenes])
         self._max_steps, self._max_wall_s = max_steps, max_wall_s
@@ -137,11 +140,11 @@ class TwinBatch:
 
     @property
     def signature(self) -> tuple[bool, ...]:
-        """Terms of the equations, as in `Twin`; batches with equal terms share their compiled code."""
+        """Terms of the equations, as in `Twin.signature`. Batches with equal terms share their compiled code."""
         return _signature(self._workers[0].parts, self.scenes[0])
 
     def set_wrench(self, wrench: ArrayLike) -> None:
-        """Set the first samples of the load; the load is linear from sample to sample.
+        """Set the initial samples of the load. The load is interpolated linearly between samples.
 
         Parameters
         ----------
@@ -151,15 +154,15 @@ class TwinBatch:
         self._wrench = np.array(wrench, dtype=np.float64).reshape(len(self), 3)
 
     def advance(self, t: float, wrench: ArrayLike | None = None) -> AdvanceBatch:
-        """Advance all twins to model time `t`; see `advance_samples`.
+        """Advance all twins to model time `t`.
 
         Parameters
         ----------
         t : float
-            Model time in s, not before the present model time.
+            Model time in s, at least the current model time.
         wrench : array_like, shape (m, 3) or (3,), optional
-            Fx, Fy [N] and M [N m] about the cavity's centre at `t`, for each twin or for all. Without it the last
-            samples are held.
+            Fx, Fy [N] and M [N m] about the cavity's centre at `t`, for each twin or for all twins. Without `wrench`,
+            the loads stay at their last samples.
 
         Returns
         -------
@@ -169,7 +172,7 @@ class TwinBatch:
         Raises
         ------
         ArgumentError
-            As for `advance_samples`.
+            The arguments are not valid (see `advance_samples`).
         """
         sample = self._samples_before() if wrench is None else np.asarray(wrench, dtype=np.float64)
         if sample.shape not in ((3,), (len(self), 3)):
@@ -177,14 +180,14 @@ class TwinBatch:
         return self.advance_samples(np.array([t], dtype=np.float64), sample[..., None, :])
 
     def advance_samples(self, t: ArrayLike, wrench: ArrayLike) -> AdvanceBatch:
-        """Advance all twins through many samples, with the same bits as by one `advance` for each sample.
+        """Advance all twins through many samples. The results are bit-identical to one `advance` per sample.
 
         Parameters
         ----------
         t : array_like, shape (n,)
             Model times in s, not decreasing.
         wrench : array_like, shape (m, n, 3) or (n, 3)
-            Fx, Fy [N] and M [N m] about the cavity's centre at each time, for each twin or for all.
+            Fx, Fy [N] and M [N m] about the cavity's centre at each time, for each twin or for all twins.
 
         Returns
         -------
@@ -194,7 +197,7 @@ class TwinBatch:
         Raises
         ------
         ArgumentError
-            A time is before the present time, or a number is not finite; the batch is unchanged.
+            A time is before the current model time, or a number is not finite. The batch is unchanged.
         """
         times, samples = np.ascontiguousarray(t, dtype=np.float64), np.asarray(wrench, dtype=np.float64)
         check_times(self.time, times)
@@ -208,7 +211,7 @@ class TwinBatch:
         return AdvanceBatch(rows)
 
     def reset(self, t: float) -> None:
-        """Go back to the scenes' initial states, at model time `t`.
+        """Reset all twins to the initial states of their scenes, at model time `t`.
 
         Parameters
         ----------
@@ -228,22 +231,22 @@ class TwinBatch:
         self._wrench = np.zeros((1, 3))
 
     def begin_beside(self, snapshot: bytes, moved: ArrayLike, *, again: bool = False) -> None:
-        """Set all twins to displaced states of a sampled twin, with its contacts, last sample and travel speed.
+        """Set all twins to displaced states of a sampled twin. They take its contacts, last sample and travel speed.
 
         Parameters
         ----------
         snapshot : bytes
-            Snapshot of a `Twin` with `excitation="sampled"` whose scene has the same layout of state.
+            Snapshot of a `Twin` with `excitation="sampled"`. Its scene must have the same state type as the batch.
         moved : array_like, shape (m, 6)
             Displacement of x, y [m], theta [rad] and their rates for each twin.
         again : bool
-            Whether the twins were displaced from the same twin before. If so, each keeps the damping that was set at
-            the touch of a continuing contact; otherwise it takes this damping from the sampled twin.
+            Whether the twins were displaced from the same twin before. If True, the damping factor of a continuing
+            contact is unchanged in each twin. If False, it is copied from the sampled twin.
 
         Raises
         ------
         ArgumentError
-            The data does not have the size of a snapshot; the twins are unchanged.
+            The size of the data is not that of a snapshot. The twins are unchanged.
         """
         here, sample, speed = read_snapshot(snapshot, self._states.dtype)
         away = np.broadcast_to(np.asarray(moved, dtype=np.float64), (len(self), 6))
@@ -265,15 +268,15 @@ class TwinBatch:
             self._states["y"][index] = geometry.state_of(self.scenes[index], there[:3], there[3:])
 
     def move(self, which: ArrayLike, q: ArrayLike, v: ArrayLike) -> None:
-        """Set the poses and rates of some twins at the present time; their wear and counters are kept.
+        """Set the poses and rates of some twins at the current time. Their wear and counters are unchanged.
 
         Parameters
         ----------
         which : array_like of int, shape (k,)
             Indices of the twins.
         q, v : array_like, shape (k, 3)
-            Poses x, y [m], theta [rad] and their rates. A contact that continues keeps the damping that was set at its
-            touch.
+            Poses x, y [m], theta [rad] and their rates. If a contact continues, the damping factor from its first touch
+            remains valid.
         """
         index = np.asarray(which, dtype=np.int64)
         poses, rates = np.asarray(q, dtype=np.float64), np.asarray(v, dtype=np.float64)
@@ -282,19 +285,19 @@ class TwinBatch:
         self._reload()
 
     def change(self, which: ArrayLike, scenes: Sequence[Scene]) -> NDArray[np.bool_]:
-        """Replace the scenes of some twins, which keep their places, wear and travel speed.
+        """Replace the scenes of some twins. Positions, wear and travel speeds of the twins are unchanged.
 
         Parameters
         ----------
         which : array_like of int, shape (k,)
-            Indices of the twins; each must be moved by `move` before its next advance.
+            Indices of the twins. Each of these twins must be moved by `move` before its next advance.
         scenes : sequence of Scene
-            New scenes of these twins. A contact that continues keeps a damping that was set at its touch.
+            New scenes of these twins. A continuing contact keeps the damping factor that was set at its first touch.
 
         Returns
         -------
         ndarray of bool, shape (k,)
-            False for a twin that is unchanged because the terms of its equations would have changed.
+            False for a twin whose scene was not replaced, because the terms of its equations would have changed.
         """
         changed = np.zeros(len(scenes), dtype=bool)
         own = list(self.scenes)
@@ -313,17 +316,17 @@ class TwinBatch:
         return changed
 
     def set_travel_speed(self, speed_m_s: ArrayLike) -> None:
-        """Set the speed along the face from here on; only wear depends on it.
+        """Set the speed along the face from the current time on. Only wear depends on this speed.
 
         Parameters
         ----------
         speed_m_s : array_like, shape (m,) or ()
-            Speed in m/s, for each twin or for all; wear depends on the magnitude.
+            Speed in m/s, for each twin or for all twins. Wear depends on the magnitude.
 
         Raises
         ------
         ArgumentError
-            As for `Twin.set_travel_speed`; the batch is unchanged.
+            A speed is not finite, or exceeds the limit of the damping (`check_travel_speed`). The batch is unchanged.
         """
         speeds = np.broadcast_to(np.abs(np.asarray(speed_m_s, dtype=np.float64)), len(self))
         for scene, speed in zip(self.scenes, speeds.tolist(), strict=True):
@@ -333,21 +336,21 @@ class TwinBatch:
                 self._params["wear_per_impulse"][index] = wear_rate(scene.wear, speed)
 
     def snapshot(self) -> bytes:
-        """Return the exact state as bytes, for twins of the same scenes and tolerance."""
+        """Return the exact states as bytes. A batch with the same scenes and tolerance can restore them."""
         return self._states.tobytes() + self._samples_before().tobytes() + self._params["wear_per_impulse"].tobytes()
 
     def restore(self, data: bytes) -> None:
-        """Restore a state saved by `snapshot`.
+        """Restore the states saved by `snapshot`.
 
         Parameters
         ----------
         data : bytes
-            Snapshot of twins of the same scenes and tolerance.
+            Snapshot of a batch with the same scenes and tolerance.
 
         Raises
         ------
         ArgumentError
-            The data does not have the size of a snapshot.
+            The size of the data is not that of a snapshot.
         """
         wear = self._params["wear_per_impulse"]
         ends = np.cumsum([self._states.nbytes, 24 * len(self), wear.nbytes])
@@ -359,11 +362,11 @@ class TwinBatch:
         wear[...] = np.frombuffer(data[ends[1] :]).reshape(wear.shape)
 
     def digest(self) -> str:
-        """Return a hash of the exact state, 16 hexadecimal digits."""
+        """Return a hash of the exact states, as 16 hexadecimal digits."""
         return hashlib.blake2b(self.snapshot(), digest_size=8).hexdigest()
 
     def _run(self, times: NDArray[np.float64], samples: NDArray[np.float64]) -> NDArray[np.void]:
-        """Advance all twins under samples of shape (m or 1, n, 3) and return their rows, shape (m, n)."""
+        """Advance all twins under samples of shape (m or 1, n, 3), and return their rows, shape (m, n)."""
         in_lanes = self._workers[0].lanes is not None
         shape = len(self), len(times)
         rows = _rows_to_fill(*shape) if in_lanes else np.zeros(shape, ROW)
@@ -389,7 +392,7 @@ class TwinBatch:
             return rows
         before, after, begun = self._states, self._before, list[Future[None]]()
         if any(one.lanes is None or one.lanes.stale for one in self._workers):
-            # records are copied as bytes, because numpy copies a record field by field
+            # records are copied as bytes, because numpy would copy a record field by field
             after.view(np.uint8)[:] = before.view(np.uint8)
         try:
             self._states, self._before = after, before
@@ -410,7 +413,7 @@ class TwinBatch:
         return rows
 
     def _reload(self) -> None:
-        """Let lanes read the states from their records, because these have changed."""
+        """Make the lanes reload the states from their records at the next advance, because the records have changed."""
         for worker in self._workers:
             if worker.lanes is not None:
                 worker.lanes.reload()
@@ -420,7 +423,7 @@ class TwinBatch:
         return np.broadcast_to(self._wrench, (len(self), 3))
 
     def _ends(self, samples: NDArray[np.float64], members: slice) -> NDArray[np.float64]:
-        """Return the previous sample and the samples of some twins per mass and inertia, shape (k, n + 1, 3)."""
+        """Return the previous and the new samples of some twins, divided by mass and inertia, shape (k, n + 1, 3)."""
         before, masses = self._samples_before()[members, None], self._masses[members, None]
         own = samples[members] if len(samples) > 1 else np.broadcast_to(samples, (len(before), *samples.shape[1:]))
         joined: NDArray[np.float64] = np.concatenate([before, own], axis=1) / masses
@@ -446,13 +449,13 @@ def _all_finite(numbers: NDArray[np.float64]) -> bool:
 
 
 def _rows_to_fill(twins: int, times: int) -> NDArray[np.void]:
-    """Return rows of `ADVANCE` that start at cache lines; lanes write every field of their rows."""
+    """Return uninitialised rows of `ADVANCE`, aligned with cache lines. Lanes write every field of these rows."""
     memory = np.empty(twins * times * ADVANCE.itemsize + _LINE, np.uint8)
     return np.ndarray((twins, times), ADVANCE, memory.data, -memory.ctypes.data % _LINE)
 
 
 class _Worker(NamedTuple):
-    """The data of one thread."""
+    """Data of one thread."""
 
     parts: Parts
     work: NDArray[np.void]
@@ -469,7 +472,7 @@ class _Worker(NamedTuple):
         return _Worker(parts, work, new_records(TOTALS, 1), Pace(state_type(terms), stiff, max_wall_s), None)
 
     def with_lanes(self, batch: TwinBatch, terms: Terms, members: range) -> _Worker:
-        """Return a worker with lanes for the twins `members`."""
+        """Return a copy of this worker with lanes for the twins `members`."""
         found = LaneTwins(batch._params, terms, members, self.work, batch._max_steps)
         return self._replace(lanes=found)
 
@@ -477,7 +480,7 @@ class _Worker(NamedTuple):
         self, params: NDArray[np.void], states: NDArray[np.void], first: int, last: int, times: _Array, ends: _Array,
         max_steps: int, rows: NDArray[np.void],
     ) -> None:  # fmt: skip
-        """Advance twins `first` to `last` - 1 through all samples by the loop for a single scene."""
+        """Advance the twins `first` to `last` - 1 through all samples, one twin after another without lanes."""
         self.pace.run(loop.advance_rows, (
             params, self.parts, states, self.pace.saved, self.work, self.totals, first, last, times, ends, max_steps,
             rows, _NO_MARKS, states[:0], None, self.pace.record,
@@ -485,12 +488,12 @@ class _Worker(NamedTuple):
 
 
 def _merge(compiled: Sequence[CompiledScene]) -> Terms:
-    """Return the terms that the compiled code needs for all members.
+    """Return the terms that compiled code for all members needs.
 
     Raises
     ------
     ArgumentError
-        The terms of the members' laws differ.
+        Terms that cannot be merged differ between members.
     """
     first = compiled[0].parts.terms
     merged = first

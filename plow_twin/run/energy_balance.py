@@ -1,4 +1,4 @@
-"""The balance of energy and momentum of a run, computed from the sums of the solver."""
+"""Balance of energy and momentum of a run, from the sums that the solver has accumulated."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """The balance of energy and momentum of a run: integrals of the forces compared with the change of state.
+    """Balance of energy and momentum of a run. It compares integrals of the forces with the change of the state.
 
     Attributes
     ----------
     kinetic_j, stored_j : tuple of float
-        Kinetic energy (including a frame on springs) and elastic energy K d^(n+1) / (n+1) of the contacts in J, each at
-        the start and at the end.
+        Kinetic energy, including a frame on springs, and elastic energy K d^(n+1) / (n+1) of the contacts in J. Each
+        tuple contains the value at the start and the value at the end.
     load_work_j, gravity_work_j : float
-        Work of the loads without gravity, and of gravity with its constant moment, in J.
+        Work in J of the loads without gravity, and work of gravity including its constant moment.
     contact_work_j, friction_work_j : float
-        Energy taken from the head by normal contact forces and by friction in J.
+        Energy in J that normal contact forces and friction take from the head.
     support_work_j : float
-        Energy taken by the springs and dampers of a `Support` in J.
+        Energy in J that the springs and dampers of a `Support` take.
     dissipated_j : float
-        The part of `contact_work_j` that is not stored at the end, in J.
+        Part of `contact_work_j` that the contacts do not store at the end, in J.
     turnover_j : float
-        Integral of the magnitudes of all powers in J.
+        Integral of the absolute values of all powers in J.
     imbalance_j : float
-        Largest |change of kinetic energy - work| at any step's end in J.
+        Largest |change of kinetic energy - work| at the end of any step, in J.
     momentum : ndarray, shape (3,)
-        Change of m vx, m vy [N s] and I omega [N m s], in world axes; vx and vy are those of the centre of mass.
+        Change of m vx, m vy [N s] and I omega [N m s] in world axes. vx and vy belong to the centre of mass.
     impulse : ndarray, shape (2, 3)
-        Integrals of loads (with gravity) and of contact forces over time; locked axes are not included.
+        Time integrals of the loads including gravity, and of the contact forces. Locked axes are excluded.
     momentum_imbalance : ndarray, shape (3,)
-        Largest |change of momentum - impulse| at any step's end.
+        Largest |change of momentum - impulse| at the end of any step.
     """
 
     kinetic_j: tuple[float, float]
@@ -62,12 +62,12 @@ class EnergyBalance:
 
     @property
     def relative_imbalance(self) -> float:
-        """Imbalance of energy as a share of the turnover."""
+        """Energy imbalance divided by the turnover."""
         return self.imbalance_j / self.turnover_j if self.turnover_j > 0.0 else 0.0
 
 
 def energy_balance_of(compiled: CompiledScene, last: State, summed: BalanceSums) -> EnergyBalance:
-    """Return the balance of a motion from its initial state to `last`."""
+    """Return the balance of a motion from its initial state to the state `last`."""
     sums, scene, first = summed.sums, compiled.scene, compiled.initial_state()
     gravity = _potential(scene, first) - _potential(scene, last)
     stored = _stored(compiled, first), _stored(compiled, last)
@@ -105,7 +105,7 @@ def _stored(compiled: CompiledScene, state: State) -> float:
 
 
 def elastic_energy(scene: Scene, penetration: Array) -> Array:
-    """Return the elastic energy of all contacts in J, shape (...), for penetrations in m, shape (..., 8)."""
+    """Return the total elastic energy of the contacts in J, shape (...), for penetrations in m, shape (..., 8)."""
     contact = scene.contact
     inside = np.where(np.isin(PAIR_NAMES, scene.pairs), np.maximum(penetration, 0.0), 0.0)
     energy = contact.stiffness * (inside ** (contact.exponent + 1.0)).sum(axis=-1) / (contact.exponent + 1.0)

@@ -1,7 +1,7 @@
-"""Runs of many scenes at once on all cores; members may differ in clearance, stiffness, load or initial state.
+"""Runs of many scenes on all cores. The scenes can differ in clearance, stiffness, load or initial state.
 
-Scenes without further terms than their law and harmonic loads share SIMD vectors (`solve.lanes`); other scenes run one
-by one.
+Scenes whose only terms are their contact law and harmonic loads share SIMD vectors (`solve.lanes`). All other scenes
+run one by one.
 """
 
 from __future__ import annotations
@@ -32,27 +32,27 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Ensemble:
-    """The motions of m scenes.
+    """Motions of m scenes, which are called members.
 
     Attributes
     ----------
     t : ndarray, shape (n,)
         Times of the output rows in s.
     q, v : ndarray, shape (m, n, 3)
-        Pose x, y [m], theta [rad] and its rate; rows after a failure are NaN.
+        Pose x, y [m], theta [rad] and its rates. The rows after a failure are NaN.
     peak, impulse, time_in_contact : ndarray, shape (m, 8)
-        Largest force [N], impulse [N s] and time with force [s] of each pair over the whole motion.
+        Largest force [N], impulse [N s] and time in contact [s] of each pair over the whole motion.
     makes : ndarray of int64, shape (m, 8)
         Number of touches of each pair.
     set_time : ndarray, shape (m, 2, 16)
-        Time in s in which each set of corners (bit i: corner i) is in contact, for counter-clockwise and clockwise
-        contacts.
+        Time in s in which exactly the corners of each set are in contact. Bit i of the last index is corner i. The
+        second index is 0 for counter-clockwise and 1 for clockwise contacts.
     events : ndarray of int64, shape (m,)
-        Number of changes of contact.
+        Number of changes of contact mode.
     wear_depth : ndarray, shape (m, 8)
         Wear depth of each pad at the end in m.
     steps, status : ndarray of int64, shape (m,)
-        Number of steps, and `Status` of each member. A member that fails does not stop the others.
+        Number of steps, and `Status` of each member. A failure of one member does not stop the others.
     """
 
     t: Array
@@ -80,38 +80,38 @@ def simulate_many(
     max_steps: int = BUDGET,
     max_wall_s: float = MOST_SECONDS,
 ) -> Ensemble:
-    """Simulate every scene from t = 0 to `t_end`; the bits of a member depend on its scene alone.
+    """Simulate every scene from t = 0 to `t_end`. The bits of a result depend only on its own scene.
 
-    Scenes with any law without a ramp, with constant or harmonic loads, and without further terms run eight at a time
-    in the lanes of a SIMD vector; they agree with `simulate` to the tolerance. All other scenes have the bits of
-    `simulate`.
+    Scenes with constant or harmonic loads, any contact law without a ramp and no further terms run eight at a time in
+    the lanes of a SIMD vector. Their results agree with `simulate` within the tolerance. For all other scenes the
+    results are bit-identical to `simulate`.
 
     Parameters
     ----------
     scenes : sequence of Scene
     t_end, output_dt, tol
-        As for `simulate`.
+        As in `simulate`.
     workers : int, optional
-        Number of threads; all cores by default. The kernels run without the interpreter's lock.
+        Number of threads. The default is the number of cores. Kernels release Python's global interpreter lock.
     on_progress : callable, optional
-        Called with the number of finished members, never by two threads at the same time.
+        Function that is called with the number of finished members. Calls from different threads do not overlap.
     max_steps : int
-        Largest number of steps of a member; a member that needs more ends with the status `BUDGET`.
+        Largest number of steps of a member. A member that needs more steps ends with the status `BUDGET`.
     max_wall_s : float
-        Wall-clock time in s that all members together may take, including compiling.
+        Largest wall-clock time in s of the whole call, including compilation.
 
     Returns
     -------
     Ensemble
-        Rows, statistics and status of each member; a failed member does not stop the others.
+        Rows, statistics and status of each member. A failure of one member does not stop the others.
 
     Raises
     ------
     ArgumentError
-        An argument cannot be used.
-        LimitError, RunInterrupted
-            The time `max_wall_s` is over, or the user pressed Ctrl-C; `result` has the members up to there, and
-            unfinished members have the status `BUDGET`.
+        An argument is not valid.
+    LimitError, RunInterrupted
+        The time `max_wall_s` has expired, or the user pressed Ctrl-C. The attribute `result` of the error contains the
+        finished members. Unfinished members have the status `BUDGET`.
     """
     check_times(t_end, output_dt)
     check_limits(max_steps, max_wall_s)
@@ -122,7 +122,7 @@ def simulate_many(
     first, others = run.tasks(threads)
     with ThreadPoolExecutor(threads) as pool:
         try:
-            # the first members run alone, because they compile the kernels
+            # the first member without lanes runs before the others, because it compiles the kernels
             for task in first:
                 task()
             for done in [pool.submit(task) for task in others]:
@@ -137,15 +137,15 @@ def simulate_many(
     return ensemble
 
 
-#: Smallest number of members that a thread takes at a time. When the last members of a share end, lanes stay empty;
-#: with fewer members this would be too large a part of the time.
+#: Smallest number of members that a thread takes at a time. Lanes are empty while the last members of a share end. With
+#: fewer members, these empty lanes would take too large a part of the time.
 _LEAST_SHARE = 64
-#: Number of shares for each thread; with several small shares all threads end at about the same time.
+#: Number of shares per thread. With several small shares, all threads end at about the same time.
 _SHARES = 4
 
 
 class _Run:
-    """The run of an ensemble: the state that its threads share."""
+    """Run of an ensemble: the data that its threads share."""
 
     def __init__(
         self,
@@ -163,7 +163,7 @@ class _Run:
         self.stopped, self.done = threading.Event(), 0
 
     def tasks(self, threads: int) -> tuple[list[Callable[[], None]], list[Callable[[], None]]]:
-        """Return the tasks to do first, one after another, and the tasks that the threads then share."""
+        """Return the tasks that run first, one after another, and the tasks that the threads then share."""
         groups: dict[object, list[int]] = {}
         alone: list[Callable[[], None]] = []
         for index, one in enumerate(self._compiled):
@@ -207,7 +207,7 @@ class _Run:
                 self._on_progress(self.done)
 
     def _run_lanes(self, run: LaneRun, share: NDArray[np.int64]) -> None:
-        """Run some members in lanes; their scenes must fit the lanes."""
+        """Run some members in lanes. The scenes of these members must fit the lanes (`fits_lanes`)."""
         waiting = share
         while len(waiting):
             self._look()
@@ -217,7 +217,7 @@ class _Run:
             self._report_progress(len(done))
 
     def _run_alone(self, index: int) -> None:
-        """Run a member by the loop for a single scene."""
+        """Run a member without lanes."""
         self._look()
         compiled, ensemble = self._compiled[index], self._ensemble
         motion = Motion.start(compiled, ensemble.q[index], ensemble.v[index])
@@ -232,7 +232,7 @@ class _Run:
         state: State | NDArray[np.void],
         status: int | NDArray[np.int64],
     ) -> None:
-        """Store the results of one or more finished members."""
+        """Store the results of finished members. `index` selects one or several members."""
         ensemble = self._ensemble
         ensemble.peak[index], ensemble.impulse[index] = totals["peak"], totals["impulse"]
         ensemble.time_in_contact[index], ensemble.makes[index] = totals["time_in_contact"], totals["makes"]

@@ -1,4 +1,4 @@
-"""Scenes run in the lanes of a SIMD vector, in slices of work. Steps of other methods run in the single loop."""
+"""Runs of scenes in the lanes of SIMD vectors, in slices of work. Steps of other methods use the loop for one scene."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from plow_twin.solve.state import EVENT, HARMONIC, STATE, TOTALS, Status, Work, 
 
 #: Number of steps of each lane in the first slice.
 _FIRST_SLICE: Final = 256
-#: Largest number of steps that the loop for a single scene takes when a lane needs a step of another method; a call of
-#: this loop costs as much as some thirty steps.
+#: Largest number of steps in the loop for one scene, when a lane needs a step of another method. A call of this loop
+#: costs as much as some thirty steps.
 _OTHER_STEPS: Final = 32
 
 
 class LaneRun:
-    """The members of an ensemble that run in lanes.
+    """Run of those members of an ensemble that use lanes.
 
     Parameters
     ----------
@@ -32,13 +32,13 @@ class LaneRun:
     compiled : sequence of CompiledScene
         All members.
     members : sequence of int
-        Indices of the members that run here.
+        Indices of the members that use lanes.
     times : ndarray, shape (n,)
-        Times of the rows in s.
+        Times of the output rows in s.
     q, v : ndarray, shape (m, n, 3)
-        Arrays that receive the rows.
+        Arrays that receive the output rows.
     t_end : float
-        End in s.
+        End of the motion in s.
     max_steps : int
         Largest number of steps of a member.
     """
@@ -68,7 +68,7 @@ class LaneRun:
         )  # fmt: skip
 
     def go_on(self, waiting: NDArray[np.int64], work: Work, lanes: np.record) -> NDArray[np.bool_]:
-        """Advance members by a slice of work in empty lanes; return whether each is done."""
+        """Advance members by a slice of work in empty lanes. Return whether each member has finished."""
         one, begin = self._compiled[waiting[0]], _time.perf_counter()
         terms = one.parts.terms
         run_lanes(
@@ -84,7 +84,7 @@ class LaneRun:
         return done
 
     def _step_otherwise(self, index: int, work: Work) -> None:
-        """Let the loop for a single scene take some steps of a member."""
+        """Advance a member by some steps in the loop for one scene."""
         members = self._members
         state, totals = self.states.view(np.recarray)[index], self.totals.view(np.recarray)[index]
         motion = Motion(state, totals, np.zeros(16 * _OTHER_STEPS, EVENT), members.q[index], members.v[index])
@@ -98,7 +98,7 @@ class LaneRun:
 
 
 def _joined(compiled: Sequence[CompiledScene], members: Sequence[int]) -> tuple[NDArray[np.void], NDArray[np.int64]]:
-    """Return the harmonics of all members in one array, and first index and count for each member, shape (m, 2)."""
+    """Return all members' harmonics in one array, and for each member its first index and its count, shape (m, 2)."""
     parts, extent, begin = [np.zeros(0, HARMONIC)], np.zeros((len(compiled), 2), np.int64), 0
     known: dict[int, tuple[int, int]] = {}
     for index in members:

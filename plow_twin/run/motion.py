@@ -1,4 +1,4 @@
-"""Runs of the compiled loop in slices; limits, progress and Ctrl-C are handled between slices."""
+"""Runs of the compiled loop in slices. Limits, progress and Ctrl-C are handled between slices."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ Array = NDArray[np.float64]
 _FIRST_LOG: Final = 4096
 #: Default number of steps after which a run ends with an error.
 BUDGET: Final = 10**8
-#: Target computing time in s of a slice of a run; number of steps in the first slice, for explicit and for implicit
-#: steps.
+#: `_SLICE_S`: target computing time in s of a slice. `_FIRST_SLICE`, `_FIRST_SLICE_IMPLICIT`: number of steps in the
+#: first slice of a scene without and with implicit steps.
 _SLICE_S: Final = 0.02
 _FIRST_SLICE, _FIRST_SLICE_IMPLICIT = 2048, 64
 
 
 @dataclass
 class Motion:
-    """The progress of a run, and the arrays that it fills."""
+    """State of a run, and the arrays that receive its results."""
 
     state: State
     totals: Totals
@@ -38,12 +38,12 @@ class Motion:
     v: Array
     penetration: Array | None = None
     force: Array | None = None
-    #: displacement and rate of a frame on springs, shape (n, 6)
+    #: displacement of a frame on springs and its rates, shape (n, 6)
     frame: Array | None = None
     sums: BalanceSums | None = None
     #: number of rows written
     first: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
-    #: time in s reached by fixed steps, which leave the state's `time` unchanged
+    #: time in s reached by fixed steps, which do not update the state's `time`
     fixed_time: float | None = None
 
     @property
@@ -58,7 +58,10 @@ class Motion:
 
     @staticmethod
     def start(compiled: CompiledScene, q: Array, v: Array, outputs: bool = False) -> Motion:
-        """Return a motion at the initial state with rows q, v, shape (n, 3); `outputs` adds arrays for the pairs."""
+        """Return a motion at the initial state with the output rows q and v, shape (n, 3) each.
+
+        `outputs` adds arrays for the pairs and for a frame on springs.
+        """
         eight = (len(q), PAIR_COUNT)
         penetration, force = (np.zeros(eight), np.zeros(eight)) if outputs else (None, None)
         frame = np.zeros((len(q), 6)) if outputs and compiled.scene.support is not None else None
@@ -75,9 +78,9 @@ def run_events(
     budget: int,
     look: Callable[[Motion], None] | None = None,
 ) -> tuple[int, int]:
-    """Advance a motion to `t_end` by the event-located series; return its `Status` and the number of rows written.
+    """Advance a motion to `t_end` by Taylor series with event detection. Return its `Status` and the number of rows.
 
-    `look` is called between slices of the run. The slices do not change a bit of the motion.
+    The function `look` is called between slices of the run. The division into slices does not change the results.
     """
     size = _FIRST_SLICE if compiled.parts.implicit is None else _FIRST_SLICE_IMPLICIT
     while True:
@@ -97,7 +100,7 @@ def run_events(
 
 
 def next_slice(size: int, took_s: float) -> int:
-    """Return the number of steps for the next slice, at most `BUDGET`; `size` steps took the time `took_s`."""
+    """Return the number of steps of the next slice. The last slice had `size` steps and took the time `took_s`."""
     return min(BUDGET, max(1, int(size * min(4.0, max(0.1, _SLICE_S / max(took_s, 1e-6))))))
 
 
@@ -111,12 +114,12 @@ def run_fixed(
     budget: int,
     look: Callable[[Motion], None] | None,
 ) -> int:
-    """Advance a motion by `steps` fixed steps; return its `Status`."""
+    """Advance a motion by `steps` fixed steps, and return its `Status`."""
     z = np.zeros(6 if compiled.parts.terms.support is None else 12)
     done, size = np.zeros(1, np.int64), _FIRST_SLICE
     while True:
         begin = _time.perf_counter()
-        # a slice writes a row at its end; if this row is not due, the next slice overwrites it
+        # each slice ends with an output row, even between output times; the next slice then overwrites this row
         allowed = min(steps, budget, steps if look is None else int(done[0]) + size)
         code = int(fixed_step.integrate_fixed(
             compiled.params, compiled.parts, motion.state, motion.totals, motion.log, z, done, allowed, dt, euler,

@@ -1,4 +1,4 @@
-"""Work in slices, between which limits are checked and Ctrl-C is handled."""
+"""Calls of kernels in slices of work. Limits and Ctrl-C are handled between slices."""
 
 from __future__ import annotations
 
@@ -11,39 +11,39 @@ import numpy as np
 from plow_twin.errors import ArgumentError
 from plow_twin.solve.state import PACE, first_of, new_records
 
-#: Default time in s after which a call ends with an error.
+#: Default wall-clock time in s after which a call ends with an error.
 MOST_SECONDS: Final = 3600.0
-#: Number of steps in a slice, for explicit steps, which take microseconds, and for implicit steps, which take up to a
-#: millisecond.
+#: Number of steps in a slice of a scene without and with implicit steps. An explicit step takes microseconds, an
+#: implicit step up to a millisecond.
 _SLICE, _SLICE_IMPLICIT = 2048, 64
 
 
 class OutOfTimeError(Exception):
-    """The wall-clock time of a call is used up, or the call was stopped."""
+    """The wall-clock time of a call has expired, or the call was stopped."""
 
 
 class Pace:
-    """Work in slices within the time limit of a call; one object serves successive calls.
+    """Runs kernels in slices within the time limit of a call. One object is used for successive calls.
 
     Parameters
     ----------
     state_type : dtype
-        Type of the state; `saved` keeps a copy of the state at the beginning of the present advance.
+        Type of the state. The attribute `saved` contains the state at the beginning of the current advance.
     implicit : bool
         Whether the scene may need implicit steps.
     max_wall_s : float
-        Time in s that a call may take.
+        Largest wall-clock time in s of a call.
     """
 
     def __init__(self, state_type: np.dtype[np.void], implicit: bool, max_wall_s: float) -> None:
         self._records = new_records(PACE, 1)
         self.record = first_of(self._records)
-        #: the record as an argument of kernels; with `record` numba would look up an attribute in slow Python code
+        #: the record as an argument of kernels; for `record`, numba would look up an attribute in slow Python code
         self.argument = self._records[0]
         #: number of failed advances in the last call, shape (1,), as a view of the record
         self.failed = self._records["failed"]
         self.record.slice = _SLICE_IMPLICIT if implicit else _SLICE
-        # bytes are copied five times as fast as a record, which numpy copies field by field
+        # numpy copies a record field by field, which takes five times as long as a copy of its bytes
         self._bytes = self._records.view(np.uint8).data
         self._start = self._bytes.tobytes()
         self.saved = new_records(state_type, 1)
@@ -51,12 +51,12 @@ class Pace:
         self.stopped = False
 
     def run(self, work: Callable[..., bool], arguments: tuple[Any, ...] = ()) -> None:
-        """Call `work` for slice after slice until it is done.
+        """Call `work` repeatedly until it returns True. Each call is a slice of the work.
 
         Raises
         ------
         OutOfTimeError
-            The time limit is reached, or `stopped` was set during the call; `record` holds the progress.
+            The time limit was reached, or `stopped` was set during the call. `record` contains the progress.
         """
         self._bytes[:] = self._start
         begin = _time.perf_counter()
@@ -66,8 +66,8 @@ class Pace:
 
 
 def check_limits(max_steps: int, max_wall_s: float) -> None:
-    """Raise `ArgumentError` for invalid limits."""
-    # a float is refused, because numba would compile the kernels again for it
+    """Raise `ArgumentError` if a limit is not valid."""
+    # a float is rejected, because numba would compile the kernels again for this type
     if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or not max_steps >= 1:
         raise ArgumentError(f"max_steps: got {max_steps!r}, expected an integer >= 1")
     if not max_wall_s > 0.0:

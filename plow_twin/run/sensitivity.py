@@ -1,9 +1,9 @@
-"""Growth of errors along a motion, which shows how long the tolerance is met.
+"""Growth of errors along a motion, and the time up to which the tolerance is met.
 
-The columns of the fundamental matrix are solutions of the linearised equations (`solve.tangents`). For scenes with
-terms that `solve.tangents` does not cover, the columns are differences between the motion and its shadows: displaced
-motions that start close to the motion and are followed over short stretches of time. These columns include the jumps at
-touches and separations (saltation), because each shadow has its own events.
+The columns of the fundamental matrix are solutions of the linearised equations (`solve.tangents`). If `solve.tangents`
+does not support a term of the scene, the columns are finite differences between the motion and its shadows. A shadow is
+a second motion that starts with a small displacement from the motion and lasts for a short stretch of time. Each shadow
+has its own events, so the columns include the jumps at touches and separations (saltation).
 """
 
 from __future__ import annotations
@@ -29,28 +29,29 @@ from plow_twin.solve.tangents import ALONG, STATE_COLUMNS, follow_columns
 
 Array = NDArray[np.float64]
 
-#: `DISPLACEMENT`: displacement of a shadow as a share of the clearance; `_LEAST_DISPLACEMENT`: smallest displacement
-#: near a wall, as a share of the clearance; `SHADOW_TOLERANCE`: tolerance of a shadow's motion.
+#: `DISPLACEMENT`: displacement of a shadow relative to the clearance. `_LEAST_DISPLACEMENT`: its smallest value near a
+#: wall. `SHADOW_TOLERANCE`: tolerance of the motion of a shadow.
 DISPLACEMENT: Final = 1e-7
 _LEAST_DISPLACEMENT: Final = 1e-10
 SHADOW_TOLERANCE: Final = 1e-12
 _STRETCHES: Final = 200
-#: Change of a parameter that is not a length, as a share of the parameter's value.
+#: Change of a parameter relative to its value, unless the parameter is a length.
 _RELATIVE_CHANGE: Final = 1e-6
-#: At the beginning of a stretch each wall must be at least this many displacements away; the displacement is reduced if
-#: necessary. If it would become too small, the previous stretch is continued instead, at most `_MOST_MERGED` times in a
-#: row.
+#: `_CLEAR_OF_WALLS`: smallest distance from each wall at the beginning of a stretch, divided by the displacement of the
+#: shadows. The displacement is reduced if necessary. If it would become too small, the previous stretch continues, at
+#: most `_MOST_MERGED` times in succession.
 _CLEAR_OF_WALLS: Final = 100.0
 _MOST_MERGED: Final = 20
-#: Largest number of steps of a shadow in a stretch.
+#: Largest number of solver steps of a shadow in one stretch.
 _SHADOW_BUDGET: Final = 10**7
-#: Tolerance of the motion along which the equations are linearised. The derivatives then have an error of some 1e-6
-#: times the growth of errors; if this error exceeds `_LARGEST_ERROR`, the tolerance of the run is used instead.
+#: `_EQUATIONS_TOLERANCE`: tolerance of the motion along which the equations are linearised. The error of the
+#: derivatives is then some 1e-6 times the growth of errors. If this error exceeds `_LARGEST_ERROR`, the tolerance of
+#: the run is used.
 _EQUATIONS_TOLERANCE, _LARGEST_ERROR = 1e-6, 1e-2
-#: `_FIRST_SLICE`: number of steps before the first check of the time limit
-#: `_MOST_WITHOUT_IMPLICIT`: largest number of explicit steps in a scene that can need implicit steps
+#: `_FIRST_SLICE`: number of steps before the first check of the time limit. `_MOST_WITHOUT_IMPLICIT`: largest number of
+#: explicit steps in a scene that may need implicit steps.
 _FIRST_SLICE, _MOST_WITHOUT_IMPLICIT = 2048, 200_000
-#: Largest growth at which an error is still within ten tolerances (`docs/solver.md`).
+#: Largest growth for which the error of a motion stays within ten tolerances (`docs/solver.md`).
 TRUSTED_GROWTH: Final = 1e4
 
 
@@ -64,17 +65,17 @@ class Sensitivity:
         Times in s.
     growth : ndarray, shape (n,)
         Largest factor by which an error at any earlier time has grown until `t`. Errors of poses are relative to the
-        clearance; errors of velocities are first multiplied by the time in which the largest load moves the head across
-        the clearance.
+        clearance. Errors of velocities are converted to lengths by the time in which the largest load moves the head
+        across the clearance.
     from_start : ndarray, shape (n, k, k)
-        Derivatives of the state at `t` with respect to the initial state; a state has the coordinates, then the rates,
-        of the k / 2 free degrees of freedom.
+        Derivatives of the state at `t` with respect to the initial state. A state contains the coordinates of the k / 2
+        free degrees of freedom, followed by their rates.
     exponent : float
-        Largest Lyapunov exponent in 1/s in the second half of the motion; if it is above 0, errors grow for ever.
+        Largest Lyapunov exponent in 1/s in the second half of the motion. If it is positive, errors grow without bound.
     tol : float
-        Tolerance of the motion.
+        Tolerance of the motion, relative to the clearance.
     by_parameter : mapping of str to ndarray, shape (n, k)
-        Derivatives of the state at `t` with respect to the chosen parameters, in the parameters' units.
+        Derivatives of the state at `t` with respect to the chosen parameters. The keys are the paths of the parameters.
     """
 
     t: Array
@@ -86,16 +87,16 @@ class Sensitivity:
 
     @property
     def trusted(self) -> bool:
-        """Whether the tolerance is met over the whole motion: `growth` does not exceed `TRUSTED_GROWTH`."""
+        """Whether the tolerance is met over the whole motion: `growth` is at most `TRUSTED_GROWTH`."""
         return bool(self.growth.max() <= TRUSTED_GROWTH)
 
     def good_until(self, accuracy: float) -> float:
-        """Return the time in s up to which the error of the pose stays below a limit.
+        """Return the time in s until which the error of the pose stays below a limit.
 
         Parameters
         ----------
         accuracy : float
-            Limit of the pose error relative to the clearance.
+            Limit of the error of the pose, relative to the clearance.
         """
         bad = np.flatnonzero(self.tol * self.growth > accuracy)
         return float(self.t[-1] if len(bad) == 0 else self.t[max(0, bad[0] - 1)])
@@ -112,7 +113,7 @@ class Sensitivity:
 def sensitivity_parameters(scene: Scene) -> dict[str, float]:
     """Return the parameters with respect to which a motion can be differentiated.
 
-    These are stiffness, damping or restitution, both clearances, and a scale factor of each load.
+    These parameters are stiffness, damping or restitution, both clearances, and a scale factor for each load.
 
     Parameters
     ----------
@@ -121,7 +122,7 @@ def sensitivity_parameters(scene: Scene) -> dict[str, float]:
     Returns
     -------
     dict of str to float
-        Values of the parameters in the scene; the keys are paths such as `contact.stiffness`.
+        Values of the parameters in the scene. The keys are paths such as `contact.stiffness`.
     """
     contact, clearance = scene.contact, scene.clearance
     found = {"contact.stiffness": contact.stiffness, "contact.damping": contact.damping or 0.0}
@@ -132,7 +133,7 @@ def sensitivity_parameters(scene: Scene) -> dict[str, float]:
 
 
 def _changed(scene: Scene, path: str, value: float) -> Scene:
-    """Return the scene with a new value of the parameter at `path`, one of `sensitivity_parameters`."""
+    """Return a copy of the scene with a new value of the parameter at `path` (see `sensitivity_parameters`)."""
     part, _, name = path.rpartition(".")
     if part in ("contact", "clearance"):
         return replace(scene, **{part: replace(getattr(scene, part), **{name: value})})
@@ -150,7 +151,7 @@ def _scaled(load: Load, factor: float) -> Load:
 
 @dataclass(frozen=True)
 class ChangedScene:
-    """A scene with a small change of one parameter."""
+    """A scene in which one parameter differs by a small change."""
 
     path: str
     compiled: CompiledScene
@@ -158,7 +159,7 @@ class ChangedScene:
 
     @staticmethod
     def of(scene: Scene, path: str, tol: float) -> ChangedScene:
-        """Return the scene with a small change of the parameter at `path`."""
+        """Return a copy of the scene with a small change of the parameter at `path`."""
         value = sensitivity_parameters(scene)[path]
         length = path.startswith("clearance")
         change = DISPLACEMENT * geometry.length_scale(scene) if length else _RELATIVE_CHANGE * value
@@ -168,29 +169,29 @@ class ChangedScene:
 
 
 def refuse_support(scene: Scene) -> None:
-    """Raise `ArgumentError` for a scene with a `Support`, because shadows displace only the head."""
+    """Raise `ArgumentError` for a scene with a `Support`, because shadows have no displacement of the frame."""
     if scene.support is not None:
         raise ArgumentError(f"sensitivity: got a scene with {scene.support}, expected a scene without support")
 
 
 class StretchProduct:
-    """The product of the fundamental matrices of consecutive stretches.
+    """Product of the fundamental matrices of successive stretches of time.
 
     Parameters
     ----------
     size : int
-        Number of free coordinates and rates.
+        Number of free coordinates and their rates.
     parameters : int
         Number of parameters.
 
     Attributes
     ----------
     total : ndarray, shape (k, k)
-        Derivatives of the present state with respect to the state at the beginning.
+        Derivatives of the current state with respect to the initial state.
     rows : ndarray, shape (p, k)
-        Derivatives of the present state with respect to the parameters.
+        Derivatives of the current state with respect to the parameters.
     growth : float
-        Largest factor by which an error at any of the kept earlier times has grown until now, at least 1.
+        Largest factor by which an error at any stored earlier time has grown until now, at least 1.
     """
 
     def __init__(self, size: int, parameters: int) -> None:
@@ -199,27 +200,27 @@ class StretchProduct:
         self._basis, self._scratch = np.eye(size), np.zeros((5 + MOST_KEPT, size, size))
 
     def follow(self, matrices: Array, changes: Array, ends: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
-        """Multiply by the matrices of further stretches; the attributes then belong to the last stretch's end.
+        """Multiply the product by the matrices of further stretches. The attributes then refer to the end of the last.
 
-        At a time within a stretch only the growth of coordinates counts, not of rates, because in the middle of an
-        impact a stiff contact turns any displacement into a large, temporary difference of velocities.
+        At a time within a stretch, `growth` includes only errors of coordinates. In the middle of an impact, a stiff
+        contact turns any displacement into a large, temporary difference of velocities.
 
         Parameters
         ----------
         matrices : ndarray, shape (n, k, k)
-            Fundamental matrices, each from the beginning of its stretch to one of n times.
+            Fundamental matrices, each from the beginning of a stretch to one of n times.
         changes : ndarray, shape (n, p, k)
-            Effects of the parameters over the same n intervals.
+            Effects of the parameters over the same n intervals of time.
         ends : ndarray of bool, shape (n,)
             Whether a stretch ends at each of the n times.
 
         Returns
         -------
         totals, rows, growth : ndarray, shapes (n, k, k), (n, p, k) and (n,)
-            The attributes at each of the n times.
+            The values of the attributes at each of the n times.
         logs : ndarray, shape (n, k)
-            Logarithms of the factors by which a stretch has extended the vectors of a basis, in the row at which the
-            stretch ends; other rows are 0.
+            Logarithms of the factors by which a stretch has extended the vectors of a basis, in the row of the end of
+            the stretch. All other rows are 0.
         """
         count, size = matrices.shape[:2]
         totals, rows = np.zeros((count, size, size)), np.zeros((count, len(self.rows), size))
@@ -241,16 +242,16 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
     t_end : float
         End of the motion in s, above 0.
     tol : float
-        Tolerance of the simulated motion; the derivatives may be computed at another tolerance.
+        Tolerance of the simulated motion. The derivatives may be computed with another tolerance.
     parameters : sequence of str
         Paths of the parameters with respect to which derivatives are computed, from `sensitivity_parameters`.
 
     Raises
     ------
     ArgumentError
-        The scene does not have one of the parameters, or it has a `Support`.
+        The scene does not have one of the parameters, or the scene has a `Support`.
     SolverError
-        A shadow could not be followed.
+        The solver cannot continue a motion.
     """
     refuse_support(scene)
     known = sensitivity_parameters(scene)
@@ -268,12 +269,11 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
         stretches = _by_shadows(scene, t_end, tol, parameters)
     totals, rows, growth, logs = follow(stretches)
     if tol < _EQUATIONS_TOLERANCE and _EQUATIONS_TOLERANCE * growth.max() > _LARGEST_ERROR:
-        # at the coarse tolerance the derivatives are too inaccurate, so the motion is linearised again at the run's
-        # tolerance
+        # at the coarse tolerance the derivatives are too inaccurate, so they are computed again at the run's tolerance
         stretches = _by_equations(scene, t_end, tol, parameters) or stretches
         totals, rows, growth, logs = follow(stretches)
     times, ends = _ends(t_end), stretches.ends
-    # the exponent is computed only from stretches that begin in the second half of the motion
+    # only stretches that begin in the second half of the motion contribute to the exponent
     edges = np.concatenate([[0.0], times[ends]])
     first = int(np.searchsorted(edges, 0.5 * t_end))
     stretched = logs[ends][first:].sum(axis=0)
@@ -286,7 +286,7 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
 
 
 class _Stretches(NamedTuple):
-    """Derivatives at the times `_ends` since the beginning of each stretch, scaled by `scale_of`."""
+    """Scaled derivatives at the times of `_ends`, each with respect to the beginning of its stretch (`scale_of`)."""
 
     matrices: Array  #: derivatives with respect to the state, shape (n, k, k)
     changes: Array  #: derivatives with respect to the parameters, shape (n, p, k)
@@ -294,7 +294,7 @@ class _Stretches(NamedTuple):
 
 
 def _by_equations(scene: Scene, t_end: float, tol: float, parameters: Sequence[str]) -> _Stretches | None:
-    """Return derivatives by the linearised equations, or None if these lack a term or take too many steps."""
+    """Return the derivatives from the linearised equations, or None for unsupported terms or too many steps."""
     compiled = compile_scene(scene, tol)
     changed = [ChangedScene.of(scene, path, tol) for path in parameters]
     if not fits_tangents(compiled) or any(one.compiled.parts.terms != compiled.parts.terms for one in changed):
@@ -324,8 +324,8 @@ def _by_equations(scene: Scene, t_end: float, tol: float, parameters: Sequence[s
 
 
 def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str]) -> _Stretches:
-    """Return derivatives by differences between the motion and its shadows."""
-    # `SHADOW_TOLERANCE` is 1e-5 of a displacement; the run's tolerance is used if it is tighter
+    """Return the derivatives from finite differences between the motion and its shadows."""
+    # `SHADOW_TOLERANCE` is 1e-5 of the displacement; a tighter tolerance of the run takes precedence
     fine = min(max(SHADOW_TOLERANCE, TOLERANCE_RANGE[0]), tol)
     compiled = compile_scene(scene, fine)
     changed = [ChangedScene.of(scene, path, fine) for path in parameters]
@@ -360,7 +360,7 @@ def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str
 
 
 def _ends(t_end: float) -> Array:
-    """Return the times [s] at which stretches may end, unevenly spaced to avoid alignment with a period."""
+    """Return the times [s] at which stretches may end. Uneven spacing prevents alignment with a period of the load."""
     ends = np.arange(1, _STRETCHES + 1, dtype=np.float64)
     ends[:-1] += 0.4 * (np.mod(ends[:-1] * 0.5 * (math.sqrt(5.0) - 1.0), 1.0) - 0.5)
     ends *= t_end / _STRETCHES
@@ -369,7 +369,7 @@ def _ends(t_end: float) -> Array:
 
 
 def scale_of(compiled: CompiledScene) -> Array:
-    """Return the units of coordinates and rates in which the clearance is 1, shape (6,)."""
+    """Return the scales of coordinates and rates, shape (6,), relative to which the clearance is 1."""
     params, length = compiled.params, geometry.length_scale(compiled.scene)
     place = np.array([1.0, 1.0, 1.0 / float(params.radius)]) * length
     scale: Array = np.concatenate([place, place * float(params.velocity_tolerance / params.position_tolerance)])
@@ -379,29 +379,29 @@ def scale_of(compiled: CompiledScene) -> Array:
 def displacement_beside(
     penetration: Array, length: float, *, held: bool = False, reads_speed: bool = False
 ) -> float | None:
-    """Return the largest displacement of shadows, in clearances, for a stretch that begins at `penetration`.
+    """Return the largest displacement of shadows, relative to the clearance, for a stretch that begins now.
 
-    A stretch does not begin during a contact with a spring, because the spring would turn a displacement into a
-    velocity larger than any error of the solver. If a damper holds the head, a displacement persists, so a small
-    displacement is sufficient.
+    A stretch does not begin during a contact with an elastic wall, because the contact would turn a displacement into a
+    velocity larger than any error of the solver. If overdamped contact holds the head, a displacement decays slowly, so
+    a small displacement is sufficient.
 
     Parameters
     ----------
     penetration : ndarray, shape (n,)
-        Penetrations in m of the pairs that can touch.
+        Penetrations in m at the beginning of the stretch, of the pairs that can touch.
     length : float
-        Clearance in m, to which displacements are relative.
+        Reference length of displacements in m.
     held : bool
         Whether overdamped contact holds the head.
     reads_speed : bool
-        Whether a contact's damping depends on the speed of its touch; a displacement within the contact does not change
-        this speed.
+        Whether the damping of a contact depends on the speed at first touch. A displacement during the contact does not
+        change this speed.
 
     Returns
     -------
     float or None
-        None if a pair is closer to its wall than `_CLEAR_OF_WALLS` times the smallest admissible displacement, or if a
-        pair is in a contact whose damping depends on the speed of its touch.
+        None if a pair is closer to its wall than `_CLEAR_OF_WALLS` times the smallest admissible displacement. None
+        also if a pair is in contact and the argument `reads_speed` is True.
     """
     if reads_speed and bool((penetration > 0.0).any()):
         return None
@@ -410,7 +410,7 @@ def displacement_beside(
 
 
 def free_places(scene: Scene) -> NDArray[np.int64]:
-    """Return the indices of the free coordinates and rates."""
+    """Return the indices of the free coordinates, followed by the indices of their rates."""
     places = [index for index, name in enumerate(DOF_NAMES) if name not in scene.locked]
     return np.array(places + [3 + index for index in places], dtype=np.int64)
 
@@ -423,10 +423,10 @@ def _beside(
     before: Sequence[State],
     work: Work,
 ) -> list[State]:
-    """Return a state and its shadows: one displaced in each free coordinate or rate, one per changed scene.
+    """Return a state and its shadows: one for each free coordinate or rate, and one for each changed scene.
 
-    `moved` has the displacements. Shadows of changed scenes are not displaced; they keep the damping factors that were
-    set at their own touches, taken from the states `before`.
+    `moved` contains the displacements of the first group. Shadows of changed scenes are not displaced. Their damping
+    factors, which are set at their own touches, are taken from the states `before`.
     """
     start = _pose_and_rate(_follow(compiled, state, float(state.time), work))
     states = [state]
@@ -449,7 +449,7 @@ def _copy(state: State) -> State:
 
 
 def _follow(compiled: CompiledScene, state: State, end: float, work: Work) -> Motion:
-    """Advance a copy of a state to `end`; return its motion, whose only output row is at `end`."""
+    """Return the motion from a copy of a state to the time `end`. It contains one output row, at `end`."""
     motion = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)), outputs=True)
     motion.state = _copy(state)
     code, _ = run_events(compiled, motion, np.array([end]), end, work, int(motion.state.steps) + _SHADOW_BUDGET)

@@ -1,4 +1,4 @@
-"""Simulation of a scene from its initial state, with the motion as arrays."""
+"""Simulation of a scene from its initial state. The result contains the motion as arrays."""
 
 from __future__ import annotations
 
@@ -28,48 +28,48 @@ from plow_twin.solve.state import EVENT, OFF, Status, Totals, Work, new_work
 Method = Literal["events", "rk4", "euler"]
 Array = NDArray[np.float64]
 
-#: Type of a contact event: time in s, pair, contact mode before and after (0 OFF, 1 ON, 2 CLIPPED), penetration rate in
-#: m/s.
+#: Record type of a contact event: time in s, pair, contact mode before and after the event, penetration rate in m/s.
+#: The modes are 0 OFF, 1 ON and 2 CLIPPED.
 EVENT_DTYPE: Final = EVENT
 _ROWS_BY_DEFAULT = 1000
-#: Largest number of rows; a row takes 176 bytes of memory.
+#: Largest number of output rows. A row takes 176 bytes of memory.
 _MOST_ROWS: Final = 1e10
 
 
 @dataclass(frozen=True)
 class Result:
-    """A motion.
+    """Motion of a scene, with statistics of its contacts.
 
     Attributes
     ----------
     t : ndarray, shape (n,)
         Times of the output rows in s.
     q, v : ndarray, shape (n, 3)
-        Pose x, y [m], theta [rad] of the cavity's centre, and its rate.
+        Pose x, y [m], theta [rad] of the cavity's centre, and the rates of the pose.
     force, penetration : ndarray, shape (n, 8)
         Normal force [N] and signed penetration [m] of each pair.
     events : ndarray of `EVENT_DTYPE`, shape (k,)
-        All contact changes in order of time.
+        All changes of contact mode, in order of time.
     statistics : mapping
-        By pair name: max, mean_in_contact, mean_over_time [N], impulse [N s], time_in_contact [s] and makes (number of
-        touches), computed from the whole motion and not only from the output rows.
+        Values of each pair by its name: max, mean_in_contact and mean_over_time [N], impulse [N s], time_in_contact [s]
+        and makes (number of touches). They are computed from the whole motion, not from the output rows.
     contact_sets : mapping
-        By sense of the swing that the contacts stop (`ccw`, `cw`) and set of corners: the share of the sense's contact
-        time in which exactly the corners of the set carry force. Corners have the scene's labels, otherwise their
-        names.
+        Shares of contact time. The keys are the sense of the swing that the contacts stop (`ccw` or `cw`), and a set of
+        corners. A value is the share of the sense's contact time in which exactly these corners carry force. Corners
+        have the labels of the scene, or their names without labels.
     solver : mapping
-        method, tol or dt, and the numbers of steps, evaluations and events. For the series each order counts as an
-        evaluation, for fixed steps each evaluation of the right-hand side.
+        The method, its `tol` or `dt`, and the numbers of steps, evaluations and events. An evaluation is one order of
+        the Taylor series, or one evaluation of the right-hand side in a fixed step.
     wear_depth : ndarray, shape (8,)
         Wear depth of each pad at the end in m.
     wall_s, compile_s : float
-        Wall-clock time in s of the run, and of compiling before the run.
+        Wall-clock times in s of the run and of the compilation before the run.
     energy_balance : EnergyBalance or None
-        Balance of energy and momentum, on request.
+        Balance of energy and momentum, if it was requested.
     sensitivity : Sensitivity or None
-        Growth of errors along the motion, on request.
+        Growth of errors along the motion, if it was requested.
     frame : ndarray, shape (n, 6), or None
-        Displacement x, y [m], theta [rad] of a frame on springs (`Support`) and its rate; q and v are relative to the
+        Displacement x, y [m], theta [rad] of a frame on springs (`Support`), and its rates. q and v are relative to the
         frame.
     """
 
@@ -125,47 +125,49 @@ def simulate(
     ----------
     scene : Scene
     t_end : float
-        End of the motion in s, not negative.
+        End of the motion in s, at least 0.
     output_dt : float, optional
-        Interval of the output rows in s, by default a thousandth of the motion. The rows do not change the motion. For
-        the fixed-step methods, `output_dt` must be a whole multiple of `dt`.
+        Interval of the output rows in s; the default is a thousandth of the motion. The rows do not influence the
+        motion. Fixed-step methods require a whole multiple of `dt`.
     tol : float
-        Tolerance of the pose relative to the clearance (`method="events"`).
+        Tolerance of the pose relative to the clearance, for `method="events"`.
     method : {"events", "rk4", "euler"}
-        Event-located Taylor series, or a fixed step without event location.
+        `events`: Taylor series with event detection. `rk4`, `euler`: fixed steps without event detection.
     dt : float, optional
-        Step in s of the fixed-step methods.
+        Step size in s of the fixed-step methods.
     energy_balance : bool
         Whether to compute the balance of energy and momentum (`Result.energy_balance`).
     max_steps : int
         Largest number of steps of the run.
     max_wall_s : float
-        Wall-clock time in s that the run may take, without compiling.
+        Largest wall-clock time in s of the run, without compilation.
     on_progress : callable, optional
-        Called with the share of the motion that is done, 0..1, some fifty times a second.
+        Function that is called with the completed share of the motion, 0..1, some fifty times a second.
     sensitivity : bool or sequence of str
-        Whether to follow the linearised motion too, which shows whether the tolerance is met (`Result.sensitivity`);
-        `ToleranceWarning` is issued if errors grow too much. With paths of parameters (`sensitivity_parameters`), the
-        derivatives with respect to these parameters are computed too. This takes some five times the work of the run,
-        and a hundred times and more for scenes with friction, wear, a ramp, a table, a locked degree of freedom or
-        overdamped contact.
+        Whether to integrate the linearised motion, too, which shows whether the tolerance is met
+        (`Result.sensitivity`). If errors grow too much, a `ToleranceWarning` is issued. A sequence contains paths of
+        parameters (`sensitivity_parameters`); the derivatives with respect to these parameters are then computed, too.
+
+        The computation takes some five times as long as the run. It takes a hundred times as long, or longer, for
+        scenes with friction, wear, a ramp, a table, a locked degree of freedom or overdamped contact.
 
     Returns
     -------
     Result
-        Rows, events, statistics.
+        Output rows, events and statistics of the motion.
 
     Raises
     ------
     ArgumentError
-        An argument cannot be used.
+        An argument is not valid.
     SolverError
-        The motion could not be continued; the message has the time and the cause.
+        The solver cannot continue the motion. The message contains the time and the cause.
     LimitError
-        `max_steps` or `max_wall_s` is reached; the error's `result` has the motion up to this limit.
+        `max_steps` or `max_wall_s` was reached. The attribute `result` of the error contains the motion up to the
+        limit.
     RunInterrupted
-        The user pressed Ctrl-C; the error's `result` has the motion up to the interruption. The error is also a
-        `KeyboardInterrupt`.
+        The user pressed Ctrl-C. The attribute `result` of the error contains the motion up to the interruption. The
+        error is also a `KeyboardInterrupt`.
     """
     check_times(t_end, output_dt, method, dt)
     check_limits(max_steps, max_wall_s)
@@ -200,11 +202,11 @@ def simulate(
 
 
 class _StoppedError(Exception):
-    """A limit was reached."""
+    """A limit of the run was reached."""
 
 
 class _Watch:
-    """Check limits and report progress between slices of a run."""
+    """Checks limits and reports progress between slices of a run."""
 
     def __init__(
         self, t_end: float, max_steps: int, max_wall_s: float, on_progress: Callable[[float], None] | None
@@ -213,7 +215,7 @@ class _Watch:
         self._begin = _time.perf_counter()
 
     def look(self, motion: Motion) -> None:
-        """Raise `_StoppedError` at a limit."""
+        """Report progress, and raise `_StoppedError` if a limit is reached."""
         steps, wall = int(motion.state.steps), _time.perf_counter() - self._begin
         if self._on_progress is not None:
             self._on_progress(motion.time / self._t_end if self._t_end > 0.0 else 1.0)
@@ -229,7 +231,7 @@ class _Watch:
 
 
 def check_times(t_end: float, output_dt: float | None, method: str = "events", dt: float | None = None) -> None:
-    """Raise `ArgumentError` for invalid times."""
+    """Raise `ArgumentError` if the times of a run are not valid."""
     if not (_is_finite(t_end) and t_end >= 0.0):
         raise ArgumentError(f"t_end: got {t_end!r}, expected a finite time >= 0 [s]")
     if output_dt is not None and not (_is_finite(output_dt) and output_dt > 0.0):
@@ -254,7 +256,7 @@ def _is_finite(value: object) -> bool:
 
 
 def output_times(t_end: float, output_dt: float | None) -> Array:
-    """Return the times 0, output_dt, ..., t_end; without `output_dt` there are a thousand intervals."""
+    """Return the times 0, output_dt, ..., t_end of the output rows. By default there are a thousand intervals."""
     if t_end == 0.0:
         return np.zeros(1)
     if output_dt is None:
@@ -264,15 +266,15 @@ def output_times(t_end: float, output_dt: float | None) -> Array:
     return times if t_end - times[-1] <= 1e-9 * output_dt else np.append(times, t_end)
 
 
-#: Scratch space of the last run, kept for the next run. If two runs overlap (in two threads, or because `on_progress`
-#: starts a run), the second run makes its own scratch space.
+#: Scratch space of the last run, which the next run reuses. If two runs overlap, the second run allocates its own
+#: scratch space. Runs overlap in several threads, or if `on_progress` starts a run.
 _spare: Final[deque[Work]] = deque(maxlen=1)
-#: Kinds of run (terms, options and method) whose kernels this process has compiled or loaded.
+#: Combinations of terms, options and method whose kernels this process has compiled or loaded.
 _ready: set[tuple[object, ...]] = set()
 
 
 def _make_ready(compiled: CompiledScene, energy_balance: bool, method: Method, dt: float | None) -> float:
-    """Compile or load the kernels of a kind of run, by a run up to t = 0; return the time in s, 0 if they are ready."""
+    """Compile or load the kernels of a run by a run of length 0. Return the time in s, or 0 if they are loaded."""
     parts = compiled.parts
     loads = parts.harmonics is None, parts.segments is None, None if parts.implicit is None else parts.implicit.dtype
     kind = parts.terms, *loads, options(compiled.scene), method == "events", energy_balance
@@ -352,9 +354,9 @@ def _result(
 
 
 def statistics_of(totals: Totals, duration: float) -> dict[str, dict[str, float]]:
-    """Return the statistics of each pair over the motion (see `Result`)."""
+    """Return the statistics of each pair over a motion of a given duration in s, as in `Result.statistics`."""
     table = {}
-    # each field is read only once, because reading a field of a record is slow
+    # each field is read only once, because access to a field of a record is slow
     sums = [totals[name].tolist() for name in ("peak", "impulse", "time_in_contact", "makes")]
     for name, peak, impulse, contact, makes in zip(PAIR_NAMES, *sums, strict=True):
         table[name] = {
@@ -369,12 +371,12 @@ def statistics_of(totals: Totals, duration: float) -> dict[str, dict[str, float]
 
 
 def contact_sets_of(scene: Scene, totals: Totals) -> dict[str, dict[str, float]]:
-    """Return the shares of contact time of the sets of corners (see `Result`), largest share first."""
+    """Return the shares of contact time, as in `Result.contact_sets`, in descending order."""
     letters = {corner: letter for letter, corner in scene.frame.labels.items()}
     labels = [letters.get(corner, corner) for corner in CORNER_NAMES]
     joint = "" if letters else "+"
     senses = {}
-    # the force of a pair turns a block in the opposite sense to a cavity, so the two senses are exchanged
+    # the force of a pair turns a block and a cavity in opposite senses
     order = ("ccw", "cw") if scene.head.carries == "walls" else ("cw", "ccw")
     for sense, times in sorted(zip(order, totals.set_time, strict=True), key=lambda item: item[0]):
         total = times.sum()

@@ -1,4 +1,4 @@
-"""Columns of the linearised equations (`solve.tangents`) for displacements and parameter changes."""
+"""Columns of the linearised equations (`solve.tangents`) for displacements and for changes of parameters."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from plow_twin.solve.tangents import COLUMNS, STATE_COLUMNS, WIDTH
 
 _Array = NDArray[np.float64]
 
-#: Terms that the linearised equations can have.
+#: Terms that the linearised equations support.
 _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "fraction", "flight", "rest"}
 
 
 def fits_tangents(compiled: CompiledScene) -> bool:
-    """Return whether the linearised equations can have all terms of a scene; its exponent must be an integer or 1.5.
+    """Return whether the linearised equations support all terms of a scene. Exponents must be integers or 1.5.
 
-    The linearised equations have no implicit steps. A law with a restitution is nevertheless covered, because it needs
-    implicit steps for slow touches only.
+    The linearised equations have no implicit steps. A law with a restitution is supported nevertheless, because it
+    needs implicit steps only for slow touches.
     """
     terms, contact = compiled.parts.terms, compiled.scene.contact
     there = {name for name, term in zip(Terms._fields, terms, strict=True) if term is not None}
@@ -32,14 +32,14 @@ def fits_tangents(compiled: CompiledScene) -> bool:
 
 
 def is_curved(terms: Terms) -> int | None:
-    """Return 1 if the force is not linear in penetration and rate, otherwise None."""
+    """Return 1 if the contact force is nonlinear in penetration and rate, and None otherwise."""
     return 1 if terms.hysteretic or terms.integer or terms.fraction else None
 
 
 def columns_beside(
     compiled: CompiledScene, changed: Sequence[tuple[CompiledScene, float]]
 ) -> tuple[NDArray[np.void], _Array, _Array]:
-    """Return columns for displacements of the state, and for scenes that each have one parameter increased.
+    """Return the columns for displacements of the state, and for changes of one parameter each.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The live twin: one head, advanced by any interval under sampled or analytic loads, that can be saved and restored."""
+"""The live twin: one head, advanced in time under sampled or analytic loads. Its state can be saved and restored."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 
 #: Default number of steps after which an advance fails.
 DEFAULT_BUDGET = 50_000_000
-#: Compiled kernels by signature and kind, which determine the types of a kernel's arguments. The kernels are kept
+#: Compiled kernels by signature and kind, which determine the argument types of a kernel. The kernels are stored here
 #: because numba's dispatch takes milliseconds.
 _entries: dict[tuple[Any, ...], Callable[..., bool]] = {}
 _NO_DIGESTS = np.zeros(0, np.int64)
 _THE_ONE = np.zeros(1, np.int64)
-#: Smallest bound for the number of evaluations of an advance: the evaluations of four Runge-Kutta steps.
+#: Smallest admissible number of evaluations of an advance. Four Runge-Kutta steps need this number.
 LEAST_EVALUATIONS = 16
 
 
@@ -63,27 +63,27 @@ class Twin:
     tol : float
         Tolerance of the pose relative to the clearance.
     excitation : {"scene", "sampled"}
-        `scene`: the scene's own loads. `sampled`: the wrenches given to `advance`, interpolated linearly; the scene's
-        loads are not used.
+        `scene`: the loads of the scene. `sampled`: the wrenches given to `advance`, interpolated linearly, instead of
+        the loads of the scene.
     start : float
-        Model time of the scene's initial state in s.
+        Model time in s of the scene's initial state.
     max_evaluations : int, optional
-        For hard real time: largest number of evaluations of the equations of motion in an advance, at least
-        `LEAST_EVALUATIONS`; an order of the series is one evaluation. An advance that needs more is completed by a few
-        Runge-Kutta steps, and its `error_estimate_m` is not zero.
+        Largest number of evaluations of the equations of motion in an advance, at least `LEAST_EVALUATIONS`, for hard
+        real time. One order of the Taylor series is one evaluation. If an advance needs more evaluations, a few
+        Runge-Kutta steps complete it, and its `error_estimate_m` is not zero.
     max_steps : int
-        Largest number of steps of an advance; an advance that needs more has the status `BUDGET` and leaves the twin
+        Largest number of steps of an advance. If an advance needs more steps, its status is `BUDGET`, and the twin is
         unchanged.
     max_wall_s : float
-        Wall-clock time in s that a call of an advancing method may take.
+        Largest wall-clock time in s of a call that advances the twin.
 
     Notes
     -----
-    At `max_wall_s` a call raises `LimitError`, and after Ctrl-C `RunInterrupted`. The twin then has the state after the
-    last complete advance, and the error's `result` has the rows up to there.
+    A call raises `LimitError` after `max_wall_s`, and `RunInterrupted` after Ctrl-C. The twin then has the state after
+    the last complete advance. The attribute `result` of the error contains the rows up to this advance.
 
-    The motion does not depend on the times of output. A sample ends a step of the solver, so equal samples give equal
-    bits.
+    The motion does not depend on the output times. However, each sample ends a step of the solver, so only equal
+    samples give bit-identical results.
     """
 
     def __init__(
@@ -119,25 +119,25 @@ class Twin:
         self._work, self._totals = first_of(self._works), first_of(self._all_totals)
         self._states[0] = compiled.initial_state(start)
         self._inertias = inertias(scene)
-        #: True: the kernel that writes rows; False: the kernel that does not
+        #: kernel that writes output rows (True), and kernel without output (False)
         self._kernels: dict[bool, Callable[..., bool]] = {}
-        #: model time, as a view of the state
+        #: model time in s, as a view of the state
         self._time = self._states["time"]
         self._wrench = np.zeros(3)
-        #: `_one_load`: work space for one sample of the load, divided by mass and inertia; `_no_snapshots`: an empty
-        #: array of snapshots
+        #: `_one_load`: work space for one sample of the load, divided by mass and inertia. `_no_snapshots`: an empty
+        #: array of snapshots.
         self._one_load, self._no_snapshots = np.empty((1, 2, 3)), self._states[:0]
         self._travel_speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
 
     @property
     def signature(self) -> tuple[bool, ...]:
-        """Which optional terms the equations have; twins with equal signatures share their compiled code."""
+        """Optional terms of the equations. Twins with equal signatures share their compiled code."""
         parts = self._parts
         there = (*parts.terms, parts.harmonics, parts.segments, parts.implicit, self._bound)
         return (*(part is not None for part in there), *options(self.scene))
 
     def like(self, scene: Scene) -> Twin:
-        """Return a twin of another scene with the tolerance, excitation and limits of this twin.
+        """Return a twin of another scene with the same tolerance, excitation and limits.
 
         Parameters
         ----------
@@ -158,7 +158,7 @@ class Twin:
         return float(self._time[0])
 
     def warm_up(self) -> float:
-        """Compile every kernel that this scene uses, or load it from the cache on disk; return the time taken in s."""
+        """Compile every kernel that this scene needs, or load it from the disk cache. Return the time in s."""
         begin = _time.perf_counter()
         saved = self.snapshot()
         self.advance(self.time + 1e-6)
@@ -173,20 +173,20 @@ class Twin:
         Parameters
         ----------
         t : float
-            Model time in s, not before the present model time.
+            Model time in s, at least the current model time.
         wrench : array_like, shape (3,), optional
-            Fx, Fy [N] and M [N m] about the cavity's centre at `t` (`excitation="sampled"` only). The load changes
-            linearly from the previous sample to this sample. Without `wrench` the last sample is held.
+            Fx, Fy [N] and M [N m] about the cavity's centre at `t`, only for `excitation="sampled"`. The load changes
+            linearly from the previous sample to this sample. Without `wrench`, the load stays at its last sample.
 
         Returns
         -------
         Advance
-            State at `t`, and sums since the previous advance. If `status` is not `OK`, the twin has not moved.
+            State at `t`, and sums since the previous advance. If `status` is not `OK`, the twin is unchanged.
 
         Raises
         ------
         ArgumentError
-            The time is before the present model time, or a number is not finite; the twin is unchanged.
+            The time is before the current model time, or a number is not finite. The twin is unchanged.
         """
         if self.excitation == "scene" and wrench is not None:
             raise ArgumentError(f"wrench: got {wrench!r}, expected None with excitation='scene'")
@@ -198,7 +198,7 @@ class Twin:
         return Advance(rows[0])
 
     def advance_samples(self, t: ArrayLike, wrench: ArrayLike) -> AdvanceSeries:
-        """Advance through many samples, with the same result, bit for bit, as one `advance` per sample.
+        """Advance through many samples. The results are bit-identical to one `advance` per sample.
 
         Parameters
         ----------
@@ -214,7 +214,7 @@ class Twin:
 
         Raises
         ------
-        ArgumentError
+            The arguments are not valid (see `advance`). The twin is unchanged.
             As for `advance`; the twin is unchanged.
         """
         if self.excitation != "sampled":
@@ -231,18 +231,18 @@ class Twin:
         rows: NDArray[np.void] | None,
         digest_after: NDArray[np.int64] = _NO_DIGESTS,
     ) -> Advanced:
-        """Advance to given times; all other calls for advances use this method.
+        """Advance to given times. All other methods that advance the twin call this method.
 
         Parameters
         ----------
         t : ndarray, shape (n,)
             Model times in s, not decreasing.
         wrench : ndarray, shape (n, 3)
-            Fx, Fy [N] and M [N m] about the cavity's centre at each time; not used with `excitation="scene"`.
+            Fx, Fy [N] and M [N m] about the cavity's centre at each time. Ignored for `excitation="scene"`.
         rows : ndarray of `ROW`, shape (n,), or None
-            Receives a row for each time. With None the motion is the same, but no forces are computed for output.
+            Array for one output row per time. None saves the computation of forces for output; the motion is the same.
         digest_after : ndarray of int64, shape (m,)
-            Increasing numbers from 1 to n; after each of these numbers of advances a digest of the state is made.
+            Increasing numbers from 1 to n. A digest of the state is computed after each of these numbers of advances.
 
         Returns
         -------
@@ -252,7 +252,7 @@ class Twin:
         Raises
         ------
         ArgumentError
-            As for `advance`; the twin is unchanged.
+            The arguments are not valid (see `advance`). The twin is unchanged.
         """
         sampled, count, with_rows = self.excitation == "sampled", len(t), rows is not None
         t, wrench = np.ascontiguousarray(t, np.float64), np.ascontiguousarray(wrench, np.float64)
@@ -282,7 +282,7 @@ class Twin:
 
     @property
     def wrench(self) -> NDArray[np.float64]:
-        """The last sample of the load: Fx, Fy [N] and M [N m], shape (3,); zero before the first sample."""
+        """Last sample of the load, shape (3,): Fx, Fy [N] and M [N m]. It is zero before the first sample."""
         return self._wrench.copy()
 
     def reset(
@@ -292,21 +292,21 @@ class Twin:
         wear_depth: ArrayLike | None = None,
         pose: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> None:
-        """Restart at model time `t` from the scene's initial state or another state.
+        """Restart at model time `t` from the initial state of the scene or from another state.
 
         Parameters
         ----------
         t : float
             Model time in s.
         wear_depth : array_like, shape (8,), optional
-            Wear depth of each pad in m, at least 0; by default the scene's initial wear depth.
+            Wear depth of each pad in m, at least 0. The default is the scene's initial wear depth.
         pose : tuple of array_like, shapes (3,) and (3,), optional
-            x, y [m], theta [rad] and their rates at the start; by default those of the scene.
+            x, y [m], theta [rad] and their rates at the start. The default is the scene's initial state.
 
         Raises
         ------
         ArgumentError
-            A time, depth or pose is out of range; the twin is unchanged.
+            A time, depth or pose is not valid. The twin is unchanged.
         """
         if not np.isfinite(t):
             raise ArgumentError(f"t: got {t!r}, expected a finite time in s")
@@ -324,29 +324,29 @@ class Twin:
         self._wrench = np.zeros(3)
 
     def move(self, q: ArrayLike, v: ArrayLike) -> None:
-        """Set pose and rates at the present time (sampled loads only); wear and counters are unchanged.
+        """Set pose and rates at the current time, only for sampled loads. Wear and counters are unchanged.
 
         Parameters
         ----------
         q, v : array_like, shape (3,)
-            Pose x, y [m], theta [rad] and its rates. A contact that continues keeps the damping that was set at its
-            touch.
+            Pose x, y [m], theta [rad] and its rates. If a contact continues, the damping factor from its first touch
+            remains valid.
         """
         place = geometry.states_of(self.scene, np.concatenate([q, v])[None])
         settle_moved(self._params, self._states, _THE_ONE, place, self.time, self._parts.terms.stick)
 
     def set_travel_speed(self, speed_m_s: float) -> None:
-        """Set the speed along the face from the present time on; only wear depends on it.
+        """Set the speed along the face from the current time on. Only wear depends on this speed.
 
         Parameters
         ----------
         speed_m_s : float
-            Speed in m/s; the sign is the direction, and wear depends on the magnitude.
+            Speed in m/s. The sign is the direction; wear depends on the magnitude.
 
         Raises
         ------
         ArgumentError
-            The speed is not finite, or above the limit that the damping sets (`check_travel_speed`).
+            The speed is not finite or exceeds the limit of the damping (`check_travel_speed`).
         """
         check_travel_speed(self.scene, float(speed_m_s))
         if self._parts.terms.wear is not None:
@@ -354,7 +354,7 @@ class Twin:
             self._set_wear_rate(abs(float(speed_m_s)))
 
     def snapshot(self) -> bytes:
-        """Return the exact state as bytes, for a twin of the same scene, tolerance and excitation."""
+        """Return the exact state as bytes. Twins of the same scene, tolerance and excitation can restore it."""
         return self._state.tobytes() + self._wrench.tobytes() + np.float64(self._travel_speed).tobytes()
 
     def restore(self, data: bytes) -> None:
@@ -376,27 +376,27 @@ class Twin:
             loop.lay_out_again(self._compiled.params, self._parts, self._state, self._work)
 
     def digest(self) -> str:
-        """Return a hash of the exact state, 16 hexadecimal digits."""
+        """Return a hash of the exact state, as 16 hexadecimal digits."""
         return _digest(self.snapshot())
 
     @property
     def wear_depth(self) -> NDArray[np.float64]:
-        """Wear depth of each pad at the end of the last step [m], shape (8,); each sample ends a step."""
+        """Wear depth of each pad at the end of the last solver step [m], shape (8,). Each sample ends a step."""
         depth: NDArray[np.float64] = self._state.wear_depth.copy()
         return depth
 
     def failure(self, status: int) -> str:
-        """Return the reason for the newest failure of an advance.
+        """Return the reason for the most recent failure of an advance.
 
         Parameters
         ----------
         status : int
-            Status of the advance.
+            Status of the failed advance.
 
         Returns
         -------
         str
-            The reason; for `OUT_OF_RANGE` it contains the head's value that is out of range, and the model's limit.
+            The reason. For `OUT_OF_RANGE` it contains the angle or penetration, and the limit of the model.
         """
         if status != Status.OUT_OF_RANGE:
             return Status(status).text
@@ -411,14 +411,14 @@ class Twin:
 
     @property
     def frame(self) -> NDArray[np.float64] | None:
-        """Displacement x, y [m], theta [rad] of a frame on springs and its rate, shape (6,); None for a fixed frame."""
+        """Displacement x, y [m], theta [rad] of a frame on springs and its rates, shape (6,); None if it is fixed."""
         state, work = self._state, self._work
         if self._parts.terms.support is None:
             return None
         if state.step_size < 0.0:
             return np.array(state.frame)
-        # under the scene's own loads the present time may lie within a step; the frame's state is then evaluated from
-        # the step's series, at the value of sigma that `dense_output.sigma_at` gives
+        # under the scene's own loads the current time may lie within a step; the frame's state is then evaluated from
+        # the series of this step, at the sigma of `dense_output.sigma_at`
         used, beta = float(state.elapsed), float(state.beta)
         sigma = 2.0 * used / (state.alpha + math.sqrt(max(state.alpha**2 + 2.0 * beta * used, 0.0)))
         return frame_at(work.frame, int(state.order), sigma)
@@ -430,23 +430,23 @@ class Twin:
 
     @property
     def evaluations(self) -> int:
-        """Number of evaluations of the equations of motion so far; an order of the series is one evaluation."""
+        """Number of evaluations of the equations of motion so far. One order of the series is one evaluation."""
         return int(self._state.evaluations)
 
     @property
     def bounded(self) -> int:
-        """Number of advances so far that ended with coarse steps because of `max_evaluations`."""
+        """Number of advances so far that Runge-Kutta steps completed because of `max_evaluations`."""
         return int(self._state.bounded)
 
     def _kernel(self, kind: tuple[bool, bool], arguments: tuple[Any, ...]) -> Callable[..., bool]:
-        """Return the kernel compiled for these arguments; signature and `kind` determine their types."""
+        """Return the kernel for these arguments. The signature and `kind` determine the types of the arguments."""
         key = self.signature, kind
         if key not in _entries:
             _entries[key] = for_arguments(loop.advance_rows, arguments)
         return _entries[key]
 
     def _digests(self, states: NDArray[np.void], wrench: NDArray[np.float64]) -> list[str]:
-        """Return a digest of each state together with its last sample of the load; `wrench` has shape (m, 3)."""
+        """Return a digest of each state together with its last sample of the load. `wrench` has shape (m, 3)."""
         size = states.itemsize
         rows = np.empty((len(states), size + 32), np.uint8)  # each row has the layout of `snapshot`
         rows[:, :size] = states.view(np.uint8).reshape(len(states), size)
@@ -457,7 +457,7 @@ class Twin:
     def _stopped(
         self, stop: BaseException, count: int, samples: NDArray[np.float64] | None, rows: NDArray[np.void] | None
     ) -> NoReturn:
-        """Restore the state after the last completed advance of the `count` advances, and raise an error."""
+        """Restore the state after the last complete advance of the `count` advances, and raise an error."""
         steps, done = self.steps, int(self._pace.record.row)
         self._go_back()
         if samples is not None and done > 0:
@@ -469,7 +469,7 @@ class Twin:
         raise (LimitError if late else RunInterrupted)(message, part, self.time) from None
 
     def _go_back(self) -> None:
-        """Undo the advance that was interrupted."""
+        """Restore the state before the interrupted advance."""
         if self._pace.record.underway == 0:
             return
         self._states[0] = self._pace.saved[0]
@@ -489,14 +489,14 @@ class Twin:
 
 
 class Advanced(NamedTuple):
-    """Result of a call: the number of failed advances, and the digests."""
+    """Number of failed advances of a call, and the digests."""
 
     failed: int
     digests: list[str]
 
 
 def read_snapshot(data: bytes, dtype: np.dtype[np.void]) -> tuple[np.void, NDArray[np.float64], float]:
-    """Return the state of the given type, the wrench (3,) and the travel speed [m/s] of a `Twin.snapshot`.
+    """Return the state of type `dtype`, the wrench, shape (3,), and the travel speed [m/s] in a `Twin.snapshot`.
 
     Raises
     ------
@@ -515,7 +515,7 @@ def _digest(snapshot: bytes | memoryview) -> str:
 
 
 def _bounded(max_evaluations: int | None, order: int, max_steps: int) -> tuple[int, Bound | None]:
-    """Return the largest number of series steps of an advance, and the Runge-Kutta steps that may end it."""
+    """Return the largest number of series steps of an advance, and the Runge-Kutta steps that can complete it."""
     if max_evaluations is None:
         return max_steps, None
     if isinstance(max_evaluations, bool) or not max_evaluations >= LEAST_EVALUATIONS:

@@ -1,4 +1,7 @@
-"""Growth of errors and effects of parameters along a live twin's motion, from shadows that advance with the twin."""
+"""Growth of errors and effects of parameters along the motion of a live twin.
+
+They are computed from shadows, which are copies of the twin with a small displacement or a changed parameter.
+"""
 
 from __future__ import annotations
 
@@ -27,43 +30,43 @@ from plow_twin.solve.state import Status
 
 Array = NDArray[np.float64]
 
-#: `_STRETCH_S`: length of a stretch in s; `_FAR`: a stretch ends earlier if a shadow is more than this many
-#: displacements away from the twin
+#: `_STRETCH_S`: length of a stretch in s. `_FAR`: limit of the distance of a shadow from the twin, divided by its
+#: initial displacement; a larger distance ends the stretch.
 _STRETCH_S, _FAR = 0.1, 100.0
-#: Longest stretch in s; a stretch becomes longer than `_STRETCH_S` if a contact prevents the start of the next stretch.
+#: Longest stretch in s. A stretch exceeds `_STRETCH_S` if a contact prevents the start of the next stretch.
 _LONGEST_S = 0.5
 
 
 class TwinSensitivity:
-    """The derivatives of a twin's state with respect to its initial state and parameters, updated with each advance.
+    """Derivatives of a twin's state with respect to its initial state and to parameters, updated with each advance.
 
     Parameters
     ----------
     twin : Twin
-        A twin with `excitation="sampled"`. From here on it must be advanced only by this object's `advance`, which
-        gives the same bits as `Twin.advance`.
+        A twin with `excitation="sampled"`. From now on only the method `advance` of this object may advance the twin.
+        Its results are bit-identical to `Twin.advance`.
     parameters : sequence of str
         Paths of the parameters with respect to which derivatives are computed, from `sensitivity_parameters`.
 
     Attributes
     ----------
     t : float
-        Model time in s to which the other attributes belong: the end of the last complete stretch, some 0.1 s before
-        the twin's time, or up to 0.5 s before it during a contact.
+        Model time in s of the other attributes: the end of the last complete stretch. It is some 0.1 s before the time
+        of the twin, and up to 0.5 s during a contact.
     from_start : ndarray, shape (k, k)
-        Derivatives of the state at `t` with respect to the twin's state when this object was made; a state has the
-        coordinates, then the rates, of the k / 2 free degrees of freedom.
+        Derivatives of the state at `t` with respect to the twin's state when this object was created. A state contains
+        the coordinates of the k / 2 free degrees of freedom, followed by their rates.
     by_parameter : dict of str to ndarray, shape (k,)
-        Derivatives of the state at `t` with respect to the parameters, for an unchanged state at the beginning.
+        Derivatives of the state at `t` with respect to the parameters, for a fixed initial state.
     growth : float
         Largest factor by which an error at any earlier time has grown until `t`, as in `Sensitivity.growth`.
     exponent : float
-        Largest Lyapunov exponent in 1/s since this object was made.
+        Largest Lyapunov exponent in 1/s since this object was created.
 
     Raises
     ------
     ArgumentError
-        The scene does not have one of the parameters, the twin is not sampled, or the scene has a `Support`.
+        The scene does not have one of the parameters or has a `Support`, or the twin is not sampled.
     """
 
     def __init__(self, twin: Twin, parameters: Sequence[str] = ()) -> None:
@@ -89,7 +92,7 @@ class TwinSensitivity:
 
     @property
     def from_start(self) -> Array:
-        """Derivatives of the state at `t` with respect to the state at the beginning."""
+        """Derivatives of the state at `t` with respect to the state when this object was created."""
         scale = self._scale[self._free]
         return np.asarray(self._product.total * scale[:, None] / scale[None, :])
 
@@ -111,24 +114,24 @@ class TwinSensitivity:
         return float(self._logs.max()) / max(self.t - self._begin, 1e-300)
 
     def advance(self, t: float, wrench: ArrayLike | None = None) -> Advance:
-        """Advance the twin, as `Twin.advance` does, and its shadows.
+        """Advance the twin and its shadows.
 
         Parameters
         ----------
         t : float
             Model time in s.
         wrench : array_like, shape (3,), optional
-            As for `Twin.advance`.
+            Wrench of the load at `t`, as in `Twin.advance`.
 
         Returns
         -------
         Advance
-            The advance of the twin.
+            Result of `Twin.advance`.
 
         Raises
         ------
         SolverError
-            A shadow could not be followed.
+            The solver cannot continue the motion of a shadow.
         """
         advanced = self._twin.advance(t, wrench)
         rows = self._shadows.advance(t, self._twin.wrench)
@@ -145,14 +148,14 @@ class TwinSensitivity:
         return advanced
 
     def _end(self, t: float, matrix: Array, changes: Array) -> None:
-        """End a stretch: `matrix` is its fundamental matrix, `changes` are the scaled effects of the parameters."""
+        """End a stretch with its fundamental matrix `matrix` and the scaled effects `changes` of the parameters."""
         by_unit = changes / np.array([one.change for one in self._changed])[:, None]
         self._logs += self._product.follow(matrix[None], by_unit[None], np.ones(1, bool))[3][0]
         self.t = t
         self._start()
 
     def _start(self, again: bool = True) -> None:
-        """Begin a stretch: all shadows start at the twin's state, or displaced a little from it."""
+        """Start a stretch: set all shadows to the twin's state, with or without a small displacement."""
         size = len(self._free)
         moved = np.zeros((len(self._shadows), 6))
         moved[np.arange(1, 1 + size), self._free] = DISPLACEMENT * self._scale[self._free]
