@@ -13,8 +13,8 @@ from scenes import ROOT
 from plow_twin.estimate import tuning
 
 FOLDER = ROOT / "plow_twin" / "estimate"
-#: Origins that a number may have if it is not in the tuning table.
-ORIGIN = re.compile(r"\b(Definition|Derived|Bound|Guard|Step|Prior): ")
+#: Words with which a comment states the origin of a number that is not in the tuning table.
+ORIGIN = re.compile(r"\b(definition|derived|bounds?|guards?|steps?|prior)\b", re.IGNORECASE)
 
 
 def unexplained(source: str) -> list[str]:
@@ -35,7 +35,7 @@ def unexplained(source: str) -> list[str]:
         while first and lines[first - 1].startswith("#:"):
             first -= 1
         comment = " ".join(line.removeprefix("#:").strip() for line in lines[first : node.lineno - 1])
-        if ORIGIN.search(comment + " ") or (not comment and explained_until == node.lineno - 1):
+        if ORIGIN.search(comment) or (not comment and explained_until == node.lineno - 1):
             explained_until = node.end_lineno or node.lineno
         elif numbers:
             found.append(lines[node.lineno - 1])
@@ -51,7 +51,7 @@ def test_a_number_is_chosen_in_the_table_or_says_where_it_comes_from(path: Path)
 def test_a_new_number_without_an_origin_is_found() -> None:
     assert unexplained("#: Share of draws.\n_NEAR = 0.7\n") == ["_NEAR = 0.7"]
     assert unexplained("_A, _B = 0.7, np.array([1.0])\n") == ["_A, _B = 0.7, np.array([1.0])"]
-    assert unexplained("#: Bound: rounds.\n_ROUNDS = 7\n_MORE = 8\n\n_LATER = 9\n") == ["_LATER = 9"]
+    assert unexplained("#: Upper bound of the iterations.\n_ROUNDS = 7\n_MORE = 8\n\n_LATER = 9\n") == ["_LATER = 9"]
 
 
 def test_every_chosen_number_is_used_and_states_its_data() -> None:

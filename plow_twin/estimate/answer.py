@@ -1,4 +1,4 @@
-"""Answers for one window: the estimate and, on request, forces with intervals and the time until a limit is reached."""
+"""Answers for one window of measurements: the estimate and, on request, contact forces and a forecast of the wear."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from plow_twin.estimate.result import Estimate, State
 from plow_twin.estimate.window import Window
 from plow_twin.model.scene import Scene, Table
 
-#: Derived: number of load periods after which the members have forgotten their initial states.
+#: Settling time in load periods before the evaluated span, derived from the decay of the members' initial states.
 _SETTLE_PERIODS: Final = 1.0
-#: Derived: longest distance between two knots of a load, as a share of the load's period; for the paper's period it is
-#: about twice `tuning.LOAD_KNOT`.
+#: Longest interval between two knots of a load, as a share of the load's period. It is derived from the paper's
+#: machine, for which it is about twice `tuning.LOAD_KNOT`.
 _KNOT_SHARE: Final = 1.0 / 400.0
 
 
 @dataclass(frozen=True)
 class Asked:
-    """The answers to give beside the estimate.
+    """The answers that are requested in addition to the estimate.
 
-    members : number of twins from which the intervals of the forces are computed; 0 for no forces
-    span_s : duration at the end of a window for which forces are given [s]
-    plan : limits of the clearances; None for no forecast
+    members : number of twins from which the intervals of the forces are computed; 0 if no forces are requested
+    span_s : duration at the end of the window for which forces are computed [s]
+    plan : limits of the clearances; None if no forecast is requested
     """
 
     members: int = 0
@@ -39,10 +39,10 @@ class Asked:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The estimate, the guess for the next window, and the other requested answers, as JSON values.
+    """The estimate from a window, the guess for the next window, and the other requested answers.
 
-    also : `forces` and `forecast` if requested; if one cannot be computed, it is null and `<name>_error` states the
-        reason
+    also : `forces` and `forecast`, if requested, as JSON values. An answer that cannot be computed is null, and
+    `<name>_error` contains the reason.
     """
 
     estimate: Estimate
@@ -51,7 +51,7 @@ class Answer:
 
     @property
     def text(self) -> str:
-        """The whole answer as JSON."""
+        """The whole answer as JSON text."""
         return json.dumps({**self.estimate.as_dict(), **self.also}, allow_nan=False)
 
 
@@ -82,17 +82,17 @@ def _forces(scene: Scene, result: Estimate, load: Load, asked: Asked) -> dict[st
 
 
 def followed(load: Load, period: float) -> Load:
-    """Return the load thinned to the samples that the members need."""
+    """Return the load without samples that hardly change the motion of the members."""
     knots = int((load.t[-1] - load.t[0]) / min(tuning.LOAD_KNOT, _KNOT_SHARE * period))
     thin = load.thinned(2.0 * tuning.TOLERANCE)
     return load.averaged(knots) if len(thin.t) > knots else thin
 
 
 def forecast_from(scene: Scene, result: Estimate, load: Load, plan: Plan) -> dict[str, Any]:
-    """Return the forecast that starts from an estimate, for JSON.
+    """Return the forecast that starts from an estimate, as JSON values.
 
-    The forecast continues the window's load with the estimated gains. If the window is too short for a period, it uses
-    the scene's load.
+    The forecast repeats the load of the window with the estimated gains. If the window is too short to contain a
+    period, the forecast uses the load of the scene.
 
     Raises
     ------
@@ -104,9 +104,9 @@ def forecast_from(scene: Scene, result: Estimate, load: Load, plan: Plan) -> dic
 
 
 def under_load(scene: Scene, result: Estimate, load: Load) -> Scene:
-    """Return the scene with its loads replaced by a window's load times the estimated gains.
+    """Return the scene with its loads replaced by the load of a window times the estimated gains.
 
-    If the window is too short for a period, the scene is returned unchanged.
+    If the window is too short to contain a period, the scene is returned unchanged.
     """
     gains = [1.0 if gain is None else gain.mean for gain in (result.gain_fx, result.gain_fy, result.gain_m)]
     felt = load.thinned() if result.load_harmonics is None else result.load_harmonics.added(load.thinned())

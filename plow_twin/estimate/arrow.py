@@ -1,7 +1,8 @@
-"""Normal equations of the swings, block tridiagonal with a border of shared unknowns, solved in linear time.
+"""Solution in linear time of the normal equations for the unknowns of the swings and the shared unknowns.
 
-Each swing has six unknowns and is linked only to its neighbours. The part of the swings is therefore factorised as a
-band matrix (Cholesky), and the border by its Schur complement.
+A swing is a part of the window with a starting state of its own, which consists of six unknowns. Each swing is coupled
+only to its neighbours and to the shared unknowns. The matrix is therefore block tridiagonal with a border. The block of
+the swings is factorised as a band matrix (Cholesky), and the border by its Schur complement.
 
 Reference: Golub and Van Loan, Matrix Computations, ch. 4.3 and 3.2.6.
 """
@@ -16,17 +17,17 @@ from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_bande
 
 Array = NDArray[np.float64]
 
-#: Definition: number of unknowns of one swing: the pose and its rate at the start, three numbers each.
+#: Number of unknowns of one swing; by definition they are the pose and its rate at the start, three numbers each.
 OWN = 6
 
 
 @dataclass(frozen=True, eq=False)
 class Arrow:
-    """A symmetric matrix for k shared unknowns and the six unknowns of each of s swings.
+    """Symmetric matrix for k shared unknowns and the six unknowns of each of s swings.
 
     border : (k, k) block of the shared unknowns
-    coupling : (6 s, k) block between the swings' unknowns and the shared unknowns
-    bands : (12, 6 s) main diagonal and subdiagonals of the swings' block, in LAPACK's band storage
+    coupling : (6 s, k) block that couples the unknowns of the swings with the shared unknowns
+    bands : (12, 6 s) main diagonal and subdiagonals of the block of the swings, in LAPACK's band storage
     """
 
     border: Array
@@ -35,12 +36,12 @@ class Arrow:
 
     @staticmethod
     def empty(shared: int, swings: int) -> Arrow:
-        """Return zeros."""
+        """Return a matrix of zeros."""
         size = OWN * swings
         return Arrow(np.zeros((shared, shared)), np.zeros((size, shared)), np.zeros((2 * OWN, size)))
 
     def add(self, swing: int, block: Array) -> None:
-        """Add a block for the shared unknowns and the consecutive swings that begin with `swing`."""
+        """Add a square block for the shared unknowns and for consecutive swings, of which `swing` is the first."""
         shared = len(self.border)
         self.border[:] += block[:shared, :shared]
         first = OWN * swing
@@ -50,7 +51,7 @@ class Arrow:
             self.bands[: len(rest) - column, first + column] += rest[column:, column]
 
     def diagonal(self) -> Array:
-        """Return the main diagonal, the shared unknowns first."""
+        """Return the main diagonal, which begins with the shared unknowns."""
         return np.concatenate([np.diag(self.border), self.bands[0]])
 
     def plus(self, diagonal: Array) -> Arrow:
@@ -61,7 +62,7 @@ class Arrow:
         return Arrow(self.border + np.diag(diagonal[:shared]), self.coupling, bands)
 
     def factorised(self) -> Factor:
-        """Return the factors.
+        """Return the Cholesky factors of the matrix.
 
         Raises
         ------
@@ -76,9 +77,9 @@ class Arrow:
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """Cholesky factors of the swings' block and of the Schur complement.
+    """Cholesky factors of the block of the swings and of the Schur complement of the border.
 
-    `eliminated`, shape (6 s, k), is the inverse of the swings' block times the coupling.
+    eliminated : (6 s, k) inverse of the block of the swings times the coupling
     """
 
     band: Array
@@ -86,7 +87,9 @@ class Factor:
     schur: Array
 
     def solve(self, right: Array) -> Array:
-        """Return the solution for one right-hand side, (k + 6 s,), or several, (k + 6 s, m)."""
+        """Return the solution for one right-hand side, shape (k + 6 s,), or for m right-hand sides, shape (k + 6 s,
+        m).
+        """
         shared = len(self.schur)
         border, rest = right[:shared], right[shared:]
         first = cho_solve((self.schur, True), border - self.eliminated.T @ rest)
@@ -94,6 +97,6 @@ class Factor:
         return np.concatenate([first, own])
 
     def covariance(self) -> Array:
-        """Return the inverse's block for the shared unknowns, shape (k, k)."""
+        """Return the block of the inverse for the shared unknowns, shape (k, k)."""
         inverse: Array = cho_solve((self.schur, True), np.eye(len(self.schur)))
         return 0.5 * (inverse + inverse.T)

@@ -1,11 +1,11 @@
-"""Clearances around a block (`carries: corners`), computed from the places of its impacts.
+"""Clearances around a block (a scene with `carries: corners`), estimated from the positions of its impacts.
 
-Between impacts the block flies: apart from drag and errors of the load, only load and gravity move it. The flights
-before and after an impact are extrapolated to the time at which they are nearest to each other. At that time the
-deepest corner is at the wall that pushed the block, or beyond the wall by the penetration. The places of all impacts
-are linear in the clearances, in the sensor's bias and lever arm, and in the compliance of the contact. All of them are
-estimated together. The errors of the impacts have a Student-t distribution of unknown scale, so the intervals follow
-from the impacts' scatter.
+Between impacts, only load and gravity move the block, apart from drag and errors of the load. The flight before an
+impact and the flight after it are extrapolated to the time at which the two flights are nearest to each other. At that
+time the deepest corner touches the wall, or has penetrated the wall if the contact is compliant. The positions of all
+impacts are linear in the clearances, in the bias and the lever arm of the sensor, and in the compliance of the contact.
+These quantities are estimated together. The errors of the positions have a Student-t distribution of unknown scale, so
+that the widths of the intervals follow from the impacts themselves.
 
 Reference: Lange, Little and Taylor, J. Am. Stat. Assoc. 84 (1989) 881 (Student-t errors by reweighting).
 """
@@ -32,28 +32,28 @@ from plow_twin.solve.compiled_scene import inertias
 
 Array = NDArray[np.float64]
 
-#: Definition: for each wall, by name, the axis that it bounds and its outward normal.
+#: Axis that each wall bounds, and outward normal of the wall, by definition.
 WALLS: Final = {
     "right": (GX, np.array([1.0, 0.0])),
     "left": (GX, np.array([-1.0, 0.0])),
     "top": (GY, np.array([0.0, 1.0])),
     "bottom": (GY, np.array([0.0, -1.0])),
 }
-#: Derived: smallest number of rows of a flight, one more than the three coefficients of a parabola.
-#: Bound: largest number of rows of a flight that are fitted.
+#: Smallest number of rows of a flight, derived from the three coefficients of a parabola, and upper bound of the number
+#: of rows that are fitted.
 _FLIGHT_ROWS: Final = (4, 9)
-#: Derived: degrees of freedom of the Student-t likelihood, the value that Lange et al. recommend.
+#: Degrees of freedom of the Student-t likelihood, derived by Lange et al.
 _FREEDOM: Final = 4.0
-#: Bound: number of scales on the grid of the likelihood, and number of reweighting rounds for each scale.
+#: Upper bounds: number of scales on the grid of the likelihood, and number of reweighting iterations for each scale.
 _SCALES, _ROUNDS = 40, 30
-#: Definition: the unknowns of the linear problem are the clearances, the bias of x, y and theta, the lever arm, and the
+#: Layout of the unknowns of the linear problem, by definition: clearances, bias of x, y and theta, lever arm, and
 #: relative change of the penetration from its value with the scene's stiffness.
 _CLEARANCES, _BIAS, _LEVER, _DEPTH, _SIZE = slice(0, 2), slice(2, 5), slice(5, 7), 7, 8
 
 
 @dataclass(frozen=True, eq=False)
 class Impact:
-    """One impact of a corner.
+    """One impact of a corner on a wall.
 
     Attributes
     ----------
@@ -62,13 +62,13 @@ class Impact:
     wall : str
         A name of `WALLS`.
     distance : float
-        Distance in m of the wall from the middle of the guide, if the wall is rigid.
+        Distance of the wall from the middle of the guide in m, computed for a rigid wall.
     deeper : float
-        Part of this distance, in m, that is penetration if the wall has the scene's stiffness.
+        Part of `distance` in m that is penetration, computed for a wall with the scene's stiffness.
     restitution : float
-        Normal speed of the corner after the impact, divided by its speed before.
+        Coefficient of restitution: normal speed of the corner after the impact, divided by the speed before the impact.
     gained : float
-        Kinetic energy after the impact, divided by the energy before.
+        Kinetic energy after the impact, divided by the energy before the impact.
     turned : ndarray, shape (2,)
         The wall's normal in the block's axes.
     arm : float
@@ -86,11 +86,11 @@ class Impact:
 
 
 def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> Estimate:
-    """Estimate the clearances around a block from the places of its impacts.
+    """Return the estimate of the clearances around a block from the positions of its impacts.
 
-    If an axis has impacts on one wall only, the poses are taken to be measured from the middle, and the bias of this
-    axis is None. A clearance is not observable if its deviation exceeds half of the prior deviation. An observable
-    clearance is rough if its deviation exceeds 1 mm.
+    If only one wall of an axis has impacts, the sensor's bias along the axis cannot be estimated. The bias is then
+    assumed to be zero, and the result contains None for it. A clearance is not observable if its standard deviation
+    exceeds half of the prior deviation. An observable clearance is rough if its standard deviation exceeds 1 mm.
 
     Parameters
     ----------
@@ -99,9 +99,9 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> E
     load : Load
         The believed load.
     poses : Poses
-        The measured poses, in the axes of the guide.
+        The poses, measured in the axes of the guide.
     known : Estimate
-        The prior.
+        The prior, in the form of an estimate.
     """
     whole = np.isfinite(poses.q).all(axis=1) & np.append(np.diff(poses.t) > 0.0, True)[: len(poses.t)]
     poses = Poses(poses.t[whole], poses.q[whole], poses.deviation)
@@ -169,7 +169,7 @@ def _unfit(found: list[Impact], contacts: int) -> str:
 
 
 def _on_walls(scene: Scene, every: list[Impact], known: Estimate) -> tuple[list[Impact], list[str]]:
-    """Return the impacts at plausible places of the walls, and a reason for each wall with impacts left out."""
+    """Return the impacts at plausible positions, and a reason for each wall with implausible impacts."""
     met: list[Impact] = []
     reasons = []
     for wall, (axis, _) in WALLS.items():
@@ -189,16 +189,16 @@ def _on_walls(scene: Scene, every: list[Impact], known: Estimate) -> tuple[list[
 
 
 def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tuple[Array, Array]:
-    """Return means and standard deviations of the vector of the linear problem, shape (8,) each."""
+    """Return means and standard deviations of the unknowns of the linear problem, shape (8,) each."""
     mean = np.zeros(_SIZE)
     mean[_CLEARANCES] = known.horizontal.mean, known.vertical.mean
     prior = np.zeros(_SIZE)
     prior[_CLEARANCES] = known.horizontal.deviation, known.vertical.deviation
     prior[_BIAS] = np.array([quantity.deviation for quantity in QUANTITIES])[BIAS]
-    # this is the prior of the paper's machine, scaled to this machine's size
+    # the prior was chosen for the paper's machine, so it is scaled to the size of this machine
     prior[_LEVER] = UNSTATED["lever_x"] * geometry.half_diagonal(scene) / PAPER_LENGTH
-    # the prior is for the logarithm of the stiffness, and the penetration is a power of the stiffness; the deviation of
-    # the penetration is chosen so that the 95 % point stays the same
+    # The prior of the stiffness is log-normal, and the penetration is a power of the stiffness. The deviation of the
+    # penetration is chosen so that the 95 % quantile is unchanged.
     spread = deviation_of(scene, "contact.stiffness") / (scene.contact.exponent + 1.0)
     prior[_DEPTH] = math.expm1(NORMAL_P95 * spread) / NORMAL_P95
     for axis in (GX, GY):
@@ -215,9 +215,9 @@ def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tu
         design[row, axis] = 0.5
         design[row, _BIAS] = *normal, one.arm
         design[row, _LEVER] = one.turned
-    # an unknown with a prior deviation of zero keeps its value
+    # an unknown with a prior deviation of zero is held fixed
     free = prior > 0.0
-    # each impact is wrong by at least the uncertainty of the frame's sides, because corners are not points
+    # real corners are rounded, so the error of an impact's position is at least the uncertainty of the frame's sides
     least = max(float(level[:2].max()), *(deviation_of(scene, f"frame.{side}") for side in ("width_m", "height_m")))
     scales = np.geomspace(least, max(float(prior[_CLEARANCES].max()), 2.0 * least), _SCALES)
     step, deviation = np.zeros(_SIZE), np.zeros(_SIZE)
@@ -226,10 +226,11 @@ def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tu
 
 
 def _student(design: Array, off: Array, prior: Array, scales: Array) -> tuple[Array, Array]:
-    """Return mean and deviations of x in off = design x + errors, with a normal prior of x and Student-t errors.
+    """Return means and standard deviations of the vector x in off = design x + errors.
 
-    The scale of the errors is log-uniform over `scales`. For each scale, reweighting gives the mode and its covariance,
-    and Laplace's approximation gives the evidence. The results of the scales are averaged with the evidence as weight.
+    The prior of x is normal with standard deviations `prior`; the errors have a Student-t distribution. The prior of
+    their scale is log-uniform over `scales`. For each scale, iterative reweighting gives the mode and its covariance,
+    and Laplace's approximation gives the evidence. The results for all scales are averaged with the evidence as weight.
     """
     modes, variances, log = [], [], []
     precision = np.diag(prior**-2.0)
@@ -252,16 +253,16 @@ def _student(design: Array, off: Array, prior: Array, scales: Array) -> tuple[Ar
 
 
 def impacts(scene: Scene, load: Load, poses: Poses, level: Array) -> tuple[list[Impact], int]:
-    """Return the impacts between flights that are long enough to be fitted, and the number of all contacts.
+    """Return the impacts between flights that are long enough for a fit, and the number of all contacts.
 
     Parameters
     ----------
     scene, load : Scene, Load
         The block, and the believed load.
     poses : Poses
-        Whole poses.
+        Poses in which all components are measured.
     level : ndarray, shape (3,)
-        Noise of a row in m, m, rad.
+        Standard deviation of the noise of a pose in m, m, rad.
     """
     t, q = poses.t, _of_mass(scene, poses.q)
     inertia = np.asarray(inertias(scene))
@@ -288,13 +289,13 @@ def impacts(scene: Scene, load: Load, poses: Poses, level: Array) -> tuple[list[
 
 
 def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return first and last index of each run of true flags."""
+    """Return the first and the last index of each run of True values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]])))
     return [(int(first), int(last) - 1) for first, last in edges.reshape(-1, 2)]
 
 
 def _of_mass(scene: Scene, q: Array) -> Array:
-    """Return poses (n, 3) of the centre of mass."""
+    """Return the poses of the centre of mass, shape (n, 3)."""
     x, y = scene.head.com_offset_m
     c, s = np.cos(q[:, 2]), np.sin(q[:, 2])
     theta = np.unwrap(q[:, 2])
@@ -302,14 +303,14 @@ def _of_mass(scene: Scene, q: Array) -> Array:
 
 
 def _load_and_weight(scene: Scene, load: Load, t: Array) -> Array:
-    """Return load plus weight at the times `t`, shape (n, 3), in N, N, N m."""
+    """Return the sum of load and weight at the times `t`, shape (n, 3), in N, N, N m."""
     wrench = np.stack([np.interp(t, load.t, column) for column in load.wrench.T], axis=1)
     weight = scene.head.mass_kg * scene.gravity.acceleration_m_s2
     return wrench - weight * np.array([0.0, 1.0, scene.gravity.arm_m])
 
 
 def _kinks(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> list[tuple[int, int]]:
-    """Return first and last row of each stretch whose acceleration is not that of a free flight."""
+    """Return the first and the last row of each contact, in which the acceleration differs from that of a flight."""
     one, two = np.diff(t)[:-1, None], np.diff(t)[1:, None]
     way = np.diff(q, axis=0)
     acceleration = 2.0 * (way[1:] / two - way[:-1] / one) / (one + two)
@@ -319,18 +320,18 @@ def _kinks(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> lis
 
 
 def _flight(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> Array:
-    """Return the coefficients of a flight's parabolas, shape (3, 3): by component, then by power of t."""
+    """Return the coefficients of the parabolas of a flight, shape (3, 3), by component and by power of t."""
     basis = np.vander(t, 3, increasing=True)
     out = np.zeros((3, 3))
     for j in range(3):
-        # the last row is the prior of the acceleration
+        # the last row of the system is the prior of the acceleration
         rows = np.vstack([basis / level[j], [0.0, 0.0, 2.0 / unknown[j]]])
         out[j] = np.linalg.lstsq(rows, np.append(q[:, j] / level[j], free[j] / unknown[j]), rcond=None)[0]
     return out
 
 
 def _meeting(scene: Scene, inertia: Array, flights: list[Array], room: float) -> Impact | None:
-    """Return the impact between two flights; None if they do not meet within `room` s or no corner is pushed."""
+    """Return the impact between two flights; None if the flights are not nearest within `room` s or no wall was hit."""
     apart = flights[1] - flights[0]
     change = apart[:, 1]
     t = -float((inertia * apart[:, 0] * change).sum() / (inertia * change * change).sum())
@@ -352,7 +353,7 @@ def _meeting(scene: Scene, inertia: Array, flights: list[Array], room: float) ->
         return None
     mass = 1.0 / (1.0 / inertia[0] + arm**2 / inertia[2])
     energy = (inertia * v**2).sum(axis=1)
-    # a rounded corner is represented by the centre of its arc
+    # `corner` is the centre of the arc if the corner is rounded, so the radius is added
     distance = float(normal @ (q[:2] + corner)) + geometry.corner_radius(scene)
     turned = np.array([c * normal[0] + s * normal[1], -s * normal[0] + c * normal[1]])
     deeper = _deeper(scene, mass, before, after)
@@ -360,18 +361,18 @@ def _meeting(scene: Scene, inertia: Array, flights: list[Array], room: float) ->
 
 
 def _corners(scene: Scene) -> Array:
-    """Return the corners relative to the centre of mass, in the block's axes, shape (2, 4)."""
+    """Return the positions of the corners relative to the centre of mass, in the block's axes, in m, shape (2, 4)."""
     corners = np.stack(geometry.corner_positions(scene))[:, ::2]
     found: Array = corners - np.array(scene.head.com_offset_m)[:, None]
     return found
 
 
 def _deeper(scene: Scene, mass: float, before: float, after: float) -> float:
-    """Return the distance in m beyond the wall at which the flights before and after a compliant contact meet.
+    """Return the distance in m beyond the wall at which the extrapolated flights of a compliant contact meet.
 
-    The corner approaches with the normal speed v, stays in contact for the time T and leaves with e v. The straight
-    lines of the two flights then meet v e T / (1 + e) beyond the wall. With the largest penetration u, T = pi u / v,
-    which is exact for a spring.
+    The corner approaches with the normal speed v, stays in contact for the time T and leaves with the speed e v. The
+    straight lines of the two flights then meet at the distance v e T / (1 + e) beyond the wall. The duration is T = pi
+    u / v, where u is the largest penetration. This duration is exact for a linear spring.
     """
     exponent = scene.contact.exponent
     largest = ((exponent + 1.0) * mass * before**2 / (2.0 * scene.contact.stiffness)) ** (1.0 / (exponent + 1.0))

@@ -1,10 +1,13 @@
 """Clearances with a hard contact, from features of the whole motion instead of the pose at each moment.
 
-With a hard contact the head bounces many times before it rests, so its pose at a moment cannot be predicted. The
-reach of the corners and the scatter of the pose at each phase of the load can be predicted. Motions with randomly drawn
-stiffness, damping and load gains are simulated and observed with the sensor's noise and gaps. A regression among the
-simulated motions near the measured one gives the difference between clearance and reach (approximate Bayesian
-computation with local-linear adjustment); its residuals give the interval.
+With a hard contact the head bounces many times before it rests, so its pose at a given moment cannot be predicted. Two
+kinds of features can be predicted: the reach of the corners, and the scatter of the pose at each phase of the load. The
+method is approximate Bayesian computation with local-linear adjustment:
+
+1. Stiffness, damping and load gains are drawn at random, and the motion is simulated for each draw.
+2. Each simulated motion is observed with the noise and the gaps of the sensor.
+3. Among the simulated motions near the measured motion, the difference between clearance and reach is regressed on the
+features. The regression gives the clearance, and its residuals give the interval.
 
 References: Beaumont, Zhang and Balding, Genetics 162 (2002) 2025; Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012)
 419; Wood, Nature 466 (2010) 1102; Blum and Francois, Stat. Comput. 20 (2010) 63.
@@ -42,59 +45,76 @@ from plow_twin.model import geometry
 
 Array = NDArray[np.float64]
 
-#: Derived: biases of theta that are tried, in rad; they reach eight prior deviations to both sides. The best bias is
-#: refined by a parabola over three quarters of the spacing of the tried biases to both sides.
+#: Grid of trial values for the bias of theta in rad, derived from its prior: the grid extends over eight prior
+#: deviations to both sides. The best value is refined with a parabola through `_NEAR_TURNS`, which extend over three
+#: quarters of the grid spacing to both sides.
 _TURNS: Final = np.linspace(-0.16, 0.16, 81)
 _FINEST_TURN: Final = 3e-3
 _NEAR_TURNS: Final = np.linspace(-_FINEST_TURN, _FINEST_TURN, 5)
-#: Bound: largest number of rows in the search for a bias, and in the refinement of the bias.
+#: Upper bounds of the number of rows in the search for a bias, and in the refinement of the bias.
 _MOST_ROWS, _MOST_NEAR_ROWS = 2000, 1200
-#: Derived: smallest number of rows in a part of a load period; the mean of nine values has a third of their scatter.
+#: Smallest number of rows in a part of a load period, derived from the scatter of a mean, which is a third of the
+#: scatter of nine values.
 _FEWEST_OF_PHASE = 9
-#: Derived: delays in s that are tried. For the measured path they reach two prior deviations to both sides, and for the
-#: paths of simulated motions a tenth of that. `_NO_LAG` is the index of zero among the delays of simulated motions.
+#: Grids of trial values for the delay in s, derived from its prior. The grid for the measured path extends over two
+#: prior deviations to both sides; the grid for simulated motions extends over a tenth of this range. `_NO_LAG` is the
+#: index of the delay zero in the second grid.
 _LAGS_S: Final = np.linspace(-0.1, 0.1, 81)
 _OF_DRAWN_S: Final = np.linspace(-0.01, 0.01, 9)
 _NO_LAG = len(_OF_DRAWN_S) // 2
-#: Derived: distances in rows, as powers of two, over which changes are computed: `_CHANGES` for the changes of pose and
-#: reach in the whole motion, `_CHANGES_BY_PHASE` for the changes of the pose at each phase of the load.
+#: Distances in rows over which second differences are computed, derived as powers of two. `_CHANGES` is used for pose
+#: and reach in the whole motion, `_CHANGES_BY_PHASE` for the pose at each phase of the load.
 _CHANGES: Final = (1, 2, 4, 8, 16, 32)
 _CHANGES_BY_PHASE: Final = (1, 4)
-#: Definition: the paths by which a scene names the sides of the frame.
+#: Paths of the frame's sides in a scene.
 _SIDES: Final = ("frame.width_m", "frame.height_m")
-#: Guard: squared scatter, in m2 or rad2, that keeps logarithms and quotients finite.
+#: Guard against logarithms of zero and divisions by zero: squared scatter in m2 or rad2.
 _NO_SCATTER = 1e-14
-#: Bound: largest factor on the work allowed for simulated motions if the window is longer than ten load periods.
+#: Upper bound of the factor by which the work for simulated motions may grow in windows longer than ten load periods.
 _LONGER = 2.0
-#: Guard: smallest and largest penetration in m that is drawn for a hard and for a firm contact.
+#: Bounds of the drawn penetration in m for a hard contact, and for a firm contact.
 _HARD_BOUNDS, _FIRM_BOUNDS = (8e-7, 6e-4), (2e-6, 2e-2)
-#: Bound: number of rounds in which the noise of a draw is corrected.
+#: Upper bound of the number of iterations in which the noise of a simulated motion is adjusted.
 _NOISE_ROUNDS = 3
-#: Derived: smallest number of draws for a regression with twenty features, and smallest number of poses for a 99 %
-#: quantile.
+#: Smallest number of draws, derived from the twenty features of the regression, and smallest number of poses, derived
+#: from the 99 % quantile that is computed from them.
 _FEWEST, _FEWEST_WHOLE = 30, 100
 
 
 @dataclass(frozen=True, eq=False)
 class Bounced:
-    """Result of a comparison.
+    """Result of the comparison of a measured motion with drawn motions.
 
-    clearance, clearance_deviation : (2,) in m
-    bias, bias_deviation : (3,) of x, y in m and theta in rad
-    ln_penetration : mean and standard deviation of the logarithm of the penetration in m under the reference force
-    ln_damping : mean and standard deviation of the unknown for the damping, as in `Unknowns`
-    noise : (3,) standard deviation of the measurements
-    distance : distance of the measured motion from nearby drawn motions, relative to the distances among drawn motions
-    path : distance of the measured path (mean and scatter of the pose over the load's period) from its prediction by
-        the drawn motions, as a normal deviate among the same distances of the drawn motions; 0 with too few poses
-    law : likeness of the motion to motions under another contact law, as a normal deviate among motions under the
-        believed law; 0 if no other law is known, or too few of its motions can be run, or the contact is not hard
-    odds : log odds of the other law; minus infinity in the same cases, and if the motions are drawn about a given
-        vector
-    unseen : (2,) deviation of the clearances in m due to errors of the frame's sides, the sensor's scales and turned
-        walls, which the motion does not show
-    rounded : (2,) excess of the clearances in m if the frame's corners are rounded by `priors.ROUNDING`; zero if the
-        scene states the corners or the sides' deviations
+    Attributes
+    ----------
+    clearance, clearance_deviation : ndarray, shape (2,)
+        Clearances and their standard deviations in m.
+    bias, bias_deviation : ndarray, shape (3,)
+        Bias of x, y in m and theta in rad, and standard deviations.
+    ln_penetration : tuple of float
+        Mean and standard deviation of the logarithm of the penetration in m under the reference force.
+    ln_damping : tuple of float
+        Mean and standard deviation of the unknown for the damping, as in `Unknowns`.
+    noise : ndarray, shape (3,)
+        Standard deviation of the measurements.
+    distance : float
+        Distance of the measured motion from nearby drawn motions, relative to the distances among drawn motions.
+    path : float
+        Distance of the measured path (mean and scatter of the pose over the load's period) from the path that the drawn
+        motions predict. It is a normal deviate among the same distances of drawn motions; 0 with too few poses.
+    law : float
+        Similarity of the motion to motions under another contact law, as a normal deviate among motions under the
+        assumed law. It is 0 if there is no other law, if too few motions under the other law can be simulated, or if
+        the contact is not hard.
+    odds : float
+        Logarithm of the odds of the other law. It is minus infinity where `law` is 0 for one of these reasons, and if
+        the motions are drawn about a given vector.
+    unseen : ndarray, shape (2,)
+        Standard deviation of the clearances in m due to quantities that the motion does not show: errors of the frame's
+        sides, the sensor's scales, and rotations of walls.
+    rounded : ndarray, shape (2,)
+        Overestimate of the clearances in m if the frame's corners have the radius `priors.ROUNDING`. It is zero if the
+        scene states the radius or the deviations of the sides.
     """
 
     clearance: Array
@@ -113,35 +133,35 @@ class Bounced:
 
 
 def bounces(unknowns: Unknowns, poses: Poses) -> bool:
-    """Return whether the motion shows a contact so hard that whole motions must be compared."""
+    """Return whether the contact is so hard that the comparison of whole motions is needed."""
     return _reach_noise(unknowns, _whole(poses)) < tuning.POSSIBLE and _is_narrow(unknowns, poses)
 
 
 def _is_narrow(unknowns: Unknowns, poses: Poses) -> bool:
-    """Return whether the head always stops at the same place up to noise, so that the walls do not yield."""
+    """Return whether the head always stops at the same position up to noise, as at walls that do not yield."""
     q = _whole(poses)
     reach = _reach(unknowns, q)
     return bool(np.median(reach[2] - reach[0]) < max(tuning.NARROW * _reach_noise(unknowns, q), tuning.FITTED))
 
 
 def _whole(poses: Poses) -> Array:
-    """Return the complete poses or, if they are few, all poses with gaps bridged by straight lines."""
+    """Return the complete poses or, if there are few, all poses with missing components interpolated linearly."""
     whole = np.isfinite(poses.q).all(axis=1)
     return poses.q[whole] if whole.sum() > _FEWEST_WHOLE else filled(poses)
 
 
 def _reach_noise(unknowns: Unknowns, q: Array) -> float:
-    """Return the standard deviation of a corner's reach in m."""
+    """Return the standard deviation in m of the reach of a corner due to noise."""
     level = noise_level(q)
     return math.hypot(level[0], level[2] * geometry.half_diagonal(unknowns.scene))
 
 
 def bias_of_hard(unknowns: Unknowns, poses: Poses) -> Array:
-    """Return the sensor's bias of x and y in m and theta in rad if the contact is hard; zeros if it is soft.
+    """Return the sensor's bias of x and y in m and theta in rad if the contact is hard; zeros if the contact is soft.
 
-    A hard wall stops both corners at the same place; with a biased theta the poses show two places. The bias of theta
-    is therefore chosen so that the farthest reaches lie closest together. The biases of x and y are removed first,
-    because they change the reaches of a turned head.
+    A hard wall stops both corners at the same position, but the poses from a sensor with biased theta show two
+    positions. The bias of theta is therefore chosen so that the scatter of the farthest reaches is smallest. The biases
+    of x and y are removed first, because they change the reaches of a rotated head.
     """
     q = _whole(poses)
     bias = np.zeros(3)
@@ -153,7 +173,10 @@ def bias_of_hard(unknowns: Unknowns, poses: Poses) -> Array:
 
 
 def _near_bias(unknowns: Unknowns, q: Array) -> Array:
-    """Return a small bias, shape (3,); the same estimate on drawn motions shows its error."""
+    """Return a small bias, shape (3,), in m, m, rad.
+
+    The error of this estimate is corrected later, because it is also applied to drawn motions without bias.
+    """
     q = _few(q, _MOST_NEAR_ROWS)
     bias = np.zeros(3)
     for _ in range(2):
@@ -166,18 +189,18 @@ def _near_bias(unknowns: Unknowns, q: Array) -> Array:
 
 
 def _few(q: Array, most: int) -> Array:
-    """Return every n-th row, with n so large that at most `most` rows are left."""
+    """Return every n-th row, with the smallest n for which at most `most` rows remain."""
     return q[:: len(q) // most + 1]
 
 
 def _off_centre(reach: Array) -> Array:
-    """Return half the difference of opposite reaches, left minus right and bottom minus top, shape (2,), in m."""
+    """Return half the differences of opposite reaches (left minus right, bottom minus top), shape (2,), in m."""
     right, left, top, bottom = reach
     return 0.5 * np.array([left - right, bottom - top])
 
 
 def _widths(unknowns: Unknowns, q: Array, turns: Array) -> Array:
-    """Return the spread of the farthest reaches for each bias of theta in `turns`, summed over the walls, in m."""
+    """Return the scatter of the farthest reaches in m, summed over the walls, for each bias of theta in `turns`."""
     count = len(q)
     (low, middle), (far, farthest) = (
         (int(start * count), max(int(end * count), int(start * count) + 1)) for start, end in tuning.TURN_WINDOWS
@@ -193,10 +216,11 @@ def _widths(unknowns: Unknowns, q: Array, turns: Array) -> Array:
 def compare(
     forward: Forward, unknowns: Unknowns, poses: Poses, period: float, near: Array | None = None, seed: int = 0
 ) -> Bounced | None:  # fmt: skip
-    """Compare the measured motion with drawn motions; None if too few can be run or the contact is not hard.
+    """Compare the measured motion with drawn motions.
 
-    The drawn motions have hard contacts. With `near`, a vector of unknowns, they are drawn about its softness and
-    damping.
+    The result is None if too few drawn motions can be simulated, or if the contact is not hard. The drawn motions have
+    hard contacts by default. If a vector of unknowns `near` is given, its softness and damping are the means of the
+    draws.
     """
     eye = MotionFeatures(unknowns, poses, period)
     measured = eye.features(eye.q)
@@ -217,7 +241,7 @@ def compare(
         features = np.array(drawn.features)
         if found is None:
             delay = path_delay(eye, features[:, 5:], drawn.q, measured[5:])
-            # the first round was drawn without a delay, so its paths are shifted by the delay that has now been found
+            # the first motions were drawn without a delay, so their paths are shifted by the estimated delay
             paths = [eye.paths(q, _OF_DRAWN_S - delay) for q in drawn.q]
             drawn.by_phase = [eye.changes_by_phase(q, -delay) for q in drawn.q]
         else:
@@ -230,8 +254,7 @@ def compare(
         found = regress_near(like, targets, seen)
         moved = measured[:2] + found.value[:2] - centre
         centre = centre + moved
-        # the change of a clearance in the last round is added to its deviation, because a clearance that still changes
-        # has not converged
+        # a clearance that still changes has not converged, so its last change is added to its deviation
         deviation = np.hypot(found.deviation[:2], moved)
         if near is None and len(features) <= tuning.DRAWS[0] and found.distance > tuning.NOT_HARD:
             return None
@@ -241,7 +264,7 @@ def compare(
             if len(rounds) == 3 and count == tuning.DRAWS[2] and not followed:
                 rounds.append((tuning.DRAWS[3], tuning.DRAWN_CLEARANCE[3]))
     assert found is not None
-    # a large change in the last round shows that a clearance has not converged, so its deviation is increased
+    # a large last change indicates a false result, so the deviation is increased further
     deviation = np.where(np.abs(moved) > tuning.ASTRAY, np.hypot(deviation, tuning.UNEXPLAINED_HARD), deviation)
     law, odds = 0.0, -math.inf
     if found.value[5] < math.log(tuning.FITTED):
@@ -257,18 +280,19 @@ def compare(
         found.distance,
         path_deviate(eye.paths(eye.q, _LAGS_S), features[:, 5:], paths, measured[5:]),
         law,
-        # without odds if `near` is given, because the limit of the odds was tuned without `near`
+        # the limit of the odds was tuned for draws without `near`, so no odds are returned for draws with `near`
         odds if near is None else -math.inf,
         *hidden_by_geometry(unknowns, poses, period, measured[:2]),
     )
 
 
 def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: Array) -> tuple[Array, Array]:
-    """Return `unseen` and `rounded` of `Bounced`; `reach`, shape (2,), holds the sums of opposite reaches in m.
+    """Return the attributes `unseen` and `rounded` of `Bounced`.
 
-    A resting head touches the frame at three corners, always at the same angle. At this angle, errors of the sides, the
-    scales and the corners change the reach as another clearance would. At a turned wall it touches with the same pad,
-    half the turn away from the wall's middle; the turns of two opposite walls add up.
+    `reach`, shape (2,), contains the sums of opposite reaches in m. A resting head touches the frame at three corners,
+    always at the same angle. Errors of the sides, scales and corners therefore change the reach in the same way as a
+    different clearance. At a rotated wall the head always touches the same pad, which is displaced by half the rotation
+    (the difference of the wall's two pads). The rotations of opposite walls are independent.
     """
     scene = unknowns.scene
     width, height = (deviation_of(scene, path) for path in _SIDES)
@@ -287,8 +311,8 @@ def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: A
     unseen = np.sqrt(
         np.square([moved(width), moved(0.0, height), *scaled]).sum(axis=0) + (0.25 * turned**2).sum(axis=1)
     )
-    # the prior of round corners is not needed if the scene states the corners' radius, or the deviation of a side,
-    # which covers the corners too
+    # the prior of rounded corners is not used if the scene states the radius, or the deviation of a side, which
+    # includes the effect of the corners
     known = scene.frame.corner_radius_m is not None or any(is_stated(scene, path) for path in _SIDES)
     across = 0.0 if known else -2.0 * priors.ROUNDING
     return unseen, moved(across, across) if across else np.zeros(2)
@@ -296,7 +320,10 @@ def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: A
 
 @dataclass(frozen=True, eq=False)
 class _Spread:
-    """Distribution of drawn contacts: means and deviations of the logarithms of penetration and damping, shape (2,)."""
+    """Distribution of the drawn contacts: mean and deviation of the logarithms of penetration and damping, shape (2,).
+
+    `bounds` are the smallest and the largest drawn penetration in m.
+    """
 
     mean: Array
     deviation: Array
@@ -310,19 +337,21 @@ class _Spread:
 
     @staticmethod
     def near(unknowns: Unknowns, vector: Array) -> _Spread:
-        """Return the distribution about the softness and damping of a vector of unknowns."""
         mean = np.array([math.log(unknowns.penetration_of(float(vector[SOFTNESS]))), vector[DAMPING]])
         return _Spread(mean, tuning.FIRM_SPREAD[0] * np.array([1.0, float(unknowns.damped)]), _FIRM_BOUNDS)
 
     def narrowed(self, found: _Regressed) -> _Spread:
-        """Return a narrower distribution, about the result of a regression."""
+        """Return a narrower distribution, whose mean is the result of a regression."""
         _, over, least = tuning.FIRM_SPREAD
         deviation = np.minimum(np.maximum(over * found.deviation[5:7], least), self.deviation)
         return _Spread(found.value[5:7], deviation, _FIRM_BOUNDS)
 
 
 class _Drawn:
-    """Motions drawn with one contact law: features, targets, changes, and the motions themselves until cleared."""
+    """Motions drawn under one contact law, with their features and the targets of the regression.
+
+    The list `q` of the motions themselves is cleared after use.
+    """
 
     def __init__(
         self, forward: Forward, unknowns: Unknowns, eye: MotionFeatures, spread: _Spread, rng: np.random.Generator
@@ -335,9 +364,9 @@ class _Drawn:
         self.q: list[Array] = []
 
     def add(self, count: int, centre: Array, about: float, delay: float, most_work: int) -> None:
-        """Draw `count` more motions that are seen `delay` s late, or fewer if the work reaches `most_work`.
+        """Draw `count` more motions, observed with a delay of `delay` s; stop early if the work reaches `most_work`.
 
-        The clearances have the mean `centre` and the deviation `about`, both in m.
+        The clearances are drawn with the mean `centre` and the standard deviation `about`, both in m.
         """
         for _ in range(count):
             if self.forward.work > most_work:
@@ -354,36 +383,36 @@ class _Drawn:
                 self.q.append(q)
 
     def _numbers(self) -> Array:
-        """Draw the logarithms of penetration and damping, and three load gains, shape (5,)."""
+        """Return drawn logarithms of penetration and damping, and three drawn load gains, shape (5,)."""
         mean = np.concatenate([self.spread.mean, np.ones(3)])
         drawn = self.rng.standard_normal(5)
         numbers: Array = mean + np.concatenate([self.spread.deviation, np.full(3, tuning.HARD_DRAWN[3])]) * drawn
         numbers[0] = np.clip(numbers[0], *np.log(self.spread.bounds))
         if self.unknowns.scene.contact.law in OTHER_LAW.values():
-            # damping under the other law is drawn as a share of critical damping, for any stiffness
+            # the damping under the other law is drawn as a fraction of the critical damping of the drawn stiffness
             critical = self.unknowns.critical_damping(self.unknowns.force / math.exp(numbers[0]))
             numbers[1] = math.log(tuning.LAW_DAMPING[1] * critical) + tuning.LAW_DAMPING[2] * drawn[1]
         return numbers
 
     def of_other_law(self) -> _Drawn | None:
-        """Return an empty set of draws with the other possible law; None if there is no such law."""
+        """Return an empty set of draws under the alternative contact law; None if there is no alternative."""
         other = with_other_law(self.unknowns)
         return None if other is None else _Drawn(self.forward.of(other.scene), other, self.eye, self.spread, self.rng)
 
     def like(self) -> Array:
-        """Return the features of the motions, shape (n, m)."""
         return np.concatenate([np.array(self.features)[:, 5:], np.array(self.changes)], axis=1)
 
     def draws(self) -> Draws:
-        """Return the features of the motions, including features by phase of the load, and the drawn unknowns."""
+        """Return all features of the motions, including the features by phase of the load, and the drawn unknowns."""
         of_draw = np.array(self.targets)[:, [5, 6, 7, 8, 9, 0, 1]]
         return Draws(np.concatenate([self.like(), np.array(self.by_phase)], axis=1), of_draw)
 
 
 def _likeliest(features: Array, targets: Array, paths: Array, measured: Array, seen: Array) -> Array:
-    """Return likeliest clearances minus reaches in m, shape (n + 1, 2), of n drawn motions and the measured motion.
+    """Return the differences between most likely clearances and reaches in m, shape (n + 1, 2).
 
-    Of `seen`, (lags, k), and `paths`, (n, lags, k), only the mean poses are used.
+    The rows are for the n drawn motions and, last, for the measured motion. `paths` of the draws have the shape (n,
+    lags, k), and `seen`, the measured path, has the shape (lags, k). Only their first halves, the mean poses, are used.
     """
     before, after = _NO_LAG - 1, _NO_LAG + 1
     paths, seen = (path[..., : path.shape[-1] // 2] for path in (paths, seen))
@@ -405,7 +434,7 @@ def _likeliest(features: Array, targets: Array, paths: Array, measured: Array, s
 
 
 def path_delay(eye: MotionFeatures, features: Array, drawn: list[Array], measured: Array) -> float:
-    """Return the delay in s that brings the measured path nearest to motions drawn without a delay."""
+    """Return the delay in s with which the measured path is nearest to the motions `drawn` without a delay."""
     paths = np.array([eye.paths(q, np.zeros(1))[0] for q in drawn])
     seen = eye.paths(eye.q, _LAGS_S)
     there = np.isfinite(paths).all(axis=0) & np.isfinite(seen).all(axis=0)
@@ -413,20 +442,19 @@ def path_delay(eye: MotionFeatures, features: Array, drawn: list[Array], measure
         return 0.0
     value, left = _Near.to(features, measured).left_over(paths[:, there])
     off = ((seen[:, there] - value) ** 2 / ((left**2).mean(axis=0) + _NO_SCATTER)).sum(axis=1)
-    # a delay cannot be negative, because no pose is known before it is measured
+    # the delay of a sensor cannot be negative
     return max(float(_LAGS_S[int(np.argmin(off))]), 0.0)
 
 
 def _of_other_law(
     drawn: _Drawn, centre: Array, delay: float, most_work: int, by_odds: bool
 ) -> tuple[float, float]:  # fmt: skip
-    """Return the likeness of the measured motion to motions under another law, and the log odds of that law.
+    """Return the similarity of the measured motion to motions under the other law, and the log odds of that law.
 
-    With `by_odds`, half of the draws are enough if their odds are clear, because then the likeness does not matter.
-
-    Goodness of fit does not separate laws with similar motions. A classifier of draws of both laws (Pudlo et al.,
-    Bioinformatics 32 (2016) 859) and the likelihood under each law do separate them. Each of the two methods finds
-    cases that the other misses.
+    Goodness of fit does not separate laws with similar motions. Two other criteria are combined, because each criterion
+    finds cases that the other criterion misses: a classifier that is trained with draws of both laws (Pudlo et al.,
+    Bioinformatics 32 (2016) 859), and the ratio of the likelihoods. With `by_odds`, only half of the motions are drawn
+    if they give clear odds. The similarity is then irrelevant.
     """
     other, nothing = drawn.of_other_law(), (0.0, -math.inf)
     if other is None:
@@ -447,10 +475,11 @@ def _of_other_law(
 
 
 def class_deviate(believed: Array, other: Array, measured: Array) -> float:
-    """Return the likeness of features (m,) to `other` (k, m) rather than `believed` (n, m), as a normal deviate.
+    """Return how similar `measured` features are to the class `other` rather than to `believed`, as a normal deviate.
 
-    The class label is regressed on the features, with the same total weight for both classes. The deviate compares the
-    prediction with the cross-validated predictions of the believed class.
+    The features have the shapes (m,), (k, m) and (n, m). The class label is regressed on the features, with the same
+    total weight for both classes. The deviate is the distance of the prediction for `measured` from the cross-validated
+    predictions for the class `believed`.
     """
     features = np.concatenate([believed, other])
     sizes = [len(believed), len(other)]
@@ -468,10 +497,10 @@ def class_deviate(believed: Array, other: Array, measured: Array) -> float:
 def path_deviate(seen: Array, features: Array, drawn: list[Array], measured: Array) -> float:
     """Return the distance of the measured path from the drawn motions as a normal deviate; 0 with too few measurements.
 
-    Nearby drawn motions are compared with the remaining drawn motions in the same way. Their distances are those of a
-    correct model, for any contact, noise and length of the window.
+    The reference for the deviate are the distances of nearby drawn motions from the other drawn motions, because these
+    distances occur with a correct model.
     """
-    # shape (n, lags, parts); stamps may be late or early, so a path is compared at several lags
+    # shape (n, lags, parts); the paths are compared at several lags, because the delay is not known exactly
     paths = np.array(drawn)
     there = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(seen).all(axis=0)
     if there.sum() < tuning.PATH_PHASES:
@@ -487,10 +516,10 @@ def path_deviate(seen: Array, features: Array, drawn: list[Array], measured: Arr
 
 
 def _distance_of_paths(features: Array, paths: Array, measured: Array, seen: Array) -> float:
-    """Return the mean square distance of a seen path (lags, k) from the prediction by the drawn paths (n, lags, k).
+    """Return the mean square distance of a path `seen`, (lags, k), from its prediction by drawn paths, (n, lags, k).
 
-    It is the Mahalanobis distance with the covariance of the drawn paths' residuals, shrunk toward equal variances
-    (Ledoit and Wolf, J. Multivar. Anal. 88 (2004) 365).
+    The distance is the Mahalanobis distance at the best lag. The covariance of the residuals of the drawn paths is
+    shrunk toward equal variances (Ledoit and Wolf, J. Multivar. Anal. 88 (2004) 365).
     """
     near = _Near.to(features, measured)
     value, left = near.left_over(paths[:, _NO_LAG])
@@ -499,8 +528,8 @@ def _distance_of_paths(features: Array, paths: Array, measured: Array, seen: Arr
     left *= np.sqrt(near.weight / near.weight.sum())[:, None] / deviation
     share, size = tuning.SHRINKAGE[1], left.shape[1]
     off = (seen - value) / deviation
-    # (a L^T L + b I)^-1 = (I - L^T (b/a I + L L^T)^-1 L) / b inverts the smaller matrix: there are fewer draws than
-    # numbers in a path
+    # A path has more numbers than there are draws, so the smaller matrix L L^T is inverted:
+    # (a L^T L + b I)^-1 = (I - L^T (b/a I + L L^T)^-1 L) / b
     equal = share * float(np.square(left).sum()) / size
     among = left @ left.T + equal / (1.0 - share) * np.eye(len(left))
     along = left @ off.T
@@ -517,11 +546,12 @@ class _Regressed:
 
 @dataclass(frozen=True, eq=False)
 class _Near:
-    """The terms of a regression on features among the nearest of n draws.
+    """Matrices of a weighted regression on m features of n draws; draws near the measured features have large weights.
 
-    distance, weight : (n,) distance of a draw from the measured features, and its weight
+    distance, weight : (n,) squared distance of each draw from the measured features, and its weight
     scale : (m,) scatter of the features
-    basis, inverse : (n, m + 1), (m + 1, m + 1) basis, and inverse of the normal matrix
+    basis : (n, m + 1) design matrix
+    inverse : (m + 1, m + 1) inverse of the normal matrix
     leverage : (n,) leverage of each draw
     """
 
@@ -543,21 +573,24 @@ class _Near:
         return _Near(distance, weight, scale, basis, inverse, leverage)
 
     def regress(self, targets: Array) -> tuple[Array, Array]:
-        """Return the targets (n, k) predicted at the measured features, shape (k,), and their residuals."""
+        """Return the prediction of `targets` (n, k) at the measured features, shape (k,), and the residuals, shape (n,
+        k).
+        """
         beta = self.inverse @ (self.basis.T @ (self.weight[:, None] * targets))
         return beta[0], targets - self.basis @ beta
 
     def left_over(self, targets: Array) -> tuple[Array, Array]:
-        """Return the result of `regress` with cross-validated residuals: each draw is predicted from the others."""
+        """Return the prediction of `regress` with leave-one-out residuals."""
         value, error = self.regress(targets)
         left: Array = error / (1.0 - np.minimum(self.leverage, 0.9))[:, None]
         return value, left
 
 
 def regress_near(features: Array, targets: Array, measured: Array) -> _Regressed:
-    """Regress targets (n, k) on features (n, m), weighting draws near the measured features most.
+    """Return the prediction at the features `measured`, (m,), of a regression of targets (n, k) on features (n, m).
 
-    The deviations are those of a prediction at `measured`, which may lie at the edge of the draws.
+    Draws near `measured` have large weights. The deviation of the prediction includes the extrapolation if `measured`
+    lies at the edge of the draws.
     """
     near = _Near.to(features, measured)
     value, error = near.regress(targets)
@@ -571,7 +604,7 @@ def regress_near(features: Array, targets: Array, measured: Array) -> _Regressed
 def _scatter_at(basis: Array, weight: Array, error: Array, leverage: Array) -> Array:
     """Return the residual variance of a regression at the measured features, shape (k,).
 
-    The variance depends on softness and noise, so the logarithm of the squared residuals is also regressed on the
+    The variance depends on the features. The logarithm of the squared residuals is therefore also regressed on the
     features (Blum and Francois).
     """
     freed = 1.0 - np.minimum(leverage, 0.9)
@@ -588,9 +621,12 @@ def _scatter_at(basis: Array, weight: Array, error: Array, leverage: Array) -> A
 
 @dataclass(frozen=True, eq=False)
 class _Phases:
-    """Rows (k,) that have a component, the part of the load period of each row, and the number of rows of each part.
+    """Division of a load period into parts, for one component of the pose.
 
-    A number of rows is at least 1, so that quotients are finite; `known` marks the parts with enough rows.
+    rows : (k,) rows in which the component was measured
+    inside : (k,) part of the load period of each row
+    size : number of rows in each part, or 1 for an empty part, so that it can be a divisor
+    known : whether each part has enough rows
     """
 
     rows: NDArray[np.int64]
@@ -600,7 +636,7 @@ class _Phases:
 
 
 class MotionFeatures:
-    """Features of motions as the sensor sees them, at the poses' times and with their gaps and noise."""
+    """Computation of the features of motions that are observed with the times, the gaps and the noise of the sensor."""
 
     def __init__(self, unknowns: Unknowns, poses: Poses, period: float) -> None:
         self._unknowns, self._t = unknowns, poses.t
@@ -608,7 +644,7 @@ class MotionFeatures:
         self.q = filled(poses)
         self.noise = noise_level(self.q)
         self._period, self._parts = period, tuning.PATH_PHASES // 2
-        #: mask of the poses that are at least one period after the first pose; earlier poses still depend on the start
+        #: mask of the poses after the first period, which no longer depend on the initial state
         self._settled = poses.t - poses.t[0] >= period
         self._whole = self._there.all(axis=1)
         if self._whole.sum() <= _FEWEST_WHOLE:
@@ -616,8 +652,7 @@ class MotionFeatures:
         self._smooth = max(min(smooth_width(poses, tuning.AVERAGED), int(self._whole.sum()) // 8), 1)
         self._reach_phase = ((poses.t[self._whole] - poses.t[0]) / period % 1.0 * tuning.PATH_PHASES).astype(int)
         phase = np.minimum(((poses.t - poses.t[0]) / period % 1.0 * self._parts).astype(int), self._parts - 1)
-        #: for each component and each part of a period, the rows that have the component; parts with few rows are left
-        #: out
+        #: rows of each component in each part of a period, without parts of few rows
         self._parts_of = [
             [rows for k in range(self._parts) if len(rows := np.flatnonzero((phase == k) & there)) > 8]
             for there in self._there.T
@@ -628,13 +663,18 @@ class MotionFeatures:
         self, forward: Forward, unknowns: Unknowns, clearance: Array, numbers: Array, delay: float,
         rng: np.random.Generator,
     ) -> Array | None:  # fmt: skip
-        """Return a simulated motion as the sensor sees it, `delay` s late; None if the model cannot be run."""
+        """Return a simulated motion as the sensor would measure it with a delay of `delay` s; None if it cannot be
+        simulated.
+
+        `clearance`, shape (2,), is in m; `numbers` are those of `_Drawn`: logarithms of penetration and damping, load
+        gains.
+        """
         vector = unknowns.nominal()
         vector[[GX, GY]], vector[DAMPING] = clearance, numbers[1]
         vector[GAIN] = np.clip(numbers[2:5], 0.7, 1.3)
         scene = unknowns.scene_of(vector)
-        # a fit has a hardest contact, but a drawn contact may be harder, because the decay of the bounces depends on
-        # the stiffness
+        # the stiffness is set directly, because `scene_of` limits it, but the decay of bounces depends on larger values
+        # too
         contact = replace(scene.contact, stiffness=unknowns.force / math.exp(numbers[0]) ** scene.contact.exponent)
         start = np.concatenate([self.q[0], np.zeros(3)])
         start += np.array([1e-3, 1e-3, 4e-3, 0.05, 0.05, 0.2]) * rng.standard_normal(6)
@@ -644,13 +684,13 @@ class MotionFeatures:
         return None if run is None else self._seen(run.q, white)
 
     def paths(self, q: Array, lags_s: Array) -> Array:
-        """Return the path for each lag, shape (lags, 240)."""
+        """Return the path of a motion for each lag, shape (lags, 240)."""
         return np.array([self._path(q, lag_s) for lag_s in lags_s])
 
     def _path(self, q: Array, lag_s: float) -> Array:
-        """Return the centred mean pose and the logarithm of its scatter at each phase of the load, shape (240,).
+        """Return the path: mean pose minus its average, and logarithm of the scatter, at each phase of the load.
 
-        Phases with too few poses are NaN. The scatter shows how fast bounces die out.
+        The shape is (240,). Phases with too few poses are NaN. The scatter depends on the decay of the bounces.
         """
         out = np.full((2, tuning.PATH_PHASES, 3), np.nan)
         for i, phases in enumerate(self._phases_at(lag_s)):
@@ -665,7 +705,7 @@ class MotionFeatures:
         return out.ravel()
 
     def _phases_at(self, lag_s: float) -> list[_Phases]:
-        """Return the phases of each component for a lag, cached because all drawn motions are seen with few lags."""
+        """Return the division of the period for each component and for a lag, cached because few lags occur."""
         if lag_s not in self._phases:
             if len(self._phases) > 2 * len(_OF_DRAWN_S):
                 self._phases.clear()
@@ -679,10 +719,11 @@ class MotionFeatures:
         return self._phases[lag_s]
 
     def _seen(self, q: Array, white: Array) -> Array:
-        """Return a motion with the noise that makes its quick changes as large as the measured ones.
+        """Return a motion with noise, chosen so that its estimated noise level equals the noise level of the
+        measurement.
 
-        Bounces also change the pose quickly. If all quick changes were taken for noise, noise and reach would be
-        overestimated.
+        Bounces raise the estimated noise level. If the measured level were added as noise, the noise and the reach of
+        the simulated motion would be too large.
         """
         noise = self.noise
         for _ in range(_NOISE_ROUNDS):
@@ -690,11 +731,11 @@ class MotionFeatures:
         return self._bridged(q + noise * white)
 
     def _bridged(self, q: Array) -> Array:
-        """Return a motion without the components that are missing in the measurement, bridged like the measurement."""
+        """Return a motion in which the components that were not measured are interpolated, as in the measurement."""
         return q if self._there.all() else filled(Poses(self._t, np.where(self._there, q, np.nan)))
 
     def features(self, q: Array) -> Array:
-        """Return reach, bias and the other features of the motion, in this order."""
+        """Return the features of a motion: two sums of opposite reaches, three biases, and then all other features."""
         whole = q[self._whole]
         bias = _near_bias(self._unknowns, whole)
         whole = whole - bias
@@ -713,7 +754,7 @@ class MotionFeatures:
         return np.concatenate([sums, bias, *like])
 
     def changes(self, q: Array) -> Array:
-        """Return logarithms of the changes of pose and reach over several distances, which show how bounces decay."""
+        """Return logarithms of second differences of pose and reach, which depend on the decay of the bounces."""
         rows = np.concatenate([q, reaches(self._unknowns.scene, q)], axis=1)
         parts = []
         for apart in _CHANGES:
@@ -723,7 +764,9 @@ class MotionFeatures:
         return np.log(np.concatenate(parts) + 1e-12)
 
     def changes_by_phase(self, q: Array, lag_s: float = 0.0) -> Array:
-        """Return the logarithms of the pose's changes at each phase of the load, for a motion that is `lag_s` late."""
+        """Return logarithms of second differences of the pose at each phase of the load, for a motion delayed by
+        `lag_s`.
+        """
         phase = ((self._t - self._t[0] - lag_s) / self._period % 1.0 * self._parts).astype(int) % self._parts
         count = np.maximum(np.bincount(phase, minlength=self._parts), 1)
         parts = []
@@ -733,14 +776,16 @@ class MotionFeatures:
         return 0.5 * np.log(np.concatenate(parts) + _NO_SCATTER)
 
     def _averaged(self, q: Array) -> Array:
-        """Return `_reach` of poses that are averaged over a few rows to reduce their noise."""
+        """Return `_reach` of poses that are averaged over a few rows to reduce the noise."""
         even = np.full(self._smooth, 1.0 / self._smooth)
         if self._smooth > 1:
             q = np.stack([np.convolve(column, even, "valid") for column in q.T], axis=1)
         return _reach(self._unknowns, q)
 
     def _by_phase(self, q: Array) -> Array:
-        """Return mean reaches in the load phases with the farthest reaches, in which the head rests, shape (3, 4)."""
+        """Return mean reaches in m, shape (3, 4), in the load phases with the farthest reaches, in which the head
+        rests.
+        """
         reach, phase = reaches(self._unknowns.scene, q), self._reach_phase
         count = np.bincount(phase, minlength=tuning.PATH_PHASES + 1)
         known = count > 0
@@ -751,13 +796,16 @@ class MotionFeatures:
 
 
 def _second_difference(rows: Array, apart: int) -> Array:
-    """Return second differences over distances of `apart` rows, shape (n - 2 apart, k)."""
+    """Return second differences of rows with the spacing `apart`, shape (n - 2 apart, k)."""
     change: Array = rows[2 * apart :] - 2.0 * rows[apart:-apart] + rows[: -2 * apart]
     return change
 
 
 def _reach(unknowns: Unknowns, q: Array) -> Array:
-    """Return the reaches toward the right, left, top and bottom, averaged between quantiles, shape (3, 4), in m."""
+    """Return the reaches toward right, left, top and bottom in m, averaged between the quantiles of `REACH_WINDOWS`.
+
+    The shape is (3, 4).
+    """
     ordered = np.sort(reaches(unknowns.scene, q), axis=0)
     count = len(ordered)
     windows = [

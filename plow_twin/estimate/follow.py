@@ -1,12 +1,14 @@
-"""The twin that follows its machine: members drawn from the prior or an estimate, moved by the measured poses.
+"""The follower, an ensemble of twins that follows one machine by means of measured poses and estimates.
 
-The members differ in clearances, contact and load gains. They are drawn from the prior at first, then from each valid
-estimate; new members start at the poses of the old members. The module `members` contains them and their Kalman filter.
+The twins, called members, differ in clearances, contact and load gains. They are drawn from the prior at first, then
+from each valid estimate. New members start at the poses of the old members. The module `members` contains the members
+and the Kalman filter by which measured poses move the members.
 
-The first member, the median twin, has the median of each parameter and no drawn noise, so its motion is physical.
-Before the first estimate it is the nominal twin, and poses do not move it: with the poses of a machine with larger
-clearances it would press its own walls, and its forces would be less accurate than without following. Until then, poses
-move the second member, a copy of the first. The median twin of the first estimate starts at the pose of this copy.
+The first member, the median twin, has the median of each parameter and no random noise, so its motion obeys the
+equations of motion. Before the first estimate it is the nominal twin, and no pose moves it. Otherwise, if the machine
+had larger clearances, the poses would press the median twin against its walls, and its forces would be less accurate.
+Until the first estimate, the poses move the second member instead, which is a copy of the first member. The median twin
+that is drawn from the first estimate starts at the pose of this copy.
 """
 
 from __future__ import annotations
@@ -45,43 +47,44 @@ from plow_twin.stream.driven import MOST_MEASURED
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 
-#: Definition: default number of members.
+#: Default number of members, by definition.
 MEMBERS: Final = 128
-#: Bound: shortest time in s between used poses. A pose that comes sooner after another adds little and costs as much.
+#: Lower bound of the time in s between two poses that are used. A pose that follows sooner contributes little but costs
+#: as much as any pose.
 APART_S: Final = 4e-3
-#: Bound: smallest and largest number of poses from whose quick changes the noise is computed.
+#: Lower and upper bound of the number of poses from which the noise is computed.
 _NOISE_ROWS: Final = (20, 400)
-#: Bound: number of samples in one call, so that the rows of all members stay in the processor's cache.
+#: Upper bound of the number of samples in one call, so that the rows of all members stay in the processor's cache.
 _CALL: Final = 20
-#: Definition: rate in 1/s at which the clearances are determined and published.
+#: Rate in 1/s at which the clearances are computed for publication, by definition.
 _KNOWN_HZ: Final = 10.0
-#: Bound: largest number of poses that wait for the model to reach their stamps; a session keeps as many for going back.
+#: Upper bound of the number of poses that wait until the model reaches their stamps; a session stores as many.
 _MOST_DUE: Final = MOST_MEASURED
-#: Definition: masks of one row that gets intervals (`_YES`) and of one row that gets none (`_NO`); an empty array of
-#: digests; the change of clearances that are constant.
+#: By definition: masks of a single row with intervals (`_YES`) or without intervals (`_NO`), an empty array of digests,
+#: and the change of clearances that do not change.
 _YES: Final = np.ones(1, bool)
 _NO: Final = np.zeros(1, bool)
 _NO_DIGESTS: Final = np.zeros(0, np.int64)
 _UNMOVED: Final = np.zeros(6)
-#: Definition: an empty load and empty poses.
+#: A load of zero and a set without poses, by definition.
 _NO_LOAD: Final = Load(np.array([0.0, 1.0]), np.zeros((2, 3)))
 _NO_POSES: Final = Poses(np.zeros(0), np.zeros((0, 3)))
 _LENGTH: Final = struct.Struct("<q")
-#: Definition: key under which an estimate has the harmonics of the load.
+#: Key of the harmonics of the load in the JSON of an estimate.
 _HARMONICS: Final = "load_harmonics"
 
 
 @dataclass(frozen=True, eq=False)
 class Span:
-    """Peaks and impulses over a span of time, with intervals.
+    """Peaks and impulses of the contact forces over a span of time, with intervals.
 
     Attributes
     ----------
     start, end : float
         Beginning and end of the span in s.
     peak, impulse : ndarray, shape (3, 8)
-        Largest force in N and impulse in N s of each pair. The rows are the median twin's values and the 5 % and 95 %
-        points.
+        Largest force in N and impulse in N s of each pair. The rows contain the values of the median twin, the 5 %
+        quantiles and the 95 % quantiles.
     """
 
     start: float
@@ -91,10 +94,10 @@ class Span:
 
 
 class _Behind(NamedTuple):
-    """Samples that only the first member has used so far, with the rows of the first member.
+    """Samples that only the first member has processed so far, with the rows of the first member.
 
-    `wanted` marks the rows that get intervals, and `ends` the rows that end a span of peaks and impulses. `begins`
-    states whether a span begins with the first row.
+    `wanted` marks the rows for which intervals are computed. `ends` marks the rows at which a span of peaks and
+    impulses ends. `begins` states whether a span begins with the first row.
     """
 
     t: Array
@@ -106,17 +109,17 @@ class _Behind(NamedTuple):
 
 
 class Follower:
-    """A twin under sampled loads that follows one machine with the help of measured poses and estimates.
+    """A twin under sampled loads that follows one machine by means of measured poses and estimates.
 
-    It is used like a `Twin`. Its motion is the motion of its first member, the median twin.
+    A `Follower` is used like a `Twin`. Its motion is the motion of its first member, the median twin.
 
     Parameters
     ----------
     scene : Scene
         The nominal scene.
     members : int
-        Number of twins, at least 20. With 1, only the parameters follow the machine: no pose moves the twin, and its
-        forces have no intervals.
+        Number of twins, either 1 or at least 20. With 1, only the parameters follow the machine; poses do not move the
+        twin, and its forces have no intervals.
     tol : float
         As for `Twin`.
     start : float
@@ -132,7 +135,7 @@ class Follower:
 
     excitation: Literal["scene", "sampled"] = "sampled"
     max_evaluations: int | None = None
-    #: number of advances that were cut short, always 0 for a follower
+    #: number of advances that `max_evaluations` has cut short, always 0 for a follower
     bounded = 0
 
     def __init__(
@@ -144,32 +147,28 @@ class Follower:
         self._members, self._seed = members, seed
         self._prior = prior(scene)
         self._speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
-        #: number of poses and estimates added so far, including those that were not used
+        #: number of poses and estimates added so far, used or not
         self.added = 0
-        #: whether each row gets intervals of the forces, not only published rows
+        #: whether intervals of the forces are computed for each row instead of only for published rows
         self.every_row = False
         #: whether a single published row is returned before `catch_up` advances the other members
         self.defers = False
         self._behind: _Behind | None = None
-        #: smallest and largest load so far, shape (2, 3)
+        #: minimum and maximum of each component of the load so far, shape (2, 3)
         self._range = np.zeros((2, 3))
         self._ends, self._begins = _NO_DIGESTS, False
         self._span_start = start
         self._wrench = np.zeros(3)
-        #: `poses_used`: number of poses that moved the members
-        #: `poses_outlying`: number of poses that were outliers
-        #: `poses_dropped`: number of poses that were dropped because too many were waiting
+        #: numbers of poses that have moved the members, that were outliers, and that were dropped from a full queue
         self.poses_used = self.poses_outlying = self.poses_dropped = 0
-        #: `drawn`: number of times that members were drawn anew
-        #: `_since`: time in s from which on the present estimate is followed
+        #: number of times that members were drawn anew, and model time in s of the latest draw from an estimate
         self.drawn, self._since = 0, start
         self._draw("", start, self._unworn())
         self._forget()
 
     def _forget(self) -> None:
-        """Forget all poses."""
-        #: poses and estimates that wait, in order of time: time in s, sequence number, and the pose or the text of the
-        #: estimate
+        #: queue of poses and estimates in order of time: time in s, sequence number, and the pose or the estimate
+        #: (JSON)
         self._due: list[tuple[float, int, list[float] | str]] = []
         #: times of recently used poses
         self._used: deque[float] = deque()
@@ -180,14 +179,16 @@ class Follower:
         return np.zeros(PAIR_COUNT) if wear is None else np.array(wear.initial_depth_m, dtype=np.float64)
 
     def _draw(self, text: str, time: float, worn: Array) -> None:
-        """Draw members in the scene's initial state from an estimate (JSON), or from the prior if `text` is empty."""
+        """Draw members from an estimate (JSON), or from the prior if `text` is empty, in the initial state of the
+        scene.
+        """
         self._text = text
         #: the followed estimate; None while the prior is followed
         self.estimate = Estimate.from_dict(json.loads(text)) if text else None
         self._load_share = _load_share(text)
         self._known = self._prior if self.estimate is None else _whole(self.estimate, self._prior)
         rng = np.random.default_rng([self._seed, self.drawn])
-        # with an uncertain load nothing is learned, because errors of the load would be taken for other parameters
+        # under an uncertain load, parameters are not corrected, because errors of the load would distort them
         learns = not self._load_share.any()
         self._ensemble = Ensemble(self.scene, self._known, self._members, rng, time, self.tol, worn, learns)
         self._ensemble.set_travel_speed(self._speed)
@@ -197,7 +198,7 @@ class Follower:
 
     @property
     def signature(self) -> tuple[bool, ...]:
-        """Terms of the equations, as in `Twin`."""
+        """The compiled terms of the equations, as in `Twin`."""
         others = self._ensemble.others
         return self._ensemble.first.signature + (() if others is None else others.signature)
 
@@ -208,7 +209,7 @@ class Follower:
 
     @property
     def wrench(self) -> Array:
-        """The last sample: Fx, Fy [N] and M [N m], shape (3,); zero before the first."""
+        """The last sample of the load: Fx, Fy [N] and M [N m], shape (3,); zero before the first sample."""
         return self._wrench.copy()
 
     @property
@@ -223,12 +224,12 @@ class Follower:
 
     @property
     def members(self) -> int:
-        """Twins that are advanced."""
+        """Number of members."""
         return self._members
 
     @property
     def lost(self) -> int:
-        """Number of members that have left the model's range."""
+        """Number of members whose motion has left the range of the model."""
         self.catch_up()
         return int((~self._ensemble.good).sum())
 
@@ -239,11 +240,11 @@ class Follower:
         return found
 
     def failure(self, status: int) -> str:
-        """Return the reason of the newest failed advance."""
+        """Return the reason of the latest failed advance as text."""
         return self._ensemble.first.failure(status)
 
     def like(self, scene: Scene) -> Follower:
-        """Return a follower of another machine that continues the counters."""
+        """Return a follower of another scene with the same settings; the counters of poses continue."""
         found = Follower(scene, self._members, tol=self.tol, seed=self._seed)
         found.every_row, found.defers = self.every_row, self.defers
         found.poses_used, found.poses_outlying = self.poses_used, self.poses_outlying
@@ -251,7 +252,7 @@ class Follower:
         return found
 
     def warm_up(self) -> float:
-        """Compile the kernels, or load them from the cache on disk; return the seconds that it took."""
+        """Compile the kernels, or load them from the cache on disk; return the elapsed time in s."""
         begin, before = _time.perf_counter(), self.snapshot()
         self.advance(self.time + 1e-6)
         self._ensemble.stand_like(self._ensemble, self._wrench)
@@ -259,14 +260,14 @@ class Follower:
         return _time.perf_counter() - begin
 
     def advance(self, t: float, wrench: ArrayLike | None = None) -> Advance:
-        """Advance to model time `t`, as `Twin.advance`."""
+        """Advance to model time `t`, as `Twin.advance` does."""
         sample = self._wrench if wrench is None else np.asarray(wrench, dtype=np.float64)
         rows = np.zeros(1, ROW)
         self.advance_rows(np.array([t], dtype=np.float64), sample[None], rows)
         return Advance(rows[0])
 
     def end_spans(self, ends: NDArray[np.int64], begins: bool) -> None:
-        """State which rows of the next `advance_rows` are published.
+        """Set which rows of the next `advance_rows` are published.
 
         Parameters
         ----------
@@ -281,10 +282,10 @@ class Follower:
     def advance_rows(
         self, t: Array, wrench: Array, rows: Rows | None, digest_after: NDArray[np.int64] = _NO_DIGESTS
     ) -> Advanced:
-        """Advance to given times, as `Twin.advance_rows`; a row uses all measurements before it.
+        """Advance to given times, as `Twin.advance_rows` does; a row depends on all measurements before its time.
 
-        With `defers`, a row that is published by itself is returned at once, and `catch_up` advances the other members
-        later.
+        With `defers`, a row that is published alone is returned before the other members are advanced. `catch_up`
+        advances these members later.
         """
         self.catch_up()
         if wrench.shape != (len(t), 3) or not np.isfinite(wrench).all():
@@ -318,7 +319,9 @@ class Follower:
     def _advance_first(
         self, t: Array, wrench: Array, rows: Rows, wanted: NDArray[np.bool_], ends: NDArray[np.bool_]
     ) -> int:
-        """Advance the median twin, leaving the other members to `catch_up`; return how many advances failed."""
+        """Advance only the median twin, and return the number of failed advances; `catch_up` advances the other
+        members.
+        """
         failed = self._ensemble.advance_first(t, wrench, rows)
         known = self._clearance.ravel()
         rows["known_clearance"] = known if self.scene.wear is None else known + self._moved(rows["wear_depth"])
@@ -328,7 +331,7 @@ class Follower:
         return failed
 
     def catch_up(self) -> None:
-        """Advance all members to the first member's time, add the intervals to its rows, and use due measurements."""
+        """Advance all members to the time of the first member, add intervals to its rows, and use due measurements."""
         behind, self._behind = self._behind, None
         if behind is None:
             return
@@ -344,7 +347,7 @@ class Follower:
             self._use(when, measured)
 
     def _stop(self, t: Array, begin: int, digest_after: Container[int]) -> int:
-        """Return the end of the samples up to the next digest, measurement or determination of the clearances."""
+        """Return the end of a part of the samples, after which a digest, a measurement or the clearances are due."""
         end = min(begin + _CALL, len(t))
         due = self._due[0][0] if self._due else math.inf
         for place in range(begin, end):
@@ -353,15 +356,16 @@ class Follower:
         return end
 
     def _moved(self, worn: Array) -> Array:
-        """Return the growth of the clearances and of their intervals' ends, (..., 6), by the pads' wear `worn` (...,
-        8).
+        """Return the growth of the clearances and of the ends of their intervals due to wear, shape (..., 6), in m.
+
+        `worn` contains the wear depths of the pads in m, shape (..., 8).
         """
         if self.scene.wear is None:
             return _UNMOVED
         return np.repeat(widening(self.scene, worn), 3, axis=-1)
 
     def _note_clearance(self) -> None:
-        """Store the present clearances of unworn pads, from the prior, the estimate or the members."""
+        """Store the present clearances without wear, from the prior, the estimate or the members."""
         self._cell = math.floor(self.time * _KNOWN_HZ)
         known = self._known
         if self.estimate is None and self._ensemble.moved:
@@ -378,7 +382,7 @@ class Follower:
         wear_depth: ArrayLike | None = None,
         pose: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> None:
-        """Begin anew at model time `t`, as `Twin.reset` does; earlier measurements are dropped."""
+        """Reset the motion at model time `t`, as `Twin.reset` does, and drop earlier measurements."""
         self.catch_up()
         self.drawn += 1
         worn = self._unworn() if wear_depth is None else np.array(wear_depth, dtype=np.float64)
@@ -391,20 +395,22 @@ class Follower:
             self._ensemble.stand_about(q, v)
 
     def set_travel_speed(self, speed_m_s: float) -> None:
-        """Set the speed along the face from here on, as `Twin.set_travel_speed`."""
+        """Set the travel speed along the face from now on, as `Twin.set_travel_speed` does."""
         self.catch_up()
         self._speed = abs(float(speed_m_s))
         self._ensemble.set_travel_speed(self._speed)
 
     def digest(self) -> str:
-        """Return a digest of the exact state, 16 hexadecimal digits."""
+        """Return a digest of the exact state, as 16 hexadecimal digits."""
         self.catch_up()
         learned = (part.tobytes() for part in self._ensemble.learned())
         state = [*self._ensemble.twins(), self._wrench.tobytes(), self._ensemble.square.tobytes(), *learned]
         return hashlib.blake2b(b"".join(state), digest_size=8).hexdigest()
 
     def snapshot(self) -> bytes:
-        """Return the exact state as bytes, which a follower with the same scene, members and seed can restore."""
+        """Return the exact state as bytes, which a follower with the same scene, number of members and seed can
+        restore.
+        """
         self.catch_up()
         blobs, random = self._ensemble.state()
         noise = np.array(self._noise_rows).reshape(-1, 3)
@@ -420,12 +426,12 @@ class Follower:
         return b"".join([_LENGTH.pack(len(head)), head, *blobs])
 
     def snapshot_size(self, data: bytes) -> int:
-        """Return the length of the snapshot at the beginning of some bytes."""
+        """Return the length in bytes of the snapshot at the beginning of `data`."""
         facts, begin = _facts(data)
         return begin + int(sum(facts["sizes"]))
 
     def restore(self, data: bytes) -> None:
-        """Restore a state saved by `snapshot`."""
+        """Restore a state that `snapshot` has returned."""
         self._behind = None
         facts, begin = _facts(data)
         blobs = []
@@ -450,21 +456,21 @@ class Follower:
     # -- measurements ------------------------------------------------------------------------------------------------
 
     def add_pose(self, t: float, q: ArrayLike, known: float = -math.inf) -> None:
-        """Add a pose measured at `t` in s, shape (3,), NaN where not measured.
+        """Add a pose `q`, shape (3,), that was measured at time `t` in s; a component that was not measured is NaN.
 
-        The pose is used when the model reaches `t`, or `known` in s if that is later. A late pose is used at once, if
-        it is at most `LATEST_S` old.
+        The pose is used when the model reaches `t` or `known`, the later of the two times in s. A late pose is used at
+        once, provided that it is at most `LATEST_S` old.
         """
         self._add(max(t, known), [t, *np.asarray(q, dtype=np.float64).tolist()])
 
     def add_estimate(self, text: str, t: float, start: float = 0.0) -> None:
-        """Add an estimate that is known from time `t` in s on, as JSON of `Estimate.as_dict`.
+        """Add an estimate, the JSON of `Estimate.as_dict`, that takes effect at time `t` in s.
 
-        Its window begins at the time `start` in s.
+        The window of the estimate begins at time `start` in s.
 
-        An estimate with both clearances is followed. One clearance is enough while no estimate is followed. Of two
-        estimates of nearly the same motion, the first is followed if the second has more rough clearances. After a
-        withdrawn estimate the twin follows the prior again.
+        The twin follows an estimate with both clearances. While it follows the prior, an estimate with one clearance is
+        enough. An estimate with more rough clearances does not replace an estimate from nearly the same motion. After a
+        withdrawn estimate, the twin follows the prior again.
         """
         self._add(t, _harmonics_from(text, start))
 
@@ -493,7 +499,7 @@ class Follower:
             self._begin_anew(measured)
 
     def _is_better(self, found: Estimate) -> bool:
-        """Return whether the followed estimate has fewer rough clearances, from nearly the same motion as another."""
+        """Return whether the followed estimate has fewer rough clearances than `found`, from nearly the same motion."""
         before, window_s = self.estimate, found.t_end - found.t_start
         if before is None or self.time - self._since >= tuning.NEW_MOTION * window_s:
             return False
@@ -502,18 +508,22 @@ class Follower:
 
     @property
     def known(self) -> str:
-        """The followed estimate as JSON; empty for the prior."""
+        """The followed estimate (JSON); empty while the twin follows the prior."""
         return self._text
 
     def follow_estimate(self, known: str) -> None:
-        """Follow the estimate in another follower's `known`; its time may have another origin, so no phase is known."""
+        """Follow the estimate that was the property `known` of another follower.
+
+        The times of the two followers may have different origins, so the harmonics of the load, which need a phase, are
+        dropped.
+        """
         known = _harmonics_from(known, None)
         if known != self._text:
             self.catch_up()
             self._begin_anew(known)
 
     def _begin_anew(self, text: str) -> None:
-        """Draw members from an estimate (JSON) or the prior; they start at the poses of the previous members."""
+        """Draw members as in `_draw`, and start these members at the poses of the previous members."""
         before = self._ensemble
         self.drawn += 1
         self._since = self.time
@@ -521,7 +531,7 @@ class Follower:
         self._ensemble.stand_like(before, self._wrench)
 
     def follow_parameters(self) -> None:
-        """Continue with one twin that no pose moves, from the state of the median twin."""
+        """Continue with a single twin, which poses do not move, from the state of the median twin."""
         self.catch_up()
         self._members = 1
         self._begin_anew(self._text)
@@ -545,12 +555,14 @@ class Follower:
             self._noise_rows.append(q)
 
     def _load_error(self) -> Array:
-        """Return the load's error according to a rough estimate, shape (3,), in N, N, N m."""
+        """Return the standard deviation of the load's error from a rough estimate, shape (3,), in N, N, N m; else
+        zero.
+        """
         found: Array = tuning.LOAD_ERROR_SHARE * self._load_share * 0.5 * (self._range[1] - self._range[0])
         return found
 
     def _sensor(self) -> tuple[Array | None, float]:
-        """Return noise and delay of the sensor; the noise is None after too few poses."""
+        """Return noise in m, m, rad and delay in s of the sensor; the noise is None if too few poses have been used."""
         found = self.estimate
         noise: Array | None = None
         if found is not None and found.noise is not None:
@@ -564,14 +576,17 @@ class Follower:
     # -- clearances and forces ---------------------------------------------------------------------------------------
 
     def clearance(self) -> Array:
-        """Return horizontal and vertical clearance, each with its 5 % and 95 % points, shape (2, 3), in m."""
+        """Return value, 5 % and 95 % quantile of the horizontal and the vertical clearance in m, shape (2, 3)."""
         self.catch_up()
         self._note_clearance()
         found: Array = self._clearance + self._moved(self.wear_depth).reshape(2, 3)
         return found
 
     def span(self) -> Span:
-        """Return peaks and impulses since the previous call; valid if no publication has ended a span since then."""
+        """Return peaks and impulses since the previous call.
+
+        The result is valid only if no row has been published since then, because a published row ends the span.
+        """
         self.catch_up()
         start, self._span_start = self._span_start, self.time
         found = Span(start, self.time, *self._ensemble.span())
@@ -579,7 +594,9 @@ class Follower:
         return found
 
     def held(self, t: float) -> Rows:
-        """Return the row, shape (1,), at a later time under the newest sample; the state does not change."""
+        """Return the row, shape (1,), at a later time `t` under the load of the newest sample; the state does not
+        change.
+        """
         self.catch_up()
         rows = np.zeros(1, ROW)
         self._ensemble.held(t, rows)
@@ -588,12 +605,17 @@ class Follower:
 
 
 def follower(scene: Scene, follow: str, members: int, tol: float) -> Follower:
-    """Return a twin of a scene; `follow` is `full`, with `members` twins, or `parameters`, without poses."""
+    """Return a follower of a scene.
+
+    With `follow` equal to `full`, it has `members` twins, which the poses move. With `parameters`, it is a single twin.
+    """
     return Follower(scene, members) if follow == "full" else Follower(scene, 1, tol=tol)
 
 
 def _harmonics_from(text: str, start: float | None) -> str:
-    """Return an estimate (JSON) whose harmonics of the load count from the time `start` in s; None leaves them out."""
+    """Return an estimate (JSON) whose harmonics of the load begin at time `start` in s, or without harmonics for
+    None.
+    """
     if _HARMONICS not in text:
         return text
     found = json.loads(text)
@@ -605,7 +627,11 @@ def _harmonics_from(text: str, start: float | None) -> str:
 
 
 def _load_share(text: str) -> Array:
-    """Return the load's error in a rough estimate (JSON), in units of half the load's range, (3,); else zero."""
+    """Return the error of the load that a rough estimate (JSON) contains, in units of half the load's range, shape
+    (3,).
+
+    The result is zero for other estimates.
+    """
     found = json.loads(text) if text else {}
     rough = State.ROUGH.value in [found.get(axis, {}).get("state") for axis in ("horizontal", "vertical")]
     figures = found.get("figures", {}) if rough else {}
@@ -613,14 +639,14 @@ def _load_share(text: str) -> Array:
 
 
 def _facts(data: bytes) -> tuple[dict[str, Any], int]:
-    """Return the facts at the beginning of a snapshot, and the place of its arrays."""
+    """Return the JSON header of a snapshot, and the index of the first byte after the header."""
     (length,) = _LENGTH.unpack_from(data)
     begin = _LENGTH.size + length
     return json.loads(data[_LENGTH.size : begin]), begin
 
 
 def prior(scene: Scene) -> Estimate:
-    """Return the prior of a scene as an estimate, with damping and gains of the load."""
+    """Return the prior of a scene as an estimate that also contains the damping and the gains of the load."""
     units = Units.of(scene, _NO_LOAD)
     unknowns = Unknowns.stated(units.scene(scene), _NO_LOAD, _NO_POSES)
     normal = [Interval.normal(*pair) for pair in zip(unknowns.nominal(), unknowns.deviations(), strict=True)]
@@ -634,7 +660,7 @@ def prior(scene: Scene) -> Estimate:
 
 
 def _whole(found: Estimate, known: Estimate) -> Estimate:
-    """Return an estimate with the prior's damping and gains in place of missing ones."""
+    """Return an estimate in which the prior `known` replaces missing damping and missing gains."""
     return replace(
         found,
         damping=found.damping or known.damping,

@@ -1,4 +1,4 @@
-"""A measured stretch followed causally: each row uses only earlier measurements."""
+"""Forces and clearances over recorded data, computed causally: each row depends only on earlier measurements."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ from plow_twin.stream.session import Session
 
 Array = NDArray[np.float64]
 
-#: Definition: length in s of the estimates' windows, and time in s between the ends of two windows; both are the
-#: defaults of a node.
+#: Length of the windows of the estimates in s, and time in s from the end of one window to the end of the next. By
+#: definition the two numbers are the defaults of the node.
 WINDOW_S, INTERVAL_S = 32.0, 10.0
-#: Definition: number of nanoseconds in a second.
+#: Nanoseconds per second, by definition.
 _NS: Final = 1e9
-#: Bound: the load is used in parts of this many seconds, so that the rows of all members fit into the processor's
-#: cache.
+#: Upper bound in s of the duration of the parts in which the load is processed, so that the rows of all members fit
+#: into the processor's cache.
 _PART_S: Final = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """Forces and clearances at some times, each from earlier measurements only.
+    """Forces and clearances as functions of time, computed from earlier measurements only.
 
     Attributes
     ----------
     t : ndarray, shape (n,)
         Times in s.
     force, low, high : ndarray, shape (n, 8)
-        Forces of the median twin and the ends of their 90 % intervals in N.
+        Forces of the median twin, and lower and upper ends of their 90 % intervals, in N.
     clearance : ndarray, shape (n, 2, 3)
-        Horizontal and vertical clearance: value, 5 % and 95 % points in m.
+        Value, 5 % and 95 % quantile of the horizontal and of the vertical clearance in m.
     """
 
     t: Array
@@ -56,14 +56,14 @@ class Followed:
 
     @classmethod
     def of(cls, t: Array, rows: NDArray[np.void]) -> Followed:
-        """Return forces and clearances from the rows of a following twin."""
+        """Return forces and clearances from the rows of a twin that follows measurements."""
         clearance = rows["known_clearance"].reshape(-1, 2, 3)
         return cls(t, rows["force"], rows["force_low"], rows["force_high"], clearance)
 
 
 @dataclass(frozen=True)
 class TakenOver:
-    """An estimate and its time in s; `taken` states whether the twins are drawn from the estimate from then on."""
+    """An estimate, the time in s at which it was finished, and whether the twins were then drawn from it (`taken`)."""
 
     t: float
     estimate: Estimate
@@ -72,7 +72,7 @@ class TakenOver:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """The rows of a stretch, its estimates, and the peaks and impulses of each span."""
+    """Result of `follow`: the rows, the estimates, and the peaks and impulses of each span."""
 
     rows: Followed
     taken_over: list[TakenOver]
@@ -90,22 +90,23 @@ def follow(
     span: float | None = None,
     seed: int = 0,
 ) -> Stretch:
-    """Return forces and clearances at each sample of the load, or each `dt` s, from earlier measurements.
+    """Return forces and clearances at each sample of the load, or every `dt` s, computed from earlier measurements.
 
     Parameters
     ----------
     scene : Scene
         The nominal scene.
     load, poses, gaps : Load, Poses, Gaps
-        Measurements on one clock. In the windows of the estimates, times count from the load's first sample.
+        Measurements with stamps of the same clock. In the estimates, times are counted from the first sample of the
+        load.
     members : int
         Number of twins.
     dt : float, optional
         Interval of the rows in s; by default there is a row at each sample of the load.
     span : float, optional
-        Duration in s of a span of peaks and impulses; no spans by default.
+        Duration in s of each span for which peaks and impulses are computed; by default there are no spans.
     seed : int
-        Seed of all draws.
+        Seed of the random numbers.
     """
     steps = _Steps(scene, load, poses, gaps, members, seed, span)
     parts = list(steps.rows(dt))
@@ -114,7 +115,7 @@ def follow(
 
 
 class _Steps:
-    """The loop over the load: as in a live twin, a session gets all measurements in order of their stamps."""
+    """Loop over the load, in which a session receives all measurements in order of their stamps, as in a live twin."""
 
     def __init__(
         self, scene: Scene, load: Load, poses: Poses, gaps: Gaps | None, members: int, seed: int, span: float | None
@@ -127,14 +128,13 @@ class _Steps:
         deviation = 0.0 if gaps is None else gaps.deviation
         self._windows = Windows(WINDOW_S, INTERVAL_S, 0.0, poses.deviation, load.deviation, deviation, early=True)
         self._guess: Guess = ()
-        #: counts of rows on a grid, of added poses and of added gaps
+        #: numbers of rows on the grid of `dt`, of added poses and of added gaps
         self._count = self._poses_added = self._gaps_added = 0
         self._span = span
         self.taken_over: list[TakenOver] = []
         self.spans: list[Span] = []
 
     def rows(self, dt: float | None) -> Iterator[Followed]:
-        """Yield the rows, part by part."""
         step = max(1, int(np.searchsorted(self._load.t, self._load.t[0] + _PART_S)))
         # the first sample is a part by itself, because there is no motion before it
         for first in (0, *range(1, len(self._stamps), step)):
@@ -152,7 +152,7 @@ class _Steps:
                     self._estimate(window)
 
     def _add_poses(self, until_ns: int) -> None:
-        """Add the poses up to a stamp; the model uses each pose when it reaches the pose's time."""
+        """Add the poses up to a stamp; the twin uses a pose when it reaches the time of the pose."""
         last = int(np.searchsorted(self._pose_stamps, until_ns, side="right"))
         for index in range(self._poses_added, last):
             stamp, q = int(self._pose_stamps[index]), tuple(self._poses.q[index].tolist())
@@ -195,12 +195,12 @@ class _Steps:
 
 
 def _stamps(t: Array, start: float) -> NDArray[np.int64]:
-    """Return times as stamps in ns from a start."""
+    """Return times in s as stamps in ns after `start`."""
     return np.round((t - start) * _NS).astype(np.int64)
 
 
 def table(followed: Followed) -> tuple[list[str], Array]:
-    """Return the names of the columns and the rows of `followed.csv`."""
+    """Return the column names of the file `followed.csv`, and its rows."""
     names, columns = ["t"], [followed.t]
     for index, pair in enumerate(PAIR_NAMES):
         names += [pair, f"{pair}/p05", f"{pair}/p95"]

@@ -1,4 +1,4 @@
-"""Prior deviations of a scene's numbers: the stated deviation, or the default for the number's mark."""
+"""Prior standard deviations of the numbers of a scene, either stated in the scene or by default."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ from typing import Final
 
 from plow_twin.model.scene import Mark, Scene
 
-#: Prior: standard deviation of a number that has no stated deviation, by kind and mark. Drawings do not show the wear
-#: of a clearance, and the numbers of a contact are seldom known unless measured. A drawing gives mass and inertia to
-#: some percent, and the sides of a frame up to a tolerance and the rounding of its corners. The exponent belongs to an
-#: idealised law; friction is seldom documented. Units are m for lengths, the logarithm for stiffness and damping (the
-#: logit for a restitution), a share for mass and inertia, and the number's own unit otherwise.
+#: Prior standard deviations of numbers without a stated deviation, by kind and by mark (the source of a number).
+#:
+#: - clearance, stiffness, damping: a drawing does not show wear, and the contact is seldom known unless measured
+#: - mass, inertia: a drawing gives the values to some percent
+#: - frame: a drawing gives the sides up to a tolerance and to the rounding of the corners
+#: - exponent, friction: the contact law is idealised, and friction is seldom documented
+#:
+#: Units: m for clearance and frame; deviation of the logarithm for stiffness and damping, and of the logit for a
+#: restitution; a relative deviation for mass and inertia; 1 for exponent and friction.
 DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
     "clearance": {Mark.GIVEN: 8e-3, Mark.MEASURED: 2e-3, Mark.RECONSTRUCTED: 8e-3, Mark.ASSUMED: 8e-3},
     "stiffness": {Mark.GIVEN: 2.5, Mark.MEASURED: 0.5, Mark.RECONSTRUCTED: 2.5, Mark.ASSUMED: 2.5},
@@ -21,16 +25,20 @@ DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
     "exponent": {Mark.GIVEN: 0.07, Mark.MEASURED: 0.03, Mark.RECONSTRUCTED: 0.07, Mark.ASSUMED: 0.07},
     "friction": {Mark.GIVEN: 0.05, Mark.MEASURED: 0.02, Mark.RECONSTRUCTED: 0.05, Mark.ASSUMED: 0.05},
 }
-#: Prior: half-normal deviation in m of the corners' radius, if the scene states no radius.
+#: Prior of the radius of the frame's corners if the scene states no radius: scale in m of a half-normal distribution.
 ROUNDING: Final = 3e-3
-#: Prior: standard deviations of a sensor's scales of x, y and theta; that of theta is larger, because an angle is often
-#: computed from two distances.
+#: Prior standard deviations of a sensor's scale factors of x, y and theta. The deviation for theta is larger, because
+#: an angle is often computed from two distances.
 SCALES: Final = (5e-3, 5e-3, 1e-2)
-#: Prior: standard deviation of a sensor's constant error of x, y [m] and theta [rad].
+#: Prior standard deviations of a sensor's bias of x, y [m] and theta [rad].
 BIAS: Final = (5e-3, 5e-3, 0.02)
-#: Prior: deviations of quantities that a scene cannot state. For each wall they are its stiffness relative to the
-#: contact's and its turn in m. For the sensor they are its scales, its lever arm in m, the squared time constant of its
-#: low pass in s2 (the low pass's mean delay is an unknown of the fit), and the drift of its clock.
+#: Prior standard deviations of quantities that a scene cannot state:
+#:
+#: - `stiffness_<wall>`: stiffness of a wall relative to the stiffness of the contact
+#: - `turn_<wall>`: rotation of a wall: difference between the outward displacements of its two pads in m
+#: - `scale_<axis>`, `lever_<axis>`: scale factor, and lever arm in m, of the sensor
+#: - `filter`: squared time constant of the sensor's low pass in s2, without its mean delay, which is fitted
+#: - `clock`: relative drift of the sensor's clock
 UNSTATED: Final = {
     **{f"stiffness_{wall}": 0.1 for wall in ("left", "right", "top", "bottom")},
     **{f"turn_{wall}": 1e-3 for wall in ("left", "right", "top", "bottom")},
@@ -39,7 +47,7 @@ UNSTATED: Final = {
     "filter": 4e-4,
     "clock": 1e-4,
 }
-#: Row of `DEFAULTS` for each number, by path.
+#: Key in `DEFAULTS` of each number of a scene, by the path of the number.
 KINDS: Final = {
     "clearance.horizontal_m": "clearance",
     "clearance.vertical_m": "clearance",
@@ -56,7 +64,7 @@ KINDS: Final = {
 
 
 def is_stated(scene: Scene, path: str) -> bool:
-    """Return whether the scene states the deviation of a number."""
+    """Return whether the scene states the standard deviation of the number at a path."""
     provenance = scene.marks.get(path)
     return provenance is not None and provenance.deviation is not None
 
