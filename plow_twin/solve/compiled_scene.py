@@ -1,4 +1,4 @@
-"""Conversion of a scene to the records that the kernels read; no other module does this."""
+"""Conversion of a scene to the records that the kernels read. No other module creates these records from a scene."""
 
 from __future__ import annotations
 
@@ -46,22 +46,21 @@ from plow_twin.solve.state import (
     state_type,
 )
 
-#: Tightest and loosest tolerance.
+#: Tightest and loosest admissible tolerance.
 TOLERANCE_RANGE = (1e-13, 1e-1)
-#: Admissible error of one step as a share of the tolerance; it is small, because the errors of hundreds of steps add up
-#: and impacts amplify them.
+#: Admissible error of one step divided by the tolerance. It is small because the errors of hundreds of steps add up,
+#: and because impacts amplify them.
 STEP_SHARE = 3e-4
-#: Largest admissible error of a step relative to the length scale; it applies at loose tolerances.
+#: Largest admissible error of a step, relative to the length scale. It limits the error at loose tolerances.
 LARGEST_STEP_ERROR = 1e-6
-#: `STEP_SHARE` for exponents that are not integers; it is smaller, because series converge slowly near a branch point.
+#: `STEP_SHARE` for exponents that are not integers. It is smaller because series converge slowly near a branch point.
 STEP_SHARE_FRACTION = 1e-6
-#: Number of mode changes at one instant after which the solver steps beyond this instant.
+#: Number of mode changes at one time after which the solver takes a step without event detection.
 MAX_EVENTS_AT_ONCE = 64
-#: Largest harmonics, as a share of the load that presses the head to its walls, for which rest is checked
+#: Largest harmonic load for which rest is detected, divided by the load that presses the head against its walls
 #: (`method.small_harmonics`).
 _SMALL_HARMONICS = 1e-2
-#: Penetration, relative to the frame's half diagonal, that counts as noise: some 45 rounding errors of the half
-#: diagonal.
+#: Penetration below which rounding dominates, divided by half the frame's diagonal. It is some 45 rounding errors.
 _NOISE = 1e-14
 
 _Found = TypeVar("_Found")
@@ -71,7 +70,7 @@ _NO_TERMS = Terms(*[None] * len(Terms._fields))
 
 @dataclass(frozen=True)
 class CompiledScene:
-    """A scene at one tolerance as records for the kernels."""
+    """Records of a scene at one tolerance, for the kernels."""
 
     scene: Scene
     params: Params
@@ -79,7 +78,7 @@ class CompiledScene:
     loads: LoadSet
 
     def initial_state(self, time: float = 0.0, wear_depth: Array | None = None) -> State:
-        """Return the scene's initial state at `time`; `wear_depth` [m] replaces the pads' initial wear if given."""
+        """Return the scene's initial state at `time`. If given, `wear_depth` [m] replaces the initial wear depth."""
         state = new_record(state_type(self.parts.terms))
         self.start(state)
         if wear_depth is not None:
@@ -89,7 +88,7 @@ class CompiledScene:
         return state
 
     def start(self, state: State | np.void) -> None:
-        """Write coordinates, rates, damping and wear of the initial state to a zero record; modes are not set."""
+        """Write coordinates, rates, damping and wear of the initial state to a zero record. Modes are not set."""
         state["y"][:] = geometry.state_of(self.scene, self.scene.initial.q, self.scene.initial.v)
         if self.parts.terms.hysteretic is not None:
             state["damping_factor"][:] = self.scene.contact.damping or 0.0
@@ -98,7 +97,7 @@ class CompiledScene:
 
 
 def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> CompiledScene:
-    """Compile a scene.
+    """Return the records of a scene for the kernels.
 
     Parameters
     ----------
@@ -106,7 +105,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
     tol : float
         Tolerance of the pose relative to `geometry.length_scale`, 1e-13 .. 1e-1.
     sampled : bool
-        Whether the load is given as samples, so that the scene's own loads are left out.
+        Whether the load is given as samples. The loads of the scene are then omitted.
 
     Raises
     ------
@@ -114,21 +113,20 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         The tolerance is out of range.
     """
     _check_tolerance(tol)
-    # a load table may be large, so scenes with tables do not use `_LATELY`, which would keep a table longer than its
-    # scene
+    # `_LATELY` would keep a load table in memory after the end of its scene, so scenes with tables do not use it
     tables = any(isinstance(load, Table) for load in scene.loads)
     return _describe(scene, tol, sampled, _Shared() if tables else _LATELY).compiled()
 
 
 def compile_scenes(scenes: Sequence[Scene], tol: float) -> tuple[NDArray[np.void], list[CompiledScene]]:
-    """Compile many scenes at one tolerance; parts that are the same object in several scenes are computed once.
+    """Return the records of many scenes at one tolerance. A part that several scenes share is converted only once.
 
     Returns
     -------
     params : ndarray of `PARAMS`, shape (m,)
-        Constants of all scenes in one block; zeros for scenes with `Options`.
+        Constants of all scenes in one array. The rows of scenes with `Options` are zero.
     compiled : list of CompiledScene
-        The scenes; their constants are the rows of `params`, or separate records for scenes with `Options`.
+        The compiled scenes. Their constants are rows of `params`, or separate records for scenes with `Options`.
 
     Raises
     ------
@@ -159,9 +157,9 @@ def _check_tolerance(tol: float) -> None:
 
 
 class _Shared:
-    """Results that scenes share; each result is computed once for the objects on which it depends.
+    """Cache for results that scenes share. Each result is computed once for the objects on which it depends.
 
-    If `most` is given, only the newest `most` results are kept.
+    If the argument `most` is given, the cache contains only the `most` newest results.
     """
 
     def __init__(self, most: float = math.inf) -> None:
@@ -171,12 +169,12 @@ class _Shared:
     def of(self, compute: Callable[..., _Found], *sources: object, given: tuple[Any, ...] | None = None) -> _Found:
         """Return compute(*sources), or compute(*given) if `given` is passed.
 
-        The result is kept for the next call with the same sources, which must therefore determine `given`.
+        The result is stored for the next call with the same sources, so the sources must determine `given`.
         """
         key = (compute, *map(id, sources))
         known = self._known.get(key)
         if known is None:
-            # the sources are kept too; otherwise another object could get the id of a source that no longer exists
+            # the sources are stored too; otherwise the id of a deleted source could belong to a new object
             known = self._known[key] = sources, compute(*(sources if given is None else given))
             if len(self._known) > self._most:
                 self._known.popitem(last=False)
@@ -184,14 +182,14 @@ class _Shared:
         return found
 
 
-#: Results computed from parts of the most recently compiled scenes. Studies vary some parts of a scene and reuse the
+#: Results for parts of the scenes that were compiled last. A study usually varies some parts of a scene, and reuses the
 #: results of the other parts.
 _LATELY: Final = _Shared(64)
 
 
 @dataclass(frozen=True)
 class _Description:
-    """The solver's description of a scene; `values` holds the fields of its `PARAMS` record."""
+    """Content of a `CompiledScene`. `values` contains the fields of its `PARAMS` record."""
 
     scene: Scene
     values: dict[str, Any]
@@ -199,7 +197,7 @@ class _Description:
     loads: LoadSet
 
     def compiled(self, params: Params | None = None) -> CompiledScene:
-        """Return the compiled scene, with its constants in `params` or in a new record."""
+        """Return the compiled scene. Its constants are written to `params`, or to a new record without `params`."""
         if params is None:
             params = new_record(params_type(options(self.scene)))
             for name, value in self.values.items():
@@ -208,7 +206,7 @@ class _Description:
 
 
 class _Unchanged(NamedTuple):
-    """All results that do not depend on the clearance; `values` holds the fields of `PARAMS` among them."""
+    """Results that do not depend on the clearance. `values` contains the fields of `PARAMS` among these results."""
 
     loads: LoadSet
     acceleration: float  #: largest acceleration in m/s^2
@@ -261,13 +259,12 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
     loads, acceleration, start_speed, harmonics, terms, unchanged = shared.of(
         _unchanged, scene.head, scene.frame, scene.contact, scene.gravity, scene.loads, scene.initial, scene.locked,
         scene.pairs, scene.wear, scene.friction, scene.support, sampled,
-        # only a head that starts off centre may touch a wall at the start, so only then do the results depend on the
-        # clearance
+        # the results depend on the clearance only if the head starts off centre, because it may then touch a wall
         scene.clearance if any(scene.initial.q) else None,
         given=(scene, sampled, shared),
     )  # fmt: skip
     length, radius = geometry.length_scale(scene), unchanged["radius"]
-    # the speed that the largest load would give the head over half the length scale
+    # speed that the head gains under the largest load over half the length scale
     speed = max(math.sqrt(length * acceleration), start_speed, 1e-3 * length)
     admissible = min(tol * (STEP_SHARE if terms.fraction is None else STEP_SHARE_FRACTION), LARGEST_STEP_ERROR)
     order = order_for(admissible)
@@ -292,7 +289,7 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
 
 
 def options(scene: Scene) -> Options:
-    """Return the options of a scene, each of which adds fields to its constants."""
+    """Return the options of a scene. Each option adds fields to the record of the scene's constants."""
     falls = scene.contact.restitution_fall is not None or scene.contact.restitution_fall_along_s_m is not None
     return Options(scene.head.carries == "corners", scene.frame.corner_radius_m is not None, falls)
 
@@ -318,7 +315,7 @@ def _of_options(scene: Scene) -> dict[str, Any]:
 
 @cache
 def damping_numbers(law: str) -> Array:
-    """Return restitution times damping number on an even grid of restitutions 0..1, shape (RESTITUTIONS + 1,)."""
+    """Return e D(e) for restitutions e on a uniform grid from 0 to 1, shape (RESTITUTIONS + 1,)."""
     grid = np.arange(RESTITUTIONS + 1) / RESTITUTIONS
     return grid * [LAWS[law].damping_number(float(e)) for e in grid]
 
@@ -326,7 +323,7 @@ def damping_numbers(law: str) -> Array:
 def _scene_terms(
     scene: Scene, law: Terms, loads: LoadSet, harmonics: Harmonics | None, segments: bool, shared: _Shared
 ) -> Terms:
-    """Return the terms of the whole scene, including the terms of its law."""
+    """Return the terms of the scene, including the terms of its contact law."""
     present = dict(
         harmonics=harmonics is not None,
         second=harmonics is not None and shared.of(_has_second, harmonics),
@@ -338,15 +335,14 @@ def _scene_terms(
     if scene.friction is not None and scene.friction.coefficient != 0.0:
         present["slip" if scene.friction.stick_stiffness_n_m is None else "stick"] = True
     present["support"] = scene.support is not None
-    # with an offset centre of mass the moment of the loads depends on the angle; flight then has no closed form
+    # with an offset centre of mass the moment of the loads depends on the angle, so flight has no closed form
     present["flight"] = present["harmonics"] and not present["offset"] and not present["support"]
-    # a head that carries corners may tumble by more than a quarter turn within a flight, so it has no flight in closed
-    # form
+    # the closed form of flight is not valid for a block that tumbles by more than a quarter turn
     present["flight"] &= scene.head.carries == "walls"
     creeps = present["wear"] or bool({"slip", "stick"} & present.keys())
     present["rest"] = not (creeps or present["support"])
     if present["harmonics"]:
-        # without damping a harmonic can swing the head up, so rest under harmonics is recognised only with damping
+        # without damping, a harmonic load can build up a motion, so rest under harmonic loads is not detected
         damped = law.viscous is not None or law.hysteretic is not None
         present["rest"] &= damped and present["flight"] and _harmonics_are_small(scene, loads, shared.of(_swing, loads))
     return law._replace(**_flags(present))
@@ -363,7 +359,7 @@ def _wear_terms(wear: Wear | None) -> dict[str, bool]:
 
 
 def _harmonics_are_small(scene: Scene, loads: LoadSet, swing: Array) -> bool:
-    """Return whether the harmonics are small compared with the steady loads and the preload at the walls."""
+    """Return whether the harmonic loads are small compared with the steady loads and the preload at the walls."""
     mass, contact = scene.head.mass_kg, scene.contact
     arms = np.array([1.0, 1.0, 1.0 / geometry.half_diagonal(scene)])
     pressing = np.abs(loads.constant) @ arms + mass * abs(scene.gravity.acceleration_m_s2)
@@ -374,9 +370,9 @@ def _harmonics_are_small(scene: Scene, loads: LoadSet, swing: Array) -> bool:
 
 
 def _initial_depth(scene: Scene) -> float:
-    """Return the largest penetration of a pair at the start in m, at least 0."""
+    """Return the largest penetration of a pair in the initial state in m, or 0 without contact."""
     if not any(scene.initial.q):
-        return 0.0  # the head is centred and reaches no wall
+        return 0.0  # a centred head does not touch a wall
     y = geometry.state_of(scene, scene.initial.q, scene.initial.v)
     rows = geometry.penetration_rows(scene)
     return max(float((np.array([y[COS], y[SIN], y[X], y[Y], 1.0]) @ rows).max()), 0.0)
@@ -384,36 +380,36 @@ def _initial_depth(scene: Scene) -> float:
 
 @lru_cache(64)
 def _thresholds(admissible: float, order: int) -> Array:
-    """Return the admissible size of each term of a series, relative to that of its first term."""
+    """Return the admissible size of each term of a series, divided by the admissible size of the first term."""
     sizes: Array = admissible ** (np.arange(MAX_ORDER + 1) / order)
     return sizes
 
 
 def order_for(admissible: float) -> int:
-    """Return the series' order for an admissible error of a step, fitted to the fastest orders of the bench scenes."""
+    """Return the order of the series for an admissible error of a step. The formula fits measured optimal orders."""
     return int(min(MAX_ORDER, max(8, round(6.0 - math.log10(admissible)))))
 
 
 def _lacuna(exponent: float) -> int:
-    """Return how many consecutive orders can vanish: a force d^n gives a term only every n + 1 orders."""
+    """Return how many successive terms of a series can be zero. A force d^n has a term in every (n + 1)th order."""
     if not float(exponent).is_integer():
         return 6
     return 2 if exponent == 1.0 else int(exponent) + 1
 
 
 def per_mass(scene: Scene, wrench: Array) -> Array:
-    """Divide wrenches, shape (..., 3), by mass and inertia."""
+    """Return wrenches, shape (..., 3), divided by mass and inertia."""
     share: Array = np.asarray(wrench) / inertias(scene)
     return share
 
 
 def inertias(scene: Scene) -> Array:
-    """Return (mass, mass, inertia) in kg, kg, kg m^2, shape (3,)."""
+    """Return mass, mass and inertia of the head in kg, kg and kg m^2, shape (3,)."""
     return np.array([scene.head.mass_kg, scene.head.mass_kg, scene.head.inertia_kg_m2])
 
 
 def _segments(scene: Scene, pieces: Pieces) -> Segments:
-    """Return the linear pieces of a load divided by mass and inertia."""
+    """Return the linear pieces of a load, divided by mass and inertia."""
     segments = np.zeros(len(pieces.knots), SEGMENT)
     segments["knot"] = pieces.knots
     segments["start"], segments["slope"] = per_mass(scene, pieces.start), per_mass(scene, pieces.slope)
@@ -421,7 +417,7 @@ def _segments(scene: Scene, pieces: Pieces) -> Segments:
 
 
 def law_terms(contact: Contact) -> tuple[Terms, float]:
-    """Return the law's terms alone, and D of the factor D / v0 at touch speed v0 (-1 for a constant factor)."""
+    """Return the terms of the contact law, and D of its damping factor D / v0, or -1 for a constant factor."""
     law, exponent = LAWS[contact.law], float(contact.exponent)
     viscous = law.additive and bool(contact.damping)
     number = -1.0 if contact.restitution is None else law.damping_number(contact.restitution)
@@ -443,7 +439,7 @@ def _flags(present: dict[str, bool]) -> dict[str, int]:
 def _harmonics(head: Head, loads: LoadSet) -> tuple[Array, Harmonics | None]:
     """Return the directions of the harmonic forces S1 and S2, and the harmonic loads.
 
-    If all forces are parallel, S1 alone has their direction; otherwise S1 is along x and S2 along y.
+    If all forces are parallel, S1 has their direction and S2 is zero. Otherwise S1 is along x and S2 along y.
     """
     if loads.omega.size == 0:
         return np.eye(2), None
@@ -476,7 +472,7 @@ def _largest_wrench(loads: LoadSet) -> Array:
 
 
 def _swing(loads: LoadSet) -> Array:
-    """Return the sum of the harmonics' amplitudes, shape (3,)."""
+    """Return the sum of the amplitudes of the harmonic loads, shape (3,)."""
     swing: Array = np.hypot(loads.sine, loads.cosine).sum(axis=0)
     return swing
 
@@ -486,12 +482,12 @@ def _has_second(harmonics: Harmonics) -> bool:
 
 
 def _start_speed(scene: Scene) -> float:
-    """Return an upper bound of the head's speed at the start in m/s."""
+    """Return an upper bound of the head's initial speed in m/s."""
     return float(np.hypot(*scene.initial.v[:2])) + geometry.half_diagonal(scene) * abs(scene.initial.v[2])
 
 
 def _largest_acceleration(scene: Scene, wrench: Array) -> float:
-    """Return an upper bound in m/s^2 of the acceleration by gravity and by loads of at most `wrench`."""
+    """Return an upper bound of the acceleration in m/s^2 under gravity and under loads of at most `wrench`."""
     acceleration = per_mass(scene, wrench)
     across = abs(scene.gravity.acceleration_m_s2) + float(np.hypot(acceleration[0], acceleration[1]))
     return across + geometry.half_diagonal(scene) * float(acceleration[2])
@@ -500,31 +496,32 @@ def _largest_acceleration(scene: Scene, wrench: Array) -> float:
 def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
     """Return the penetration in m below which the impulse until separation is negligible.
 
-    A pair that separates from the penetration d at the speed v receives the impulse K d^(n+1) / ((n+1) v). It must be a
-    small share of the velocity tolerance, since there may be many separations, some of them a hundred times slower.
+    A pair that separates from the penetration d at the speed v receives the impulse K d^(n+1) / ((n+1) v). This impulse
+    must be small compared with the velocity tolerance, because there can be many separations, and some of them can be a
+    hundred times slower.
     """
     exponent = scene.contact.exponent
     share = 1e-5 if exponent == 1.5 or float(exponent).is_integer() else 1e-8
     impulse = share * tol * speed * scene.head.mass_kg
     release = float((impulse * (exponent + 1.0) * speed / scene.contact.stiffness) ** (1.0 / (exponent + 1.0)))
     if not float(exponent).is_integer():
-        # a depth of few rounding errors is noise, and the series of its power would have non-finite terms
+        # below a few rounding errors, a depth is noise, and the series of its power would have non-finite terms
         release = max(release, _NOISE * geometry.half_diagonal(scene))
     friction = scene.friction
     if friction is not None and friction.stick_stiffness_n_m is not None and friction.coefficient > 0.0:
-        # when a pair becomes RELEASED, the spring of its sticking corner ends too; the jump of the spring's force must
-        # therefore also be negligible
+        # when a pair becomes RELEASED, the force of the spring at its sticking corner jumps to zero, so this force must
+        # be negligible, too
         stretch = max(1e-3 * tol * length, 1e-15 * geometry.half_diagonal(scene))
         held = stretch * friction.stick_stiffness_n_m / friction.coefficient
-        # the depth is at least the distance that a corner covers in 1e-11 s; if a corner crossed it faster, its series
-        # would have non-finite terms
+        # a corner needs at least 1e-11 s to cross the depth; for a faster crossing, its series would have non-finite
+        # terms
         depth = max(float((held / scene.contact.stiffness) ** (1.0 / exponent)), 1e-11 * speed)
         release = min(release, depth)
     return release
 
 
 def _implicit(scene: Scene, terms: Terms, values: dict[str, Any]) -> Implicit | None:
-    """Return nodes and scratch space of implicit steps, or None if nothing can be overdamped."""
+    """Return nodes and scratch space of implicit steps, or None if the motion cannot be overdamped."""
     contact = scene.contact
     mobility = 1.0 / scene.head.mass_kg + values["radius"] ** 2 / scene.head.inertia_kg_m2
     if scene.support is not None:
@@ -541,14 +538,14 @@ def _implicit(scene: Scene, terms: Terms, values: dict[str, Any]) -> Implicit | 
     if terms.slip is not None:
         damping += values["friction"] * largest_force / values["slip_speed"]
     overdamped = damping * mobility > OVERDAMPED_RATIO * math.sqrt(spring * mobility)
-    # a support can be overdamped like a contact
+    # the motion on a support can be overdamped, too
     if scene.support is not None:
         overdamped |= bool((values["frame_damping"] > OVERDAMPED_RATIO * np.sqrt(values["frame_stiffness"])).any())
     return new_implicit(scene.support is not None) if overdamped else None
 
 
 def _rubbing(scene: Scene) -> dict[str, Any]:
-    """Return the constants of sliding and running-in (`solve.rubbing`), zeros if they are off."""
+    """Return the constants of in-plane sliding and running-in (`solve.rubbing`), if the scene has them."""
     wear, there, found = scene.wear, _wear_terms(scene.wear), dict[str, Any]()
     if wear is not None and there.get("sliding"):
         found["slip_rows"] = geometry.slip_rows(scene)
@@ -559,7 +556,7 @@ def _rubbing(scene: Scene) -> dict[str, Any]:
 
 
 def _slip(scene: Scene) -> dict[str, Any]:
-    """Return the constants of friction; without friction only the slip speed, a divisor, is not zero."""
+    """Return the constants of friction. Without friction, only the slip speed is set, because it is a divisor."""
     friction = scene.friction
     if friction is None:
         return {"slip_speed": 1.0}
@@ -575,7 +572,7 @@ def _slip(scene: Scene) -> dict[str, Any]:
 
 
 def _frame(scene: Scene) -> dict[str, Any]:
-    """Return the constants of a `Support`, zeros without one."""
+    """Return the constants of a `Support`, if the scene has one."""
     support = scene.support
     if support is None:
         return {}
@@ -586,5 +583,5 @@ def _frame(scene: Scene) -> dict[str, Any]:
 
 
 def wear_rate(wear: Wear, speed: float) -> float:
-    """Return a pad's wear depth per impulse, k_s v / A in m/(N s), at a speed along the face (Archard's law)."""
+    """Return the wear depth of a pad per impulse, k_s v / A in m/(N s), at a speed along the face (Archard's law)."""
     return wear.coefficient_m2_n * speed / wear.pad_area_m2

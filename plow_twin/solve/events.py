@@ -1,7 +1,7 @@
-"""The first event of a step.
+"""Detection of the first event of a step.
 
-A guard is a polynomial over the step that is positive as long as a pair keeps its mode. The event is at the first point
-where a guard turns negative, found by `polynomial.first_root`.
+A guard function is a polynomial over the step. It is positive as long as a pair keeps its mode. The first root of any
+guard function is the event. `polynomial.first_root` finds it.
 """
 
 from __future__ import annotations
@@ -13,26 +13,29 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.grip import grip_guard
 from plow_twin.solve.state import CLIPPED, CROSSING, OFF, ON, RATIO, RELEASED, SIGN
 
-#: Two events are simultaneous if the time between them is less than this share of the step that ends with them.
+#: Largest difference of the times of two simultaneous events, divided by the size of the step that ends with them.
 _AT_ONCE = 1e-12
-#: Penetration at which a pair changes from ON to RELEASED, as a share of `Params.release`. The pair is ON again at
-#: `Params.release` itself.
+#: Penetration at which a pair changes from ON to RELEASED, divided by `Params.release`. The pair changes back to ON at
+#: `Params.release`.
 LET_GO = 0.25
-#: Allowances for rounding in the proof that no guard turns negative: a factor on the sums of terms, and an absolute
-#: error of the guard 1 + lambda d'.
+#: Allowances for rounding in the proof that no guard function becomes negative: a factor for sums of terms, and an
+#: absolute error of the guard function 1 + lambda d'.
 _ROUNDED, _ROUNDING = 1.0 + 1e-9, 1e-9
 _ALL_PAIRS = 2**PAIR_COUNT - 1
-#: Penetration below which a RELEASED pair counts as resting on its wall, as a share of `Params.release`.
+#: Penetration below which a RELEASED pair is treated as resting on its wall, divided by `Params.release`.
 ON_THE_WALL = 1e-6
 
 
 @kernel(fast=True)
 def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
-    """Write each pair's first guard to `w.guard`.
+    """Write the first guard function of each pair to `w.guard`.
 
-    The guard of a pair that is OFF is -d, with the penetration d. The guard of a pair that is ON is F / K = d + (C / K)
-    d' for Kelvin-Voigt; for other laws it is d, less a small penetration if the exponent is not an integer. All other
-    guards are d.
+    The guard function depends on the mode and on the penetration d:
+
+    - OFF: -d.
+    - ON: F / K = d + (C / K) d' for Kelvin-Voigt, and d for all other laws. For exponents that are not integers, a
+      small penetration is subtracted.
+    - All other modes: d.
     """
     guard, weights = w.guard, w.per_pair
     for pair in range(PAIR_COUNT):
@@ -51,22 +54,25 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
     for pair in range(PAIR_COUNT):
         first = max(guard[0, pair], 0.0)
         if state.mode[pair] == ON:
-            # a pair becomes RELEASED at a quarter of the depth at which it is ON again; it therefore cannot alternate
-            # between the modes
+            # a pair becomes RELEASED at a quarter of the depth at which it becomes ON again, so that it cannot
+            # alternate between these modes
             first -= min(LET_GO * p.release, 0.5 * first)
         elif state.mode[pair] == RELEASED and first <= ON_THE_WALL * p.release:
-            # a RELEASED pair that rests on its wall parts a little outside the wall, at the depth -LET_GO * release;
-            # its guard is raised by this distance
+            # a RELEASED pair that rests on its wall separates at the depth -LET_GO * release, so its guard function is
+            # increased by this distance
             first = max(guard[0, pair] + LET_GO * p.release, 0.0)
         guard[0, pair] = first if p.enabled[pair] == 1 else 1.0
 
 
 @kernel()
 def _second_guard(p, state, w, order, pair, viscous, hysteretic, integer, fraction, ramp) -> bool:
-    """Write the second guard of a penetrating pair to `w.column[0]`; return whether it has one.
+    """Write the second guard function of a penetrating pair to `w.column[0]`. Return whether the pair has one.
 
-    For a pair that is ON the second guard is 1 + lambda d', or the force F with a ramp. For a CLIPPED pair it is
-    positive as long as the force would pull. For a RELEASED pair it is p.release - d.
+    The second guard function depends on the mode:
+
+    - ON: 1 + lambda d', or the force F for a law with a ramp.
+    - CLIPPED: the opposite of ON, which is positive as long as the force would pull.
+    - RELEASED: p.release - d.
     """
     g, mode = w.column[0], state.mode[pair]
     g[order] = 0.0
@@ -94,7 +100,7 @@ def _second_guard(p, state, w, order, pair, viscous, hysteretic, integer, fracti
 
 @kernel(inline="code")
 def elastic_term(p, w, k, pair, integer, fraction):
-    """Return order k of the series of d^n, with the penetration d of a pair."""
+    """Return coefficient k of the series of d^n, where d is the penetration of a pair."""
     if integer is not None:
         return w.power[int(p.exponent) - 2, k, pair]
     if fraction is not None:
@@ -104,7 +110,7 @@ def elastic_term(p, w, k, pair, integer, fraction):
 
 @kernel()
 def _pull(p, w, order, pair, mode, integer, fraction) -> None:
-    """Write the force of a ramped law to `w.column[0]`, with the opposite sign for a CLIPPED pair."""
+    """Write the force of a law with a ramp to `w.column[0]`, with the opposite sign for a CLIPPED pair."""
     g, sign = w.column[0], 1.0 if mode == ON else -1.0
     for k in range(order):
         elastic = elastic_term(p, w, k, pair, integer, fraction)
@@ -113,7 +119,7 @@ def _pull(p, w, order, pair, mode, integer, fraction) -> None:
 
 @kernel()
 def _ramp_guard(p, state, w, order, pair) -> None:
-    """Write to `w.column[0]` a guard that is positive while the pair stays on its side of the ramp's end."""
+    """Write to `w.column[0]` a guard function that is positive until the penetration crosses the end of the ramp."""
     g, sign = w.column[0], 1.0 if state.beyond_ramp[pair] == 1 else -1.0
     for k in range(order + 1):
         g[k] = sign * w.penetration[k, pair]
@@ -122,11 +128,10 @@ def _ramp_guard(p, state, w, order, pair) -> None:
 
 @kernel(fast=True)
 def _unsafe_pairs(w, order, h):
-    """Return a bit for each guard that may turn negative on [0, h].
+    """Return an integer with a bit for each pair whose guard function g may become negative on [0, h].
 
-    A guard stays positive if g_0 and g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are positive, because this lower
-    bound is concave in h. If this fails for any guard, the guards are tested by the sign of their Bernstein
-    coefficients.
+    The function g stays positive if g_0 and g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are positive, because this
+    lower bound is concave in h. If the test fails for any pair, the signs of the Bernstein coefficients are tested.
     """
     guard, b = w.guard, w.bernstein
     reach = splat(0.0)
@@ -148,11 +153,11 @@ def _unsafe_pairs(w, order, h):
 
 @kernel(fast=True)
 def _nothing_ends(p, state, w, order, h, penetrating, hysteretic) -> bool:
-    """Return whether every pair is proved to keep its mode on [0, h], for an integer exponent without a ramp.
+    """Return whether no pair changes its mode on [0, h], for an integer exponent without a ramp.
 
-    The function makes the first test of `_unsafe_pairs` and the test of `_stays` for all pairs side by side, without
-    credit for a rising linear term. An allowance for rounding makes sure that guards that pass this test would also
-    pass those two tests.
+    The function combines the first test of `_unsafe_pairs` with the test of `_stays`, for all pairs at once. It does
+    not count a positive linear term. The allowances for rounding ensure that every guard function that passes this test
+    would also pass the two other tests.
     """
     weights = w.per_pair
     for pair in range(PAIR_COUNT):
@@ -178,7 +183,7 @@ def _nothing_ends(p, state, w, order, h, penetrating, hysteretic) -> bool:
 
 @kernel(inline="code")
 def _next_mode(p, mode, viscous, fraction, ramp):
-    """Return the mode that follows `mode` when the pair's first guard turns negative."""
+    """Return the mode after `mode`, when the first guard function of a pair becomes negative."""
     if mode == OFF:
         return ON if fraction is None or p.exponent == 1.5 else RELEASED
     if mode == ON and viscous is not None and ramp is None:
@@ -188,7 +193,7 @@ def _next_mode(p, mode, viscous, fraction, ramp):
 
 @kernel()
 def _stays(column, order, h) -> bool:
-    """Return whether the lower bound of `_unsafe_pairs` proves that a guard does not turn negative on [0, h]."""
+    """Return whether the lower bound of `_unsafe_pairs` proves that a guard function stays positive on [0, h]."""
     reach = 0.0
     for k in range(order, 1, -1):
         reach = (reach + max(-column[k], 0.0)) * h
@@ -197,7 +202,7 @@ def _stays(column, order, h) -> bool:
 
 @kernel()
 def _sooner(state, w, order, best) -> float:
-    """Return the sigma at which the guard in `w.column[0]` first turns negative, or `best` if that comes first."""
+    """Return the sigma at which the guard function in `w.column[0]` first becomes negative, at most `best`."""
     column = w.column[0]
     if _stays(column, order, best):
         return best
@@ -207,7 +212,7 @@ def _sooner(state, w, order, best) -> float:
 
 @kernel()
 def _ends_with(column, order, at, within) -> bool:
-    """Return whether a guard that is positive before `at` turns negative no later than `within` after it."""
+    """Return whether a guard function that is positive before `at` becomes negative before `at` + `within`."""
     value, slope = column[order], 0.0
     for k in range(order - 1, -1, -1):
         slope = slope * at + value
@@ -217,7 +222,7 @@ def _ends_with(column, order, at, within) -> bool:
 
 @kernel(fast=True)
 def _guards_end_with(w, order, at, within):
-    """Return a bit for each pair whose first guard turns negative with the event at `at` (see `_ends_with`)."""
+    """Return an integer with a bit for each pair for whose first guard function `_ends_with` is true."""
     value, slope, zero = row(w.guard, order), splat(0.0), splat(0.0)
     for k in range(order - 1, -1, -1):
         slope = slope * at + value
@@ -229,9 +234,9 @@ def _guards_end_with(w, order, at, within):
 def note_switches(
     p, state, w, order, at, event, target, penetrating, viscous, hysteretic, integer, fraction, ramp, stick
 ) -> None:
-    """Write to `w.switch` the next mode of each pair that switches at the event, -1 for the others.
+    """Write to `w.switch` the next mode of each pair that changes its mode at the event, and -1 for all other pairs.
 
-    Pairs whose events differ in time only by rounding switch together, so that a symmetric motion stays symmetric.
+    Pairs whose events differ only by rounding change their modes together, so that a symmetric motion stays symmetric.
     """
     column, within = w.column[0], _AT_ONCE * at
     ending = _guards_end_with(w, order, at, within)
@@ -258,7 +263,7 @@ def note_switches(
 
 @kernel()
 def first_event(p, state, w, order, sigma, penetrating, viscous, hysteretic, integer, fraction, ramp, stick):
-    """Return (sigma, pair, next mode) of the first event in [0, sigma), or (sigma, -1, 0) without an event."""
+    """Return sigma, pair and next mode of the first event in [0, sigma), or (sigma, -1, 0) without an event."""
     if viscous is None and fraction is None and ramp is None and stick is None:  # noqa: SIM102 - left out by types
         if _nothing_ends(p, state, w, order, sigma, penetrating, hysteretic):
             return sigma, -1, 0
@@ -271,7 +276,7 @@ def first_event(p, state, w, order, sigma, penetrating, viscous, hysteretic, int
             for k in range(order + 1):
                 column[k], w.halves[0, k] = w.guard[k, pair], w.bernstein[k, pair]
             if _stays(column, order, best):
-                # this guard cannot turn negative before the event that has already been found
+                # this guard function cannot become negative before the event that has already been found
                 continue
             state.guard_roots += 1
             root = first_root_within(column, order, sigma, w)

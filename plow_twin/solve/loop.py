@@ -1,4 +1,4 @@
-"""The loop that takes one step after another and reads the motion at each time of output."""
+"""The main loop of the solver. It takes one step after another, and evaluates the motion at each output time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _BUDGET, _LOG_FULL, _PAUSED = int(Status.BUDGET), int(Status.LOG_FULL), int(Stat
 
 @kernel(inline="source")
 def _unowned_loads(parts):
-    """Return the parts with loads that are not reference counted; the caller keeps them alive."""
+    """Return the parts with loads that are not reference counted. The caller has to keep the loads alive."""
     return Parts(parts.terms, unowned(parts.harmonics), unowned(parts.segments), parts.implicit)
 
 
@@ -39,7 +39,7 @@ def _end(p, parts, state, w, totals, log) -> None:
 
 @kernel(inline="source")
 def _next(p, parts, state, w, stop_time, budget) -> int:
-    """Lay out the next step, unless the motion is within a step; return a `Status`."""
+    """Compute the next step, unless the current time is within a step. Return a `Status`."""
     if state.step_size >= 0.0:
         return _OK
     if state.steps >= budget:
@@ -51,9 +51,9 @@ def _next(p, parts, state, w, stop_time, budget) -> int:
 
 @kernel()
 def _present(p, harmonics, flight, support, state, w, y) -> None:
-    """Write the body coordinates at the present time to y, and the state of a frame on springs to `w`.
+    """Write the body coordinates at the current time to y, and the state of a frame on springs to `w`.
 
-    The present time may lie within a step.
+    The current time can be within a step.
     """
     if state.step_size >= 0.0:
         evaluate(p, harmonics, flight, support, state, w, sigma_at(state, state.elapsed), y)
@@ -65,9 +65,9 @@ def _present(p, harmonics, flight, support, state, w, y) -> None:
 
 @kernel()
 def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
-    """Advance the motion to `target`, by steps that may reach beyond it up to `stop_time`; return a `Status`.
+    """Advance the motion to `target`, and return a `Status`. Steps may extend beyond `target`, up to `stop_time`.
 
-    Without `totals` (None) no impulses, peaks and times are summed; the motion is the same.
+    If `totals` is None, impulses, peaks and times are not computed. The motion is the same.
     """
     while True:
         t0 = state.step_start
@@ -77,7 +77,7 @@ def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
         if code != _OK:
             return code
         low = sigma_at(state, state.elapsed)
-        # a step that ends at a stop may end a rounding error beyond it; this remainder must not become a further step
+        # rounding can place the stop time slightly beyond the end of the step; this rest must not become another step
         stopped = state.ends_at_stop == 1 and target >= state.stop_time
         if target < t0 + state.step_size and not stopped:
             if totals is not None:
@@ -92,7 +92,7 @@ def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
 
 @kernel()
 def _worn_at(state, w, wear, sigma, out) -> None:
-    """Write each pad's wear depth at the value `sigma` of the current step's variable."""
+    """Write each pad's wear depth at a value `sigma` of the step's series variable."""
     if wear is not None:
         wear_depth_at(state, w, sigma, out)
     else:
@@ -101,7 +101,7 @@ def _worn_at(state, w, wear, sigma, out) -> None:
 
 @kernel()
 def _worn_now(state, w, wear, out) -> None:
-    """Write each pad's wear depth at the present time, which may lie within a step."""
+    """Write each pad's wear depth at the current time, which can be within a step."""
     if state.step_size >= 0.0:
         _worn_at(state, w, wear, sigma_at(state, state.elapsed), out)
     else:
@@ -110,7 +110,7 @@ def _worn_now(state, w, wear, out) -> None:
 
 @kernel()
 def _clear(totals) -> None:
-    """Clear the sums of an advance."""
+    """Reset the sums of an advance to zero."""
     if totals is not None:
         set_row(totals.peak, 0, splat(0.0))
         set_row(totals.impulse, 0, splat(0.0))
@@ -121,9 +121,10 @@ def _clear(totals) -> None:
 
 @kernel()
 def _undo(support, state, w, target) -> None:
-    """Set the time to `target` after a failed advance, and the head to its place and wear before the advance.
+    """Undo a failed advance: set the time to `target`, and the head to its state and wear before the advance.
 
-    If the advance began within a step, this step ends there: `w.saved_y` has the place, `w.saved_wear` the wear.
+    If the advance began within a step, this step ends there. `w.saved_y` and `w.saved_wear` contain the saved state and
+    wear.
     """
     set_row(state.y, 0, row(w.saved_y, 0))
     set_row(state.wear_depth, 0, row(w.saved_wear, 0))
@@ -135,11 +136,11 @@ def _undo(support, state, w, target) -> None:
 
 @kernel()
 def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound, pace):
-    """Start or continue an advance to `target`; return a `Status` and the number of steps of the advance.
+    """Start or continue an advance to `target`. Return a `Status` and the number of steps of the advance.
 
-    If the advance fails, the time becomes `target`, the head keeps its state, and nothing is counted. `saved` is an
-    array of one record, for the state before the advance. If there is a `bound`, a used-up budget is no failure,
-    because the rest of the advance is computed by a few coarse steps.
+    If the advance fails, the time becomes `target`, but the state and the counts of the head are those before the
+    advance. `saved` is an array of one record for the state before the advance. With a `bound`, an advance that reaches
+    the largest number of steps does not fail, because a few Runge-Kutta steps complete it.
     """
     state = states[index]
     if pace.underway == 0:
@@ -172,7 +173,7 @@ def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budge
 
 @kernel()
 def _read_row(p, parts, state, w, totals, out) -> None:
-    """Write the state at the present time and the totals to a `ROW`, and clear the totals."""
+    """Write the state at the current time and the totals to a `ROW`, and reset the totals."""
     y = w.moved
     _present(p, parts.harmonics, parts.terms.flight, parts.terms.support, state, w, y)
     pose_of(p, y, parts.terms.offset, out.q, out.v)
@@ -192,13 +193,13 @@ def _begin_slice(pace) -> None:
 
 @kernel(inline="source")
 def _is_over(pace) -> bool:
-    """Return whether the slice of work is used up and no advance is under way."""
+    """Return whether the slice of work is used up and no advance is in progress."""
     return bool(pace.left <= 0 and pace.underway == 0)
 
 
 @kernel(inline="source")
 def _follow_line(piece, start, time, before, sample) -> None:
-    """Make the load linear from the sample `before` at time `start` to the next `sample` at `time`."""
+    """Set the load to a straight line from `before` at the time `start` to `sample` at the time `time`."""
     span = time - start
     piece.knot = start
     for j in range(3):
@@ -210,35 +211,36 @@ def _follow_line(piece, start, time, before, sample) -> None:
 def advance_rows(
     params, parts, states, saved, work, totals, first, last, times, wrench, budget, rows, marks, snapshots, bound, pace
 ) -> bool:
-    """Advance members `first` to `last` - 1 to each time; a twin alone gets the same bits as in a group.
+    """Advance the members `first` to `last` - 1 to each time. The bits of a result do not depend on other members.
 
     Parameters
     ----------
     params, states : ndarray of records, shape (m,)
         Constants and states of all members.
     saved, work, totals : ndarray of records, shape (1,)
-        The state before the present advance, scratch space and sums. Without `totals` (None) nothing is summed or read
-        out; the motion is the same.
+        State before the current advance, scratch space, and sums. If `totals` is None, no sums are computed and no rows
+        are written. The motion is the same.
     times : ndarray, shape (n,)
         Times in s, not decreasing.
     wrench : ndarray, shape (m, n + 1, 3), or None
-        Samples of the load per mass and inertia, joined by straight lines: the sample before the first time, then the
-        sample at each time. A step ends at each of these times. None for the scene's own loads.
+        Samples of the load, divided by mass and inertia. They are the sample before the first time, followed by the
+        sample at each time, and they are interpolated linearly. A step ends at each of these times. None for the loads
+        of the scene.
     rows : ndarray of `ROW`, shape (m, n), or None
-        Receives the motion and the totals at each time; None without totals.
+        Array that receives the motion and the totals at each time, or None without `totals`.
     marks : ndarray of int64, shape (k,)
-        Increasing numbers of advances, counted from 1, after which the state is copied.
+        Increasing numbers of advances, counted from 1. After each of these advances the state is copied.
     snapshots : ndarray of records, shape (k,)
-        Receives these copies.
+        Array that receives the copies of the state.
     bound : record of `BOUND`, or None
-        As in `_advance`.
+        Limit of the evaluations of each advance.
     pace : record of `PACE`
         Progress of the work, from which the call continues.
 
     Returns
     -------
     bool
-        Whether all advances are done; otherwise the caller checks its limits and calls again with the same `pace`.
+        Whether all advances are done. If not, the caller checks its limits and calls again with the same `pace`.
     """
     parts, states = _unowned_loads(parts), unowned(states)
     w, count = work[0], times.size
@@ -274,7 +276,7 @@ def advance_rows(
 
 @kernel(entry=True)
 def interrupt_step(p, parts, state, w, totals) -> None:
-    """End the current step at the present time, before a change from outside."""
+    """End the current step at the current time, before the caller changes the state or the parameters."""
     if state.step_size < 0.0:
         return
     state.sigma_end = sigma_at(state, state.elapsed)
@@ -288,17 +290,16 @@ def interrupt_step(p, parts, state, w, totals) -> None:
 
 @kernel(entry=True)
 def lay_out_again(p, parts, state, w) -> None:
-    """Compute the current step again after a restore, because its series are not part of the state.
+    """Compute the current step again after a snapshot was restored, because snapshots do not contain the step's series.
 
-    A saved state can lie within a step only if the loads are the scene's own, and steps under these loads have no stop
-    time.
+    A snapshot can be within a step only under the scene's own loads. Steps under these loads have no stop time.
     """
     if state.at_rest == 1:
         write_rest(p, state, w)
         return
     used, implicit = state.elapsed, parts.implicit
     if implicit is not None:
-        # the step is laid out a second time, so the fields that the first layout changed are restored
+        # the step is computed a second time, so the fields that the first computation changed are restored
         state.implicit_size, state.decay_times = state.implicit_size_before, state.decay_times_before
         state.refused = state.refused_before
     steps, evaluations, guard_roots = state.steps, state.evaluations, state.guard_roots
@@ -311,9 +312,9 @@ def lay_out_again(p, parts, state, w) -> None:
 
 @kernel()
 def _rows_in_flight(p, harmonics, flight, state, w, t, i, q, v, penetration, force):
-    """Fill the rows within a step of free flight from row i on; return the first row after it.
+    """Fill the output rows within a step of free flight, from row i on. Return the index of the first row after it.
 
-    This is a function of its own, because the loop over rows in `integrate` is a tenth faster without this branch.
+    With this code in a separate function, the loop over rows in `integrate` is a tenth faster.
     """
     if flight is not None:
         t0, y, rate = state.step_start, w.read_y, w.read_rate
@@ -330,9 +331,10 @@ def _rows_in_flight(p, harmonics, flight, state, w, t, i, q, v, penetration, for
 def integrate(
     p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penetration, force, frame, balance
 ) -> int:
-    """Advance to `t_end` and fill the rows of t, q, v, penetration, force from row `first[0]` on. Returns a `Status`.
+    """Advance to `t_end`, fill the output rows from row `first[0]` on, and return a `Status`.
 
-    `penetration`, `force`, `frame` (n, 6) and `balance` may be None. The steps do not depend on the rows' times.
+    The rows are the arrays t, q, v, `penetration`, `force` and `frame`, shape (n, 6). The last three arrays and
+    `balance` can be None. The steps do not depend on the output times.
     """
     parts, log, t = _unowned_loads(parts), unowned(log), unowned(t)
     q, v, pair_penetration, pair_force = unowned(q), unowned(v), unowned(penetration), unowned(force)

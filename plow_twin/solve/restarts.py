@@ -1,4 +1,4 @@
-"""Many runs of one scene in one compiled call, each from its own state over its own interval of time."""
+"""Many runs of one scene in one compiled call. Each run has its own initial state and time interval."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ _integrate = for_kernels(loop.integrate)
 
 @kernel(entry=True)
 def run_restarts(p, parts, states, w, totals, log, edges, budgets, t, q, v) -> int:
-    """Run state m through the times t[edges[m]:edges[m + 1]], and fill the same rows of q and v.
+    """Run state m through the times t[edges[m]:edges[m + 1]], and write the poses and rates to the same rows of q and
+    v.
 
-    The caller sets each state's place, rates and time; the modes of its pairs are chosen here. Returns the first
-    `Status` that is not OK, after which no further state is run.
+    The caller sets the coordinates, rates and time of each state; this function sets the modes of its pairs. If a run
+    fails, the function returns its `Status` and omits the remaining runs.
     """
     first = np.zeros(1, np.int64)
     for m in range(states.size):

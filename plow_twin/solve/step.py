@@ -1,7 +1,7 @@
-"""A step: its series, size, first event and totals, and the change of a mode at its end.
+"""A step of the solver: choice of the method, first event, and change of modes at the end of the step.
 
-Steps do not depend on the times at which output is wanted. A step ends at an event, at a knot of the load, or where its
-series is no longer accurate.
+Steps do not depend on the output times. A step ends at an event, at a knot of the load, or where its series is no
+longer accurate.
 """
 
 from __future__ import annotations
@@ -26,21 +26,19 @@ from plow_twin.solve.state import COS, CROSSING, OFF, ON, RELEASED, SIN, SLIPS_F
 from plow_twin.solve.totals import log_event
 from plow_twin.solve.tumbling import turn_at, turn_corners
 
-#: The methods in the order in which a step tries them; kernels call each by its name.
+#: Methods in the order in which a step tries them. The order also appears in `lay_out_step`, which calls them by name.
 METHODS: Final[tuple[Method, ...]] = (flight, rest, implicit, taylor)
-#: Longest step in s, so that every power of a step is finite.
+#: Longest step in s. This bound ensures that all powers of a step are finite.
 LONGEST_STEP = 100.0
-#: Size in sigma (the variable of the series) of the step that leads beyond an instant at which modes would otherwise
-#: change back and forth without end.
+#: Size, in sigma (the variable of the series), of the step that ends an endless alternation of modes at one time.
 PAST_AN_INSTANT = 1e-9
-#: Two times count as the same instant if their relative difference is at most this value, which covers a few rounding
-#: errors.
+#: Largest relative difference of two times that are treated as equal. It covers a few rounding errors.
 ONE_INSTANT = 1e-15
 
 
 @kernel()
 def _set_load(p, segments, state, w):
-    """Write the load at the step's start and its slope to `w.wrench`; return the time up to which they are valid."""
+    """Write the load at the start of the step and its slope to `w.wrench`. Return the time until which it is valid."""
     for j in range(3):
         w.wrench[0, j], w.wrench[1, j] = p.constant[j], 0.0
     if segments is None:
@@ -62,7 +60,7 @@ def _set_load(p, segments, state, w):
 
 @kernel()
 def _begin_step(p, segments, state, w, stop_time, viscous, fraction, ramp, stick):
-    """Begin the layout of a step; return its largest length and whether any pair penetrates."""
+    """Begin the computation of a step. Return its largest length in s, and whether any pair penetrates."""
     penetrating = weigh_pairs(p, state, w, viscous, fraction, ramp, stick)
     state.stop_time = min(stop_time, _set_load(p, segments, state, w))
     state.alpha, state.beta, state.elapsed, state.event_pair = 1.0, 0.0, 0.0, -1
@@ -72,7 +70,7 @@ def _begin_step(p, segments, state, w, stop_time, viscous, fraction, ramp, stick
 
 @kernel()
 def lay_out_step(p, parts, state, w, stop_time) -> bool:
-    """Lay out the next step, which ends at `stop_time` at the latest; return False if it is not finite."""
+    """Compute the next step, which ends at `stop_time` at the latest. Return False if its series is not finite."""
     terms = parts.terms
     span, penetrating = _begin_step(
         p, parts.segments, state, w, stop_time, terms.viscous, terms.fraction, terms.ramp, terms.stick
@@ -80,7 +78,7 @@ def lay_out_step(p, parts, state, w, stop_time) -> bool:
     if flight.lay_out(p, parts, flight.own(parts), state, w, span, penetrating) or rest.lay_out(
         p, parts, rest.own(parts), state, w, span, penetrating
     ):
-        # the head cannot reach a wall (flight), or does not leave its walls (rest)
+        # the head does not touch a wall during a flight, and does not leave its walls at rest
         state.step_size = state.sigma_end
     elif implicit.lay_out(p, parts, implicit.own(parts), state, w, span, penetrating) or taylor.lay_out(
         p, parts, taylor.own(parts), state, w, span, penetrating
@@ -96,7 +94,7 @@ def lay_out_step(p, parts, state, w, stop_time) -> bool:
 
 @kernel()
 def lay_out_series_step(p, parts, state, w, stop_time) -> bool:
-    """Lay out the next step by Taylor series, even if the head is in free flight or at rest."""
+    """Compute the next step by Taylor series, even in free flight or at rest. Return False if it is not finite."""
     terms = parts.terms
     span, penetrating = _begin_step(
         p, parts.segments, state, w, stop_time, terms.viscous, terms.fraction, terms.ramp, terms.stick
@@ -111,11 +109,11 @@ def lay_out_series_step(p, parts, state, w, stop_time) -> bool:
 
 @kernel()
 def _end_at_event(p, state, w, span, penetrating, law, stick) -> None:
-    """Shorten a laid-out step to end at its first event, if there is one, and compute its size in s."""
+    """Shorten a computed step so that it ends at its first event, and write its size in s."""
     sigma, order = state.sigma_end, state.order
     end, pair, target = first_event(p, state, w, order, sigma, penetrating, *law, stick)
     if pair >= 0 and state.events_at_once > p.max_events:
-        # modes change back and forth at one instant: step beyond it with the present modes
+        # modes alternate at one time: take a short step with the current modes
         state.recoveries += 1
         end, pair = max(end, min(sigma, PAST_AN_INSTANT)), -1
     turn = turn_at(p, state, w, order, end)
@@ -132,7 +130,7 @@ def _end_at_event(p, state, w, span, penetrating, law, stick) -> None:
 
 @kernel()
 def complete_step(p, harmonics, flight, support, state, w, totals, log, wear, fraction, stick) -> None:
-    """Move the state to the step's end and change the modes as its event requires; `totals` and `log` may be None."""
+    """Set the state to the end of the step, and change the modes of its event. `totals` and `log` may be None."""
     y = state.y
     sigma = state.sigma_end
     if wear is not None:
@@ -169,7 +167,7 @@ def complete_step(p, harmonics, flight, support, state, w, totals, log, wear, fr
 
 @kernel()
 def _switch(p, state, pair, new, totals, log, fraction, stick) -> None:
-    """Change the mode of a pair, and record the change in the totals and the log."""
+    """Change the mode of a pair, and record the change in the totals and in the log."""
     old = state.mode[pair]
     if stick is not None and new >= SLIPS_FORWARD:
         switch_grip(p, state, pair, new)
@@ -196,7 +194,7 @@ def _switch(p, state, pair, new, totals, log, fraction, stick) -> None:
                 state.mode[pair] = RELEASED
     if stick is not None and state.mode[pair] == ON and old != ON:
         grasp(p, state, pair, old)
-    # the log has no mode RELEASED, so a RELEASED pair counts as ON
+    # the log does not contain the mode RELEASED, so a RELEASED pair is logged as ON
     old, new = ON if old == RELEASED else old, ON if new == RELEASED else new
     if log is not None and old != new:
         log_event(log, totals, state.step_start, pair, old, new, penetration_and_rate(p, state, pair)[1])
