@@ -1,7 +1,8 @@
-"""Writer of one MCAP file; compiled code writes many messages at a time into chunks.
+"""Write MCAP files.
 
-Compiled code and compressors run without the interpreter lock. Each write is a whole record, so that the file of a
-killed process can be read up to its last chunk.
+Compiled functions write many messages at a time into a chunk. Like the compressors, they run without the lock of the
+Python interpreter. Each record is written to the file by a single call, so that the file of a killed process can be
+read up to the last chunk.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _INDEX_ENTRY: Final = np.dtype([("time", "<u8"), ("offset", "<u8")])
 
 
 class ChunkBuilder:
-    """The messages of a chunk that is being filled."""
+    """Buffer that collects the messages of a chunk."""
 
     def __init__(self, compression: str) -> None:
         self.compression = compression
@@ -53,7 +54,7 @@ class ChunkBuilder:
         length: Indexes,
         data: bytes,
     ) -> None:
-        """Add messages; arrays have shape (n,), and `data` has the bytes of all messages, one after the other."""
+        """Add n messages. The arrays have shape (n,), and `data` is the concatenation of all messages."""
         sizes = MESSAGE_HEAD + length
         ends = np.cumsum(sizes)
         starts = self.reserve(int(ends[-1]) if len(ends) else 0) + ends - sizes
@@ -71,14 +72,14 @@ class ChunkBuilder:
         stamp_ns: Indexes,
         values: Any,
     ) -> None:
-        """Write many messages of one template at places that `reserve` has returned."""
+        """Write messages of one template to the offsets `starts`, which `reserve` must have returned."""
         channels, length = np.full(len(starts), channel), np.full(len(starts), len(template))
         heads(self._buffer, starts, channels, sequence, log_time_ns, np.maximum(stamp_ns, 0), length)
         fill(self._buffer, starts + MESSAGE_HEAD, template.data, template.places, stamp_ns, values)
         self._note(channels, log_time_ns, starts)
 
     def reserve(self, size: int) -> int:
-        """Make room for `size` more bytes and return the offset of the first of them."""
+        """Enlarge the content by `size` bytes and return the offset of the first new byte."""
         place = self.size
         self.size += size
         if self.size > len(self._buffer):
@@ -88,7 +89,7 @@ class ChunkBuilder:
         return place
 
     def clear(self) -> None:
-        """Drop all messages."""
+        """Discard all messages."""
         self.size, self._channels, self._times, self._offsets = 0, [], [], []
 
     def _note(self, channel: Indexes, time_ns: Indexes, offset: Indexes) -> None:
@@ -97,8 +98,9 @@ class ChunkBuilder:
         self._offsets.append(offset)
 
     def pop(self) -> tuple[Bytes, dict[int, Any]]:
-        """Return the records and the index of each channel (times and offsets, in order of time), and empty the
-        builder.
+        """Return the records and the index of each channel, and empty the builder.
+
+        An index consists of the times and offsets of the messages, sorted by time.
         """
         channels, times, offsets = map(np.concatenate, (self._channels, self._times, self._offsets))
         index = {}
@@ -115,7 +117,7 @@ class ChunkBuilder:
 
 @compiled
 def heads(buffer, starts, channel, sequence, log_time, publish_time, length):  # type: ignore[no-untyped-def]
-    """Write the heads of messages: opcode, length, channel, sequence and times."""
+    """Write the head of each message: opcode, length, channel, sequence number and times."""
     for n in range(starts.size):
         start, size = starts[n], length[n] + 22
         set_word(buffer, start, 5 | size << 8)
@@ -126,7 +128,7 @@ def heads(buffer, starts, channel, sequence, log_time, publish_time, length):  #
 
 @compiled
 def spread(buffer, starts, length, data):  # type: ignore[no-untyped-def]
-    """Copy the messages in `data`, which follow each other, to the offsets `starts` of `buffer`."""
+    """Copy the concatenated messages in `data` to the offsets `starts` in `buffer`."""
     place = 0
     for n in range(starts.size):
         start, end = starts[n], place + length[n]
@@ -135,10 +137,10 @@ def spread(buffer, starts, length, data):  # type: ignore[no-untyped-def]
 
 
 class McapFile:
-    """An MCAP file that is being written to `out`.
+    """Writer of an MCAP file to the stream `out`.
 
-    Every method may raise `OSError` (disk full). The bytes of a failed `chunk` are removed and its messages are lost;
-    after any other failed method `out` must be closed.
+    Every method raises `OSError` if the disk is full. After a failed call of `chunk`, the messages of the chunk are
+    lost and the file is as before the call. After any other failed call, `out` must be closed.
     """
 
     def __init__(self, out: ByteFile, library: str) -> None:
@@ -148,7 +150,7 @@ class McapFile:
         self._schemas: dict[str, Any] = {}
         self._channels: dict[int, Any] = {}
         self._undeclared: list[Any] = []
-        # A live run writes some thousand chunks an hour. Bytes take a tenth of the memory of objects.
+        # a live run writes thousands of chunks an hour, and bytes take a tenth of the memory of objects
         self._chunk_index = bytearray()
         self._chunk_count = 0
         self._metadata: list[Any] = []
@@ -159,17 +161,17 @@ class McapFile:
 
     @property
     def size(self) -> int:
-        """Bytes written so far [B]."""
+        """Size of the file so far [B]."""
         return self.out.tell()
 
     @property
     def counts(self) -> Counter[int]:
-        """Number of messages by channel."""
+        """Number of messages of each channel."""
         return self._counts
 
     @property
     def times(self) -> tuple[int, int]:
-        """First and last log time [ns], or (0, 0) if there are no messages."""
+        """First and last log time [ns], or (0, 0) without messages."""
         return (min(self._times), max(self._times)) if self._times else (0, 0)
 
     def _write(self, record: Any) -> int:
@@ -186,7 +188,7 @@ class McapFile:
         self._metadata.append(MetadataIndex(offset=offset, length=length, name=name))
 
     def channel(self, topic: str, message_type: str, schema: bytes, metadata: Mapping[str, str]) -> int:
-        """Add a channel and return its number; the file declares it before the next chunk."""
+        """Add a channel and return its number. The channel is declared in the file before the next chunk."""
         from mcap.records import Channel, Schema
 
         if message_type not in self._schemas:
@@ -205,7 +207,7 @@ class McapFile:
         return number
 
     def chunk(self, builder: ChunkBuilder) -> None:
-        """Write a chunk and its index; an empty chunk is not written."""
+        """Write the messages of a builder as a chunk with its index; an empty chunk is not written."""
         if not builder.size:
             return
         content, index = builder.pop()
@@ -257,7 +259,7 @@ class McapFile:
         self._chunk_index += _records_bytes([entry])
 
     def finish(self) -> None:
-        """Write the index and the end of the MCAP file."""
+        """Write the index, the footer and the final magic bytes."""
         from mcap.opcode import Opcode
         from mcap.records import DataEnd, Footer, Statistics, SummaryOffset
 
@@ -311,7 +313,7 @@ def _compress(compression: str, content: Bytes) -> bytes:
     if compression == "lz4":
         import lz4.frame
 
-        # independent blocks are decompressed in two thirds of the time of linked blocks, and take 1 % more space
+        # independent blocks are decompressed faster than linked blocks, and take only 1 % more space
         return bytes(lz4.frame.compress(content, block_linked=False))
     import zstandard
 
@@ -319,7 +321,10 @@ def _compress(compression: str, content: Bytes) -> bytes:
 
 
 class UnbufferedFile:
-    """A file without a buffer: after a write has failed on a full disk, no bytes are left to be written."""
+    """A new file without a buffer.
+
+    After a failed write to a full disk, a buffered file would try to write the rest of its buffer again.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -334,7 +339,7 @@ class UnbufferedFile:
         self._open = True
 
     def write(self, data: bytes) -> None:
-        """Write all bytes of `data`."""
+        """Append all bytes of `data`."""
         view = memoryview(data)
         while view:
             with naming(self._path):
@@ -343,21 +348,21 @@ class UnbufferedFile:
             view = view[count:]
 
     def tell(self) -> int:
-        """Return the bytes written so far."""
+        """Return the size of the file [B]."""
         return self._offset
 
     def truncate(self, size: int) -> None:
-        """Truncate to a size."""
+        """Truncate the file to `size` bytes."""
         os.ftruncate(self._descriptor, size)
         os.lseek(self._descriptor, size, os.SEEK_SET)
         self._offset = size
 
     def sync(self) -> None:
-        """Wait for the disk."""
+        """Wait until all data are on the disk."""
         os.fdatasync(self._descriptor)
 
     def is_linked(self) -> bool:
-        """Return whether the path still leads to this file."""
+        """Return whether the file still exists at its path."""
         try:
             return os.path.samestat(os.fstat(self._descriptor), os.stat(self._path))
         except FileNotFoundError:
@@ -377,15 +382,15 @@ class MemoryFile:
         self.content = bytearray()
 
     def write(self, data: bytes) -> None:
-        """Write all bytes of `data`."""
+        """Append all bytes of `data`."""
         self.content += data
 
     def tell(self) -> int:
-        """Return the bytes written so far."""
+        """Return the size of the file [B]."""
         return len(self.content)
 
     def truncate(self, size: int) -> None:
-        """Truncate to a size."""
+        """Truncate the file to `size` bytes."""
         del self.content[size:]
 
     def sync(self) -> None:
@@ -399,5 +404,5 @@ class MemoryFile:
         """Do nothing."""
 
 
-#: Destination of a recording's bytes.
+#: A file to which a recording can be written.
 ByteFile: TypeAlias = UnbufferedFile | MemoryFile

@@ -1,10 +1,14 @@
-"""Measured loads and motions for the estimate, read from a folder, a run, or any recording by a mapping.
+"""Read measured loads and motions, which an estimate needs, from a folder of tables, a run, or another recording.
 
-A folder contains scene.yaml, load.csv (t, fx, fy, m) and pose.csv (t, x, y, theta). If gaps were measured, it also
-contains gaps.csv (t and columns named after pairs), and pose.csv may be missing. contact_forces.csv is optional and has
-the columns of gaps.csv. Each table may be a Parquet file instead, such as load.parquet.
+A folder of tables contains these files:
 
-A *stretch* is a part of the load without missing samples.
+- scene.yaml
+- load.csv with the columns t, fx, fy and m
+- pose.csv with the columns t, x, y and theta; it may be missing if gaps.csv exists
+- optionally gaps.csv with the column t and columns that are named after pairs
+- optionally contact_forces.csv with the same columns as gaps.csv
+
+Each table may be a Parquet file instead, such as load.parquet.
 """
 
 from __future__ import annotations
@@ -46,14 +50,15 @@ FORCES_FILE = "contact_forces.csv"
 _LOAD_COLUMNS: Final = ("t", "fx", "fy", "m")
 _POSE_COLUMNS: Final = ("t", "x", "y", "theta")
 _NOT_STATED: Final = (math.nan,) * 3
-#: Largest number of rows that are kept of a table; a load then takes 320 MB and covers nearly three hours at 1 kHz.
+#: Largest number of rows of a table in memory. A load of this length takes 320 MB; at 1 kHz it covers almost three
+#: hours.
 MOST_ROWS: Final = 10_000_000
-#: Key of the losses for rows that were dropped because they are older.
+#: Key under which the losses contain the number of rows that were dropped because of `MOST_ROWS`.
 OLDER_ROWS: Final = "older_rows"
 
 
 class _Rows:
-    """The newest `MOST_ROWS` rows of a table; up to a quarter more wait to be dropped."""
+    """Table that keeps only the newest `MOST_ROWS` rows, and sometimes up to a quarter more until it drops them."""
 
     def __init__(self, columns: int) -> None:
         self._columns, self._values = columns, array("d")
@@ -64,7 +69,7 @@ class _Rows:
         return self.dropped + len(self._values) // self._columns
 
     def add(self, values: Iterable[float] | Array) -> None:
-        """Add the numbers of one row, or an array of rows, shape (n, columns)."""
+        """Append the numbers of one row, or an array of rows with shape (n, columns)."""
         if isinstance(values, np.ndarray):
             self._values.frombytes(values.tobytes())
         else:
@@ -73,7 +78,7 @@ class _Rows:
             self._cut()
 
     def table(self) -> Array:
-        """Return the rows, shape (n, columns); no row may be added afterwards."""
+        """Return the rows, shape (n, columns). After this call, no row may be added."""
         self._cut()
         return np.asarray(self._values, dtype=np.float64).reshape(-1, self._columns)
 
@@ -93,17 +98,17 @@ class Measured:
     load : ndarray, shape (n, 4)
         t [s] and the measured load Fx, Fy [N], M [N m].
     poses : ndarray, shape (k, 4)
-        t [s] and x, y [m], theta [rad], NaN for an empty cell.
+        t [s] and x, y [m], theta [rad]. An empty cell is NaN.
     unreadable : int
         Number of rows and messages that could not be read or used.
     pose_deviation, load_deviation : tuple of float
-        Standard deviations of x, y [m], theta [rad] and of Fx, Fy [N], M [N m] that the run states, 0 if not stated.
+        Standard deviations from the run: x, y [m] and theta [rad], and Fx, Fy [N] and M [N m]. A missing value is 0.
     gaps : ndarray, shape (m, 9)
-        t [s] and the gaps of the eight pairs [m], NaN without a sensor.
+        t [s] and the gaps of the eight pairs [m]. The gap of a pair without a sensor is NaN.
     gaps_deviation : float
-        Standard deviation of the gaps that the run states [m], 0 if not stated.
+        Standard deviation of the gaps from the run [m]. A missing value is 0.
     lost : mapping of str to int
-        Counts by reason; their sum is `unreadable`.
+        Counts of the losses by reason. The sum of the counts is `unreadable`.
     forces : ndarray, shape (m, 9)
         t [s] and the contact forces of the eight pairs [N].
     """
@@ -121,14 +126,14 @@ class Measured:
 
 
 def read_measured(folder: Path, scene: Path | None = None) -> Measured:
-    """Read the measurements in a folder; the file `scene`, if given, replaces the folder's scene.yaml.
+    """Return the measurements in a folder of tables. If the file `scene` is given, it replaces scene.yaml.
 
     Raises
     ------
     RecordingError
         A file or a column is missing.
     SceneError
-        The scene cannot be used.
+        The scene is invalid.
     """
     lost = Counter[str]()
     load = _read(_table(folder, LOAD_FILE), lost, _LOAD_COLUMNS)
@@ -142,36 +147,37 @@ def read_measured(folder: Path, scene: Path | None = None) -> Measured:
         poses = _read(file, lost, _POSE_COLUMNS)
     model = load_scene(scene_path(str(scene)) if scene else folder / SCENE_FILE)
     if len(load) and load[0, 0] >= EPOCH_S:
-        # times count from the first sample of the load
+        # time is counted from the first sample of the load
         for table in (poses, gaps, forces, load):
             table[:, 0] -= load[0, 0]
     return Measured(model, load, poses, lost.total(), gaps=gaps, lost=dict(lost), forces=forces)
 
 
 def is_measured(folder: Path) -> bool:
-    """Return whether a folder has a table of the load."""
+    """Return whether a folder contains a table of the load."""
     return _table(folder, LOAD_FILE).is_file()
 
 
 def _table(folder: Path, name: str) -> Path:
-    """Return the path of a table, which is the Parquet file if there is no CSV file."""
+    """Return the path of a table: the CSV file or, if it is missing, the Parquet file."""
     file = folder / name
     other = file.with_suffix(SUFFIX)
     return other if other.is_file() and not file.is_file() else file
 
 
 def read_recording(path: Path, scene: Path | None = None, mapping: Path | None = None) -> Measured:
-    """Read a run by its journal, or another recording (MCAP, rosbag2's sqlite3, CSV) by the mapping.
+    """Return the measurements in a recording, in which time is counted from the first sample of the load.
 
-    A pose that is not in the journal of a run is read from the other topics in the run's folder and in its subfolders
-    `beside`, `beside_2`, .... Times count from the first sample of the load.
+    The measurements of a run are read from its journal. If the journal contains no pose, the poses are read from other
+    topics in the folder of the run and its subfolders `beside`, `beside_2`, .... Any other recording is read through
+    the mapping.
 
     Raises
     ------
     RecordingError
-        A recording cannot be read, or has no load or no pose.
+        The recording cannot be read, or it contains no load or no pose.
     SceneError
-        The scene cannot be used.
+        The scene is invalid.
     """
     own, deviations = own_run(path), (UNSTATED, UNSTATED)
     if own is None:
@@ -195,7 +201,7 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
             folder = path if path.is_dir() else path.parent
             places = [folder, *readable_beside(folder, lost)]
             rows, _, unread, why = _collect(places, mapping, ("head_pose", "forces"), own.header.node)
-            unread.pop("missing_parts", 0)  # the run has already counted its missing parts
+            unread.pop("missing_parts", 0)  # missing parts are counted below, in `own.lost_parts`
             lost.update(unread)
         lost.update(own.lost, damaged_chunks=own.damaged_chunks, **own.lost_parts)
     poses = rows["head_pose"]
@@ -213,11 +219,22 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
 
 
 def _journal(reader: RunReader, lost: Counter[str]) -> tuple[Array, list[int], Array, Array, Array, Array]:
-    """Return the samples, the rows before which samples are missing, the poses, the gaps, and the stated deviations.
+    """Return the measurements in the journal of a run.
 
-    The first column of each table is the stamp [ns]. The deviations are the largest of the load, shape (3,), and those
-    of each pose, shape (n, 3), NaN if not stated. Data from before a change of the pads or a step of the clock are left
-    out.
+    Data before a change of the pads, or before a step of the clock, are omitted.
+
+    Returns
+    -------
+    loads : ndarray, shape (n, 4)
+        Stamp [ns] and load of each sample.
+    begins : list of int
+        Rows of `loads` before which samples are missing.
+    poses, gaps : ndarray, shape (k, 4) and (m, 9)
+        Stamp [ns] and values of each measurement.
+    spread : ndarray, shape (3,)
+        Largest standard deviation of the load that the journal contains.
+    deviations : ndarray, shape (k, 3)
+        Standard deviation of each pose, NaN if the journal does not contain it.
     """
     loads, poses, gaps = _Rows(4), _Rows(7), _Rows(1 + PAIR_COUNT)
     holes, begins, spread = Holes(), list[int](), np.zeros(3)
@@ -247,10 +264,10 @@ def _journal(reader: RunReader, lost: Counter[str]) -> tuple[Array, list[int], A
 
 
 def _longest(rows: Array, begins: list[int]) -> Array:
-    """Return the longest stretch of a load.
+    """Return the longest part of a load without missing samples.
 
-    A stretch ends at a row of `begins` if the gap before this row is long: samples were lost there, so the load is
-    unknown.
+    At the rows `begins`, samples are missing. If the missing time is long, the load in it is unknown, and the load is
+    split there.
     """
     if len(rows) < 2:
         return rows
@@ -264,9 +281,18 @@ def _longest(rows: Array, begins: list[int]) -> Array:
 def _collect(
     places: list[Path], mapping: Path | None, wanted: tuple[str, ...], node: str
 ) -> tuple[dict[str, Array], list[int], Counter[str], str]:
-    """Return the rows of each wanted role, the rows of the load before which messages are missing, and the losses.
+    """Return the messages of the wanted roles in several recordings.
 
-    The first column of each table is the stamp [ns]. The last result says why messages do not fit their roles.
+    Returns
+    -------
+    tables : dict of ndarray
+        Stamp [ns] and values of each message, for each role.
+    begins : list of int
+        Rows of the load before which messages are missing.
+    lost : Counter
+        Losses by reason.
+    why : str
+        Reasons why messages do not fit their roles, for an error message.
     """
     rows = {name: _Rows(1 + len(ROLES[name])) for name in wanted}
     lost, begins = Counter[str](), list[int]()
@@ -288,9 +314,10 @@ def _collect(
 
 
 def _read(path: Path, lost: Counter[str], columns: tuple[str, ...], some: tuple[str, ...] = ()) -> Array:
-    """Return the rows of a table, NaN for an empty cell; rows that could not be read are counted in `lost`.
+    """Return the rows of a table; an empty cell is NaN, and invalid rows are counted in `lost`.
 
-    All of `columns` and at least one column of `some` are required; other missing columns of `some` are NaN.
+    The table must have all columns in `columns` and at least one of the columns in `some`. A missing column of `some`
+    is filled with NaN.
     """
     header, rows = read_table(path)
     names = list(header.names)
@@ -316,7 +343,7 @@ def _read(path: Path, lost: Counter[str], columns: tuple[str, ...], some: tuple[
 
 
 def _counted(rows: _Rows, lost: Counter[str]) -> Array:
-    """Return the table of the kept rows and count the dropped rows in `lost`."""
+    """Return the table of the rows, and add the number of dropped rows to `lost`."""
     table = rows.table()
     if rows.dropped:
         lost[OLDER_ROWS] += rows.dropped

@@ -1,4 +1,4 @@
-"""Merging of the messages of separately written files by their stamps."""
+"""Merge the messages from several files by their stamps."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ from typing import Final, TypeAlias, TypeVar
 
 T = TypeVar("T")
 
-#: A function that returns the stamp of a message [ns], or None.
+#: Function that returns the stamp of a message [ns], or None for a message without a stamp.
 StampOf: TypeAlias = Callable[[T], int | None]
 
-#: A stamp older than the newest stamp by more than this [ns] is a step of the clock; otherwise the row is late.
+#: Largest delay [ns] of a late message behind the newest stamp. A larger difference means that the clock was set back.
 _STEP_NS: Final = 1_000_000_000
-#: A stamp newer than the newest stamp by more than this [ns] may be wrong; the next stamp decides.
+#: Largest plausible increase from one stamp to the next [ns]. After a larger increase, the following stamp shows
+#: whether the stamp was wrong.
 _JUMP_NS: Final = 10_000_000_000
 
 
 def merged(streams: Iterable[Iterator[T]], stamp_ns: StampOf[T]) -> Iterator[T]:
-    """Yield the messages of all streams in the order of their stamps; each stream keeps its own order.
+    """Yield the messages of all streams in the order of their stamps, without a change of order within a stream.
 
-    A message without a stamp, or with a single wrong stamp, keeps its place in its stream. After its clock has stepped
-    back, a stream waits until the clocks of the other streams have stepped back too.
+    A message without a stamp, or with a single wrong stamp, follows its predecessor in the stream. When the clock of a
+    stream steps back, the other streams are read up to the same step before this stream continues.
     """
     for _, _, arrived in heapq.merge(*(_placed(stream, stamp_ns) for stream in streams), key=lambda item: item[:2]):
         yield arrived
@@ -43,7 +44,7 @@ def _placed(stream: Iterator[T], stamp_ns: StampOf[T]) -> Iterator[tuple[int, in
 
 
 def _is_stray(stamp: int, newest: int, following: int | None) -> bool:
-    """Return whether only this stamp is wrong: the next stamp continues the earlier stamps."""
+    """Return whether a stamp is a single wrong stamp, after which the stamps continue as before."""
     if following is None:
         return False
     back = newest - stamp > _STEP_NS

@@ -1,6 +1,6 @@
-"""Messages of the node and of its journal, as plain immutable values without ROS.
+"""Messages of the node and of the journal as immutable Python objects, without a ROS installation.
 
-Each class is one ROS 2 message type (`TYPE`). Stamps are integer nanoseconds.
+Each class represents the ROS 2 message type `TYPE`. Stamps are integers in nanoseconds.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ _ZERO36: Final[Float64s] = np.zeros(36)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointState:
-    """Named numbers: `position`, `velocity` and `effort` each have the length of `name` or are empty.
+    """Named numbers. The arrays `position`, `velocity` and `effort` are as long as `name`, or empty.
 
-    The sender must not change the arrays afterwards.
+    The arrays must not be changed after the message has been created.
     """
 
     TYPE: ClassVar = "sensor_msgs/msg/JointState"
@@ -36,9 +36,10 @@ class JointState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Odometry:
-    """Pose in the frame `frame_id` and twist in `child_frame_id`; `orientation` is the quaternion (x, y, z, w).
+    """Pose in the frame `frame_id`, and twist in the frame `child_frame_id`.
 
-    Covariances are row-major 6 x 6 over (x, y, z, rotation about x, y, z); all zeros: unknown.
+    `orientation` is the quaternion (x, y, z, w). A covariance is the row-major 6 x 6 matrix of (x, y, z, rotation about
+    x, y, z); a matrix of zeros means that the covariance is unknown.
     """
 
     TYPE: ClassVar = "nav_msgs/msg/Odometry"
@@ -56,7 +57,7 @@ class Odometry:
 
 @dataclass(frozen=True, slots=True)
 class DiagnosticStatus:
-    """A state: `level` 0 OK, 1 WARN, 2 ERROR, 3 STALE, a message, and key/value pairs."""
+    """Status of a component. `level` is 0 (OK), 1 (WARN), 2 (ERROR) or 3 (STALE)."""
 
     TYPE: ClassVar = "diagnostic_msgs/msg/DiagnosticStatus"
 
@@ -69,7 +70,7 @@ class DiagnosticStatus:
 
 @dataclass(frozen=True, slots=True)
 class WrenchStamped:
-    """Force [N] and moment [N m] about the cavity's centre."""
+    """Force [N], and moment [N m] about the centre of the cavity."""
 
     TYPE: ClassVar = "geometry_msgs/msg/WrenchStamped"
 
@@ -81,7 +82,7 @@ class WrenchStamped:
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """One line of text."""
+    """A line of text."""
 
     TYPE: ClassVar = "std_msgs/msg/String"
 
@@ -90,7 +91,7 @@ class Text:
 
 @dataclass(frozen=True, slots=True)
 class Integers:
-    """Unsigned integers of 64 bits."""
+    """Unsigned 64-bit integers."""
 
     TYPE: ClassVar = "std_msgs/msg/UInt64MultiArray"
 

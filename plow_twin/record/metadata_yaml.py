@@ -1,4 +1,4 @@
-"""The `metadata.yaml` of rosbag2 in Jazzy (version 9), and the QoS texts inside MCAP files."""
+"""Read and write `metadata.yaml` of rosbag2 in ROS 2 Jazzy (version 9), and the QoS texts in MCAP files."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from plow_twin.stream.topics import TOPICS
 
 METADATA_VERSION: Final = 9
 _INFINITE: Final = {"sec": 9223372036, "nsec": 854775807}
-#: Prefix of the keys in `custom_data` that count lost messages by topic.
+#: Prefix of the keys in `custom_data` whose values are numbers of lost messages. The topic follows the prefix.
 _LOST: Final = "plow_twin_lost "
 
 
 @dataclass
 class TopicCount:
-    """A topic of a recording and its number of messages; an empty QoS or type hash is filled in."""
+    """A topic of a recording and its number of messages. `bag_metadata` replaces an empty QoS or type hash."""
 
     topic: str
     message_type: str
@@ -32,7 +32,10 @@ class TopicCount:
 
 
 def qos_profile(base_name: str) -> dict[str, Any]:
-    """Return the QoS that the node offers on a topic (by base name); other topics are reliable with depth 10."""
+    """Return the QoS that the node offers on the topic with this base name.
+
+    For other topics, the QoS is reliable with depth 10.
+    """
     for topic in TOPICS:
         if topic.name == base_name:
             return offered(True, topic.latched, topic.depth)
@@ -40,7 +43,7 @@ def qos_profile(base_name: str) -> dict[str, Any]:
 
 
 def offered(reliable: bool, latched: bool, depth: int) -> dict[str, Any]:
-    """Return a QoS profile in the form in which rosbag2 writes it."""
+    """Return a QoS profile in the format of rosbag2."""
     return {
         "history": "keep_last",
         "depth": depth,
@@ -55,13 +58,13 @@ def offered(reliable: bool, latched: bool, depth: int) -> dict[str, Any]:
 
 
 def qos_text(base_name: str) -> str:
-    """Return the QoS of a topic as the text of its channel in an MCAP file."""
+    """Return the QoS of a topic as the YAML text that its channel in an MCAP file contains."""
     return dump_yaml([qos_profile(base_name)], flow=False).strip()
 
 
 @dataclass(frozen=True)
 class PartFacts:
-    """A file of a recording: first and last receive time [ns], and its topics."""
+    """A file of a recording, with the first and last receive time [ns] and the topics."""
 
     name: str
     start_ns: int
@@ -72,7 +75,10 @@ class PartFacts:
 def bag_metadata(
     parts: Sequence[PartFacts], lost: Mapping[str, int], custom: Mapping[str, str] = MappingProxyType({})
 ) -> dict[str, Any]:
-    """Return the content of `metadata.yaml` for the files of a recording, in order, and its losses by topic."""
+    """Return the content of `metadata.yaml` for the files `parts` of a recording, in order.
+
+    `lost` is the number of lost messages by topic, and `custom` contains further entries of `custom_data`.
+    """
     totals: dict[str, TopicCount] = {}
     for part in parts:
         for topic in part.topics:
@@ -121,12 +127,12 @@ def bag_metadata(
 
 
 def listed_parts(folder: Path) -> list[str]:
-    """Return the files that `metadata.yaml` names.
+    """Return the names of the files in `metadata.yaml`.
 
     Raises
     ------
     RecordingError
-        The file is not the metadata of a bag.
+        `metadata.yaml` is not the metadata of a bag.
     """
     path = folder / "metadata.yaml"
     try:
@@ -141,7 +147,7 @@ def _information(folder: Path) -> Any:
 
 
 def _parsed(read: tuple[Any, list[Problem]]) -> Any:
-    """Return the document, or raise `RecordingError` if reading it found problems."""
+    """Return the parsed document, or raise `RecordingError` if it has problems."""
     document, problems = read
     if problems:
         raise RecordingError(f"{problems[0]}")
@@ -149,7 +155,10 @@ def _parsed(read: tuple[Any, list[Problem]]) -> Any:
 
 
 def recorded_losses(folder: Path) -> dict[str, int]:
-    """Return the losses by topic in `metadata.yaml`; empty if the file cannot be read."""
+    """Return the number of lost messages by topic from `metadata.yaml`.
+
+    The result is empty if the file is missing or invalid.
+    """
     try:
         custom = _information(folder)["custom_data"] or {}
         return {key.removeprefix(_LOST): int(count) for key, count in custom.items() if key.startswith(_LOST)}
@@ -158,12 +167,12 @@ def recorded_losses(folder: Path) -> dict[str, int]:
 
 
 def missing_files(folder: Path, without: Collection[str] = ()) -> list[str]:
-    """Return the files that `metadata.yaml` names and that are missing or in `without`."""
+    """Return the files in `metadata.yaml` that do not exist or that `without` contains."""
     try:
         listed = listed_parts(folder)
     except RecordingError:
         return []
-    # old versions of rosbag2 write the folder's name before the file's name
+    # in `metadata.yaml` of old versions of rosbag2, the name of the folder precedes the name of the file
     return [
         name
         for name in listed
@@ -172,7 +181,7 @@ def missing_files(folder: Path, without: Collection[str] = ()) -> list[str]:
 
 
 def write_metadata(folder: Path, metadata: Mapping[str, Any], *, sync: bool = False) -> None:
-    """Write `metadata.yaml` in one step; with `sync` wait for the disk."""
+    """Replace `metadata.yaml` atomically; with `sync`, wait until the file is on the disk."""
     partial = folder / "metadata.yaml.partial"
     partial.write_text(dump_yaml(metadata, flow=False), encoding="utf-8")
     if sync:

@@ -1,4 +1,4 @@
-"""Messages of a publication, made from the table of topics both in a live run and in a replay."""
+"""Create the messages of a publication from the table of topics, in a live run and in a replay."""
 
 from __future__ import annotations
 
@@ -14,20 +14,23 @@ from plow_twin.stream.topics import JOINT_STATE, Cadence, Topic, names_of, topic
 
 Array = NDArray[np.float64]
 
-#: Topics whose messages a replay computes from the journal.
+#: Topics whose messages a replay can compute from the journal.
 REPLAYED: Final = topics_of(Cadence.EACH, Cadence.FOLLOWED, Cadence.SLOW)
 PUBLICATION_TOPICS: Final = tuple(topic.name for topic in REPLAYED)
-#: Topics that only a twin with `follow: full` has.
+#: Topics on which only a twin with `follow: full` publishes.
 FOLLOWED_TOPICS: Final = names_of(Cadence.FOLLOWED)
 
 
 def publication_messages(published: Published, frame_id: str, child_frame_id: str) -> dict[str, Message]:
-    """Return the messages of a publication by base name of the topic; slow messages only for a slow part."""
+    """Return the messages of a publication by base name of the topic.
+
+    Slow topics have a message only if the publication has a slow part.
+    """
     return _messages(REPLAYED, published, frame_id, child_frame_id)
 
 
 def marks(published: Published, frame_id: str) -> dict[str, Message]:
-    """Return the additional messages of a marked publication."""
+    """Return the messages that only a marked publication has."""
     return _messages(topics_of(Cadence.MARKED), published, frame_id, "")
 
 
@@ -44,7 +47,7 @@ def _messages(
 
 
 def message(topic: Topic, stamp_ns: int, numbers: Array, frame_id: str, child_frame_id: str) -> Message:
-    """Return the message of a topic with the given numbers, in the order of the topic's columns."""
+    """Return the message of a topic. `numbers` has the order of the columns of the topic."""
     ends = np.cumsum([sum(count for _, count in parts) for parts in topic.columns.values()])
     fields = dict(zip(topic.columns, np.split(numbers, ends[:-1]), strict=True))
     if topic.type == JOINT_STATE:
@@ -54,10 +57,10 @@ def message(topic: Topic, stamp_ns: int, numbers: Array, frame_id: str, child_fr
 
 
 def template(topic: Topic, frame_id: str, child_frame_id: str) -> Template:
-    """Return the bytes of a topic's messages, with places for the numbers of its columns."""
+    """Return the template of the messages on a topic, in which the stamp and the numbers are replaced."""
     return Template.of(lambda numbers: message(topic, 0, numbers, frame_id, child_frame_id), topic.count)
 
 
 def publication_templates(frame_id: str, child_frame_id: str) -> dict[str, Template]:
-    """Return the templates of the messages that a replay computes, by base name of their topic."""
+    """Return the templates of the messages on the topics in `REPLAYED`, by base name of the topic."""
     return {topic.name: template(topic, frame_id, child_frame_id) for topic in REPLAYED}

@@ -1,7 +1,7 @@
-"""Reading of a recording from front to back, even if it was cut off by a kill or has damaged chunks.
+"""Read a run from front to back, even if it is truncated or has damaged chunks.
 
-A recording has one or many *parts*, which are files. Only some chunks are in memory at a time. Journal entries and
-outputs are in separate chunks, and are put in order by their sequence numbers.
+A recording consists of one or more files, its *parts*. Only a few chunks are in memory at a time. Journal entries and
+outputs are stored in separate chunks; the reader merges them by their sequence numbers.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from plow_twin.record.metadata_yaml import missing_files
 from plow_twin.record.template import Indexes, Template, read_numbers
 from plow_twin.stream.journal import Entry, Loss, Sample
 
-#: Largest number of journal entries that wait for the messages after them.
+#: Largest number of journal entries in memory. More entries are yielded even if outputs between them may follow.
 _PENDING: Final = 65_536
-#: Smallest number of entries in a batch, unless the outputs of `_LEAST // 16` chunks wait.
+#: Smallest number of entries in a batch. A batch may be smaller if the outputs of `_LEAST // 16` chunks are in memory.
 _LEAST: Final = 8192
-#: Smallest number of entries in a batch without outputs, which take most of the memory.
+#: The same number for batches without outputs, which need less memory.
 _LEAST_ALONE: Final = 32_768
-#: Typical growth of a recording at 1 kHz [B/s], for an estimate of the duration without an index.
+#: Typical growth of a recording at 1 kHz [B/s]. It is used to estimate the duration of a file without an index.
 _BYTES_PER_S: Final = 400_000
-#: Indexes of Fx, Fy and M in force and torque.
+#: Indexes of Fx, Fy and M in the six numbers of a wrench.
 _WRENCH: Final = np.array([0, 1, 5])
 
 
 class FileStatus(Enum):
-    """How a file ended."""
+    """State of the end of a recording."""
 
     UNREAD = "not read to its end"
     COMPLETE = "complete"
@@ -54,23 +54,34 @@ class FileStatus(Enum):
 
 @dataclass
 class RunReader:
-    """Iterate over the records of a recording: a folder or an `.mcap` file.
+    """Iterate over the records of a run.
 
-    After the iteration, `status`, `damaged_chunks`, `lost`, `stop_reason` (of a recording that stopped early) and
-    `counts` (records by topic) are known. `position` is the share of the files that has been read, 0..1.
+    Parameters
+    ----------
+    path
+        Folder of the run, or one of its `.mcap` files.
+    tail
+        Wait for a run that is still being written. The reader then also reads new parts, and yields an empty batch
+        whenever it reaches the end of the data.
 
-    `parts` are the files that are read, and `path` is the first of them. `repeated` maps files that repeat a part to
-    the file that is read instead. `foreign` maps files of another run to the keys of their headers that differ from the
-    majority. A part that is not an MCAP file counts as a damaged chunk, and parts that are removed meanwhile are
-    skipped.
-
-    With a `tail` a recording is followed while it is written: new parts are read as well, and an empty batch is yielded
-    whenever all records so far have been read.
+    Attributes
+    ----------
+    parts : list of Path
+        Files that are read; `path` is the first file. Parts that are removed during the iteration are skipped.
+    repeated : dict
+        Files that repeat a part, with the file that is read instead.
+    foreign : dict
+        Files of another run, with the keys in which their headers differ from the headers of most files.
+    status, damaged_chunks, stop_reason, counts
+        Results of the iteration. A part that is not an MCAP file counts as a damaged chunk. `counts` is the number of
+        records by topic.
+    position : float
+        Share of the data that has been read, from 0 to 1.
 
     Raises
     ------
     RecordingError
-        There is no such file, or it is not a recording of plow_twin.
+        The file does not exist, or it is not a recording of plow_twin.
     """
 
     path: Path
@@ -89,7 +100,7 @@ class RunReader:
         self._place = Path(self.path)
         self._headers: dict[Path, RunHeader] = {}
         self._counted: Counter[str] = Counter()
-        self._noted: dict[int, Loss | Dropped] = {}  # by sequence number, because an entry may be in two chunks
+        self._noted: dict[int, Loss | Dropped] = {}  # by sequence number, so that a repeated entry is counted once
         self._look_for_parts()
         self.path = self.parts[0]
         for part in self.parts:
@@ -119,7 +130,7 @@ class RunReader:
                 self.repeated[file] = read[self._headers[file].part]
 
     def _of_other_runs(self) -> dict[Path, tuple[str, ...]]:
-        """Return the files of other runs, with the header keys in which they differ from the run of most files."""
+        """Return the files whose header differs from that of most files, with the keys that differ."""
         records = {file: header.to_record() for file, header in self._headers.items()}
         for record in records.values():
             del record["part"]
@@ -135,7 +146,7 @@ class RunReader:
 
     @property
     def missing_parts(self) -> int:
-        """Number of parts that the folder lacks: named in `metadata.yaml`, or implied by the numbers of other parts."""
+        """Number of missing parts, according to `metadata.yaml` and to the part numbers of the other files."""
         if not self._place.is_dir():
             return 0
         there = {self.number(file) for file in self.parts}
@@ -147,7 +158,11 @@ class RunReader:
 
     @property
     def lost(self) -> dict[str, int]:
-        """Losses by topic: the counts of the recorder at close, or if it was killed, its notes in the journal."""
+        """Number of lost messages by topic.
+
+        The recorder writes these numbers when it closes the recording. If the recorder was killed, they are the sums of
+        its notes in the journal.
+        """
         noted: Counter[str] = Counter()
         for entry in self._noted.values():
             noted[entry.topic if isinstance(entry, Dropped) else "journal"] += entry.count
@@ -155,14 +170,14 @@ class RunReader:
 
     @property
     def lost_parts(self) -> dict[str, int]:
-        """Numbers of missing and foreign parts, by their keys among the losses; zeros are left out."""
-        # the recorder of a followed run may remove the oldest parts
+        """Numbers of missing parts and of parts of other runs; a number of zero is omitted."""
+        # while a run is being written, the recorder may remove its oldest parts
         missing = self.missing_parts if self.tail is None else 0
         found = {"missing_parts": missing, "foreign_parts": len(self.foreign)}
         return {name: count for name, count in found.items() if count}
 
     def number(self, file: Path) -> int:
-        """Return the number of a part from its header or, if it has no header, from its name."""
+        """Return the number of a part from the header of the file or, without a header, from the file name."""
         return self._headers[file].part if file in self._headers else part_number(file)[0]
 
     def _place_of(self, file: Path) -> tuple[int, bool, str]:
@@ -176,7 +191,7 @@ class RunReader:
             yield from in_order(batch)
 
     def batches(self, *, outputs: bool = True) -> Iterator[Batch]:
-        """Yield the records in order, many at a time; without `outputs` only the journal is read."""
+        """Yield the records in order, many at a time. Without `outputs`, only the journal is read."""
         self.status, self.damaged_chunks, self.position, self.stop_reason = FileStatus.UNREAD, 0, 0.0, None
         self.counts.clear()
         self._counted.clear()
@@ -192,7 +207,7 @@ class RunReader:
         size, before = self.size(), 0
         finished, cut = True, False
         for part in self._parts_to_read():
-            self.damaged_chunks += cut  # a part that was cut off may lack its last records
+            self.damaged_chunks += cut  # the last records of a truncated part may be missing
             cut = False
             begins = is_mcap(part) if len(self.parts) > 1 else True
             if self.tail is None and begins is None:
@@ -229,7 +244,7 @@ class RunReader:
             self.status = FileStatus.COMPLETE if self.stop_reason is None else FileStatus.STOPPED_EARLY
 
     def _parts_to_read(self) -> Iterator[Path]:
-        """Yield the parts in order; with a tail, also parts that begin during the reading."""
+        """Yield the parts in order; with a tail, also parts that the recorder starts during the iteration."""
         done: list[Path] = []
         while left := [part for part in self.parts if part not in done]:
             done.append(left[0])
@@ -241,7 +256,7 @@ class RunReader:
                 self._look_for_parts()
 
     def size(self) -> int:
-        """Return the size of the parts on the disk [B]."""
+        """Return the total size of the parts [B]."""
         found = 0
         for part in self.parts:
             with suppress(FileNotFoundError):
@@ -249,12 +264,15 @@ class RunReader:
         return found
 
     def duration_s(self) -> float:
-        """Return the span of the receive times [s] from the parts' indexes, or an estimate from their size."""
+        """Return the time from the first to the last record [s].
+
+        If a part has no index, the time is estimated from the size of the files.
+        """
         first_ns, last_ns, known = self._received_ns()
         return float(last_ns - first_ns) * 1e-9 if known else self.size() / _BYTES_PER_S
 
     def began_ns(self) -> int | None:
-        """Return the first receive time [ns] from the parts' indexes; None while a part has no index."""
+        """Return the first receive time [ns], or None if a part has no index."""
         first_ns, _, known = self._received_ns()
         return first_ns if known else None
 
@@ -266,7 +284,7 @@ class RunReader:
             try:
                 with part.open("rb") as stream:
                     summary = make_reader(stream).get_summary()
-            except Exception:  # a part that was cut off has no summary
+            except Exception:  # a truncated part has no summary
                 continue
             if summary is not None and summary.statistics is not None and summary.statistics.message_count:
                 first.append(summary.statistics.message_start_time)
@@ -281,11 +299,11 @@ class RunReader:
             counted = Counter({topic: int(count) for topic, count in record.items()})
         except ValueError as error:
             raise RecordingError(f"{self.path}: metadata {LOSS_RECORD!r}: {error}, expected counts") from error
-        self._counted = counted  # the newest part has the counts of the whole run
+        self._counted = counted  # each part contains the counts from the beginning of the run
 
 
 class _Merger:
-    """Merge journal and outputs in order of their sequence numbers."""
+    """Merge journal entries and outputs by their sequence numbers."""
 
     def __init__(self, reader: RunReader, outputs: bool) -> None:
         self._run = reader
@@ -317,7 +335,7 @@ class _Merger:
         return any(self._chunks.channels[number].topic in self._journal for number in numbers)
 
     def add(self, messages: Messages) -> Iterator[Batch]:
-        """Add a chunk and yield the batches that it completes."""
+        """Add the messages of a chunk, and yield the batches that are complete."""
         assert self._chunks is not None
         counts = np.bincount(messages.channel)
         there = counts.nonzero()[0]
@@ -334,7 +352,7 @@ class _Merger:
             elif channel.message_type in MESSAGE_TYPES:
                 sent.append(number)
                 named = channel.topic, channel.message_type
-                if self._topics.get(number) != named:  # earlier outputs keep the old mapping
+                if self._topics.get(number) != named:  # a new dictionary, because earlier outputs refer to the old one
                     self._topics = {**self._topics, number: named}
         if journal:
             chosen = messages if len(journal) == len(there) else _of(messages, journal)
@@ -363,7 +381,7 @@ class _Merger:
         return unwrapped
 
     def _read_to(self, end: int) -> Iterator[Batch]:
-        """Yield the waiting records with sequence numbers below `end`."""
+        """Yield the records in memory that have sequence numbers below `end`."""
         waiting = Entries.joined(self._entries)
         later = np.flatnonzero(waiting.sequence >= end)
         count = int(later[0]) if later.size else len(waiting)
@@ -415,7 +433,7 @@ def _of(messages: Messages, channels: list[int]) -> Messages:
 
 
 def sample_template(frame_id: str) -> Template:
-    """Return the template of the journal's samples: six numbers, force and torque."""
+    """Return the template of load samples in the journal. Its six numbers are the force and the torque."""
 
     def build(values: NDArray[np.float64]) -> Message:
         fx, fy, fz, mx, my, mz = values.tolist()
@@ -425,12 +443,12 @@ def sample_template(frame_id: str) -> Template:
 
 
 def read_header(path: Path) -> RunHeader | None:
-    """Return the header of a recording of plow_twin, or None for any other recording.
+    """Return the header of a recording of plow_twin, or None for a recording of another program.
 
     Raises
     ------
     RecordingError
-        The file is not an MCAP file, or its header cannot be read.
+        The file is not an MCAP file, or its header is invalid.
     """
     found: list[RunHeader] = []
 
@@ -440,19 +458,19 @@ def read_header(path: Path) -> RunHeader | None:
 
     for _ in ChunkReader(path, on_metadata):
         break
-    if not found:  # programs that rewrite a file put the header's record last
+    if not found:  # programs that rewrite MCAP files move metadata records to the end
         for name, record in metadata_records(path):
             on_metadata(name, record)
     return found[0] if found else None
 
 
 def run_parts(path: Path) -> list[Path]:
-    """Return the files of a recording given as its folder or as one file, in order.
+    """Return the MCAP files of a recording in order; `path` is the folder, or a single file.
 
     Raises
     ------
     RecordingError
-        There is no file.
+        No file exists.
     """
     if path.is_dir():
         files = sorted(path.glob("*.mcap"), key=part_number)
@@ -465,18 +483,18 @@ def run_parts(path: Path) -> list[Path]:
 
 
 def mcap_path(path: Path) -> Path:
-    """Return the first file of a recording given as its folder or as one file."""
+    """Return the first MCAP file of a recording; `path` is the folder, or a single file."""
     return run_parts(path)[0]
 
 
 def part_number(path: Path) -> tuple[int, str]:
-    """Return the sort key of a part: the number at the end of its name (-1 without a number), and the name."""
+    """Return the sort key of a file: the number at the end of its name, or -1 without a number, and the name."""
     digits = re.search(r"(\d+)$", path.stem)
     return (int(digits[1]) if digits else -1, path.name)
 
 
 def own_run(path: Path, tail: Tail | None = None) -> RunReader | None:
-    """Return the reader of a run of plow_twin, or None for another recording."""
+    """Return a reader of a run, or None for a recording of another program."""
     if path.is_dir() and not any(path.glob("*.mcap")):
         return None
     try:

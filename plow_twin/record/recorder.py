@@ -1,10 +1,11 @@
 """The recorder of a live node.
 
-A caller puts journal entries and publications in a queue and never waits for the disk. The recorder's thread empties
-the queue every 50 ms and writes the file. When the thread falls behind, items that do not fit in the queue are dropped.
-Each loss is counted by topic, and the file has a note of it at its place.
+Callers put journal entries and publications in a queue, and never wait for the disk. A thread empties the queue every
+50 ms and writes the file. If the thread is too slow, items that do not fit in the queue are dropped. Dropped items are
+counted by topic, and a note in the file marks the place of each loss.
 
-A *ring* is a recording in memory that keeps only the newest seconds of a run; `Recorder.mark` writes it to the disk.
+A *ring* is a recording in memory that keeps only the last seconds of a run. The method `Recorder.mark` writes the ring
+to the disk.
 """
 
 from __future__ import annotations
@@ -37,23 +38,30 @@ if TYPE_CHECKING:
     from plow_twin.record.ring import RingWriter
     from plow_twin.record.writer import RunWriter
 
-#: Key under which the loss counters count lost journal entries.
+#: Key of the number of lost journal entries in the loss counters.
 JOURNAL: Final = "journal"
 #: Interval at which the thread empties the queue [s].
 _POLL_S: Final = 0.05
-#: Errors of a full disk, on which there may be room again later.
+#: Error numbers of a full disk. These errors only pause the recording, because space may become free.
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
-#: Number of items that the thread writes before it sleeps, so that callers of the recorder get the interpreter lock.
+#: Number of items after which the thread sleeps for a moment. Other threads can then acquire the interpreter lock.
 _BURST: Final = 128
 
 
 @dataclass(frozen=True)
 class RecorderCounters:
-    """The state of a recorder.
+    """State of a recorder.
 
-    `lost` counts lost messages by topic, and lost journal entries under `journal`. `error` says why recording has
-    stopped, or why the newest ring was not written. `marks` and `marks_lost` count the rings that were and were not
-    written.
+    Attributes
+    ----------
+    written, queued : int
+        Numbers of items that were written, and that are in the queue.
+    lost : dict
+        Number of lost messages by topic. The key of lost journal entries is `journal`.
+    error : str or None
+        Reason why recording stopped, or why the last ring was not written.
+    marks, marks_lost : int
+        Number of rings that were written, and number of rings that could not be written.
     """
 
     written: int
@@ -67,7 +75,7 @@ class RecorderCounters:
 
 @dataclass(frozen=True)
 class LossReport:
-    """The losses of a recording by topic, whether its file was closed, and the error that stopped it."""
+    """Losses of a recording by topic, whether the file was closed, and the error that stopped the recording."""
 
     lost: Mapping[str, int]
     closed: bool
@@ -75,11 +83,11 @@ class LossReport:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing was lost and the file has its index."""
+        """Whether the file was closed and nothing was lost."""
         return self.closed and not self.lost and self.error is None
 
     def sentence(self, folder: Path) -> str:
-        """Return a sentence with the losses, and with the commands that show and complete the recording in `folder`."""
+        """Return a text with the losses and with the commands that show and repair the recording in `folder`."""
         lacks = [f"{count} lost of {topic}" for topic, count in self.lost.items()]
         if self.error is not None:
             lacks.append(self.error)
@@ -96,35 +104,35 @@ class Recorder:
     Parameters
     ----------
     path
-        Folder to make, e.g. `runs/monday`; the file is `runs/monday/monday_0.mcap`.
+        Folder to create. In the folder `runs/monday`, the first file is `runs/monday/monday_0.mcap`.
     header
         Scene and settings of the run.
     queue_size
-        Number of items that may wait for the thread; the last quarter of the queue is kept for the journal.
+        Largest number of items in the queue. The last quarter of the queue is reserved for journal entries.
     flush_period_s
-        Interval between writes to the operating system [s]. If the process is killed, the journal of up to one interval
-        and the messages of up to two intervals are lost.
+        Interval between writes to the file [s]. If the process is killed, the journal entries of up to one interval and
+        the messages of up to two intervals are lost.
     chunk_size
-        Size of the waiting data [B] at which a chunk is closed.
+        Size at which a chunk is written to the file [B].
     min_free_bytes
-        Free space on the disk [B] below which recording pauses.
+        Free space on the disk below which recording pauses [B].
     part_bytes, part_s
-        Size [B] and duration [s] at which a new part (file) is started; 0: never.
+        Size [B] and duration [s] after which a new part (file) is started. With 0, the parts have no limit.
     keep_bytes
-        Size of all ended parts [B] above which the oldest parts are removed; 0: all are kept.
+        Total size of the completed parts above which the oldest parts are removed [B]. With 0, no part is removed.
     ring_s
-        Length of the ring [s]; 0: everything is written.
+        Duration of the ring [s]. With 0, the recorder has no ring and writes all data to the disk.
     sync
-        Whether each flush, new part and ring waits for the disk (`fdatasync`), so that it survives a loss of power.
+        Whether the recorder calls `fdatasync` after each write, so that the written data survive a loss of power.
     now_ns
-        Function that returns the receive time [ns]; it is called in the caller's thread.
+        Function that returns the receive time [ns]. The recorder calls it in the thread of the caller.
     on_error
-        Function that receives the reason, once and in the recorder's thread, when recording stops early.
+        Function that receives the reason when recording stops early. It is called once, in the thread of the recorder.
 
     Raises
     ------
     RecordingError
-        The folder is not empty or cannot be made.
+        The folder is not empty or cannot be created.
     """
 
     def __init__(
@@ -157,7 +165,7 @@ class Recorder:
             part_bytes, part_s, keep_bytes = 0, ring_s / PARTS, 0
         self._writer = self._ring or RunWriter(self._folder, header, chunk_size, min_free_bytes, sync=sync)
         self.path = self._writer.path
-        self._mark: Path | None = None  # folder for the ring
+        self._mark: Path | None = None  # folder to which the ring will be written
         self._marks = self._marks_lost = 0
         self._mark_error: str | None = None
         each, slow, marked = (
@@ -165,7 +173,7 @@ class Recorder:
         )
         if header.follow == "full":
             each += tuple(map(header.topic, names_of(Cadence.FOLLOWED)))
-        #: topics of a publication, by whether it has a slow part and whether it is marked
+        #: topics of a publication; the key contains whether it has a slow part, and whether it is marked
         self._topics_of = {
             (False, False): each, (True, False): each + slow, (False, True): each + marked,
             (True, True): each + slow + marked,
@@ -174,13 +182,13 @@ class Recorder:
         self._split_due = False
         self._part_since = time.monotonic()
         self._queue: deque[_Item] = deque()
-        #: an item may hold many entries or publications; this counts all but one of each item
+        #: number of entries and publications in the queue, minus the length of the queue; an item may contain several
         self._more = 0
         self._queue_size = queue_size
         self._flush_period_s = flush_period_s
         self._now_ns = now_ns
         self._on_error = on_error
-        self._lock = threading.Lock()  # never held while the thread writes
+        self._lock = threading.Lock()  # the thread releases this lock before it writes to the disk
         self._sequence = -1
         self._journal_gap = 0
         self._snapshot_due = False
@@ -199,14 +207,14 @@ class Recorder:
 
     @property
     def snapshot_wanted(self) -> bool:
-        """Whether the caller should journal a `Snapshot` now, after a loss or at the end of a part."""
+        """Whether the caller should add a `Snapshot` to the journal, because of a loss or the end of a part."""
         if not (self._snapshot_due or self._split_due):
             return False
         return self._accepting and not self._paused and self._queued < self._queue_size // 2
 
     @property
     def counters(self) -> RecorderCounters:
-        """The present counters."""
+        """The current state of the recorder."""
         with self._lock:
             lost = dict(self._lost)
             error = self._error or self._mark_error
@@ -214,10 +222,15 @@ class Recorder:
         return RecorderCounters(self._written, self._queued, self._writer.bytes_written, lost, error, *marks)
 
     def mark(self) -> Path | None:
-        """Write the ring once the next `Snapshot` is journalled or the recorder is closed.
+        """Request that the ring is written to a new folder.
 
-        Returns the folder for the ring, or None for a recorder without a ring. Further calls have no effect until the
-        ring is written.
+        The ring is written before the next `Snapshot` in the journal, or when the recorder is closed. Until then,
+        further calls have no effect.
+
+        Returns
+        -------
+        Path or None
+            The folder, or None if the recorder has no ring.
         """
         from plow_twin.record.writer import free_folder
 
@@ -229,9 +242,9 @@ class Recorder:
             return self._mark
 
     def journal(self, entry: Entry) -> bool:
-        """Queue a journal entry; return False if it was lost.
+        """Add a journal entry to the queue; return False if the entry is lost.
 
-        After a loss only a `Snapshot` is accepted, because a replay needs the state to continue.
+        After a loss, all entries are refused until a `Snapshot` arrives. A replay can continue only from a snapshot.
         """
         now = self._now_ns()
         with self._lock:
@@ -245,7 +258,7 @@ class Recorder:
                 if self._journal_gap:
                     self._push_entry(now, Loss(self._journal_gap))
                     self._journal_gap = 0
-                # notes of losses come before the snapshot, so that all messages after the snapshot can be compared
+                # the notes of losses precede the snapshot: a replay can compare all messages after the snapshot
                 if snapshot:
                     self._push_notes(now)
                 self._push_entry(now, entry)
@@ -254,13 +267,13 @@ class Recorder:
                 return True
             self._snapshot_due = True
             if not (self._journal_gap and snapshot):
-                self._sequence += 1  # a lost entry keeps its number, because messages refer to it
+                self._sequence += 1  # a lost entry uses up a number, because messages refer to the number
                 self._journal_gap += 1
                 self._lost[JOURNAL] += 1
             return False
 
     def output(self, topic: str, stamp_ns: int, message: Message) -> bool:
-        """Queue a message that was sent on `topic` (resolved name) for time `stamp_ns`; return False if it was lost."""
+        """Add a message that was sent on `topic`, a resolved name, to the queue; return False if it is lost."""
         now = self._now_ns()
         with self._lock:
             if fits := self._admitted(now, 2, (topic,)):
@@ -268,10 +281,10 @@ class Recorder:
         return fits
 
     def publication(self, published: Published, sent: Mapping[str, bytes] = MappingProxyType({})) -> bool:
-        """Queue the messages of a publication of one row; return False if they were lost.
+        """Add the messages of a publication with one row to the queue; return False if the messages are lost.
 
-        `sent` maps base names of topics to the bytes of their messages. If `sent` is empty, the recorder makes the
-        messages that a replay can compute.
+        `sent` maps the base names of the topics to the bytes of the messages. If it is empty, the recorder encodes the
+        messages of all topics that a replay can compute.
         """
         now = self._now_ns()
         topics = self._topics_of[len(published.slow) > 0, bool(sent) and bool(published.rows["marked"][0])]
@@ -281,9 +294,13 @@ class Recorder:
         return fits
 
     def series(self, series: Series) -> NDArray[np.int64]:
-        """Queue all samples and digests of a series as journal entries, or lose all of them.
+        """Add all samples and digests of a series to the queue as journal entries; if they do not fit, all are lost.
 
-        Returns, for each sample, the number of the journal entry before its publication, shape (n,).
+        Returns
+        -------
+        ndarray of int64, shape (n,)
+            For each sample, the sequence number that its publication needs. This number belongs to the sample or, if a
+            digest follows the sample, to the digest.
         """
         now, samples = self._now_ns(), len(series.stamps)
         count = samples + len(series.digests)
@@ -301,7 +318,10 @@ class Recorder:
         return item.sequence + np.arange(samples) + np.cumsum(ends)
 
     def publications(self, published: Published, sequence: NDArray[np.int64]) -> bool:
-        """Queue unsent publications, each after its entry in `sequence`; return False if they were lost."""
+        """Add publications that the node has not sent to the queue; return False if the publications are lost.
+
+        `sequence`, shape (n,), is the number of the journal entry before each publication.
+        """
         now, count = self._now_ns(), len(published.rows)
         topics = Counter(dict.fromkeys(self._topics_of[False, False], count))
         topics.update(dict.fromkeys(set(self._topics_of[True, False]) - topics.keys(), len(published.slow)))
@@ -311,7 +331,10 @@ class Recorder:
         return fits
 
     def _admitted(self, now: int, items: int, topics: Iterable[str]) -> bool:
-        """Return whether messages may be queued; note earlier losses or count this loss."""
+        """Return whether the queue has space for messages on `topics`.
+
+        If it has space, notes about earlier losses on these topics are queued. Otherwise the messages count as lost.
+        """
         if not self._room(items, self._queue_size * 3 // 4):
             self._snapshot_due = True
             self._output_gaps.update(topics)
@@ -343,9 +366,9 @@ class Recorder:
         self._output_gaps.clear()
 
     def close(self, timeout_s: float = 5.0) -> LossReport:
-        """Write the queued items, close the file and return the losses; a second call only returns the losses.
+        """Write the queued items, close the file and return the losses. A second call only returns the losses.
 
-        Gives up when the thread writes no item for `timeout_s` [s].
+        If the thread writes no item within `timeout_s` [s], the method returns although the file is not closed.
         """
         atexit.unregister(self.close)
         with self._lock:
@@ -391,11 +414,11 @@ class Recorder:
                 self._give_up(reason)
             if self._mark is not None:
                 self._split()
-            with self._lock:  # callers may still count losses
+            with self._lock:  # other threads may still change the counters
                 lost = dict(self._lost)
             self._writer.close(lost, reason or self._paused)
             self._closed = True
-        except Exception as error:  # the twin continues without its recorder after any error
+        except Exception as error:  # the twin continues without a recorder, whatever the error is
             self._give_up(str(error), self._unflushed)
             self._writer.abandon()
 
@@ -415,7 +438,10 @@ class Recorder:
                 time.sleep(1e-6)
 
     def _write(self, items: list[_Item]) -> None:
-        """Write items, neighbours of one kind together; journal and outputs each keep their order."""
+        """Write items, consecutive items of one kind in one call.
+
+        The order of the journal entries and the order of the outputs are preserved.
+        """
         samples: list[_EntryItem] = []
         publications: list[_PublicationItem] = []
         for item in items:
@@ -435,7 +461,7 @@ class Recorder:
             else:
                 publications = self._write_publications(publications)
                 item.write(self._writer)
-        # in the file, the chunk of samples comes before the chunk of the messages that were sent after these samples
+        # in the file, the chunk of samples precedes the chunk of the messages that were sent after the samples
         self._write_samples(samples)
         self._write_publications(publications)
 
@@ -462,7 +488,7 @@ class Recorder:
         return full or (part_s > 0.0 and time.monotonic() - self._part_since >= part_s)
 
     def _split(self) -> None:
-        """Start a new part; the snapshot that is written next makes the part self-contained."""
+        """Start a new part. The caller writes a snapshot next, so that a replay can begin with this part."""
         with self._lock:
             lost = dict(self._lost)
         self._writer.split(lost, self._limits[2])
@@ -473,7 +499,7 @@ class Recorder:
                 self._dump(self._ring, self._mark, lost)
             except (OSError, RecordingError) as failed:  # the ring stays in memory
                 error = f"{self._mark}: the last {self._ring_s:g} s not written: {failed}"
-            # the lock covers `_mark` and the counts, because a caller that sees the new count may mark again at once
+            # both change under one lock, because a caller that reads a new count may call `mark` immediately
             with self._lock:
                 self._mark = None
                 if error is None:
@@ -488,14 +514,14 @@ class Recorder:
 
         try:
             ring.dump(folder, lost)
-        except TakenError:  # another process made this folder meanwhile
+        except TakenError:  # another process has created the folder in the meantime
             in_free_folder(self._folder, lambda other: ring.dump(other, lost))
 
     def _flush(self) -> str | None:
         self._writer.flush()
         self._unflushed.clear()
         reason = self._writer.reason_to_stop()
-        if reason is not None:  # the folder may be gone, so the free space of its disk is not looked up
+        if reason is not None:  # the folder may not exist any more, so `shortage` could fail
             return reason
         if self._part_is_full():
             self._split_due = True
@@ -508,7 +534,7 @@ class Recorder:
         return None
 
     def _pause(self, reason: str) -> None:
-        """Refuse items until the disk has room again; queued and unflushed items are lost."""
+        """Refuse items until the disk has enough space again; queued and unflushed items are lost."""
         with self._lock:
             first = not self._paused
             self._paused = reason
@@ -526,7 +552,7 @@ class Recorder:
             self._on_error(error)
 
     def _give_up(self, reason: str, unsafe: Mapping[str, int] = MappingProxyType({})) -> None:
-        """Refuse items for good and report why; queued items and the unflushed items `unsafe` are lost."""
+        """Refuse all further items and report `reason`; queued items and the unflushed items `unsafe` are lost."""
         first = self._error is None
         with self._lock:
             self._accepting, self._paused = False, None
@@ -539,7 +565,7 @@ class Recorder:
 
 
 class _SeriesItem(NamedTuple):
-    """Samples and digests for the file; `sequence` is the number of the first entry."""
+    """Samples and digests to write. `sequence` is the sequence number of the first entry."""
 
     sequence: int
     log_time_ns: int
@@ -557,9 +583,9 @@ class _SeriesItem(NamedTuple):
 
 
 class _PublicationsItem(NamedTuple):
-    """Publications for the file; `sequence` has, for each publication, the number of the journal entry before it.
+    """Publications to write. `sequence` is the number of the journal entry before each publication.
 
-    The `keys` of every item are the topics that lose messages if the item is lost.
+    The attribute `keys` of every kind of item contains the topics whose messages are lost if the item is lost.
     """
 
     sequence: NDArray[np.int64]
@@ -577,7 +603,8 @@ def _numbers(items: Sequence[_EntryItem | _PublicationItem]) -> tuple[NDArray[np
     return np.array(sequence, np.int64), np.array(log_time_ns, np.int64)
 
 
-# About 4000 of these items are made each second. A named tuple takes a quarter of the time of a frozen dataclass.
+# A live node creates thousands of items each second, and a named tuple is created four times as fast as a frozen
+# dataclass.
 class _EntryItem(NamedTuple):
     sequence: int
     log_time_ns: int

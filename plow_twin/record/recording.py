@@ -1,4 +1,4 @@
-"""A recording as tables of numbers for numpy, pandas and Arrow, read batch by batch or as a whole."""
+"""Read a recording as tables of numbers for numpy, pandas and Arrow, in batches or as a whole."""
 
 from __future__ import annotations
 
@@ -29,12 +29,15 @@ Array = NDArray[np.float64]
 Indexes = NDArray[np.int64]
 
 _POSE: Final = ("x", "y", "theta")
-#: Quantities whose names differ: name in the record, name in the tables.
+#: Quantities whose name in the tables differs from the name of the field in the record.
 _NAMES: Final = {"makes": "touches"}
 
 
 def _columns_of(topic: Topic) -> tuple[str, ...]:
-    """Return the columns of a topic's table: its names, or `<name>/<quantity>` if it has several quantities."""
+    """Return the column names of the table of a topic.
+
+    If the topic has several quantities, a column name is `<name>/<quantity>`.
+    """
     if topic.type != JOINT_STATE:
         return *_POSE, "velocity_x", "velocity_y", "omega"
     if len(topic.columns) == 1:
@@ -43,7 +46,7 @@ def _columns_of(topic: Topic) -> tuple[str, ...]:
     return tuple(f"{name}/{_NAMES.get(quantity, quantity)}" for quantity in quantities for name in topic.names)
 
 
-#: Columns of each table. The first two tables are inputs of the twin, the others its outputs.
+#: Columns of each table. The first two tables contain inputs of the twin, and all other tables contain its outputs.
 COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "excitation": ("fx", "fy", "m"),
     "head_pose": _POSE,
@@ -52,7 +55,7 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 def read_recording(run: str | Path) -> Recording:
-    """Return a recording of plow_twin; only its header is read before the first table.
+    """Open a recording of plow_twin and return it. The data are read when a table is accessed.
 
     Parameters
     ----------
@@ -62,21 +65,29 @@ def read_recording(run: str | Path) -> Recording:
     Raises
     ------
     RecordingError
-        There is no such recording.
+        The path is not a recording of plow_twin.
     """
     return Recording(Path(run))
 
 
 @dataclass(frozen=True)
 class Batched:
-    """Rows of a table: `stamp_ns` (n,) in ns on the clock of the samples, `values` (n, k) in SI."""
+    """Rows of a table.
+
+    Attributes
+    ----------
+    stamp_ns : ndarray of int64, shape (n,)
+        Stamps on the clock of the samples [ns].
+    values : ndarray, shape (n, k)
+        Values of the columns [SI units].
+    """
 
     stamp_ns: Indexes
     values: Array
 
 
 class Recording:
-    """A recording, read lazily; `recording["contact_peaks"]` is a table.
+    """A recording whose data are read when they are accessed. `recording["contact_peaks"]` is a table.
 
     Attributes
     ----------
@@ -95,12 +106,12 @@ class Recording:
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene of the run, made when it is requested, since the tables can be read without a usable scene.
+        """The scene of the run. It is parsed at the first access, so that an invalid scene does not prevent reading.
 
         Raises
         ------
         RecordingError
-            This version of plow_twin cannot use the scene.
+            The scene is invalid in this version of plow_twin.
         """
         return self.header.scene(self.path)
 
@@ -115,9 +126,9 @@ class Recording:
         return Table(self, name, COLUMNS[name])
 
     def losses(self) -> dict[str, int]:
-        """Return the counts of missing messages by topic.
+        """Return the number of missing messages by topic.
 
-        This reads the recording, unless `batches` or a table has already read it to its end.
+        The method reads the whole journal, unless the recording has already been read to its end.
         """
         if self._losses is None:
             for _ in self._read(outputs=False):
@@ -126,24 +137,24 @@ class Recording:
         return dict(self._losses)
 
     def _read(self, *, outputs: bool) -> Iterator[Batch]:
-        """Yield the batches of the recording and keep its losses at the end."""
+        """Yield the batches of the recording, and store the losses at the end."""
         reader = RunReader(self.path)
         yield from reader.batches(outputs=outputs)
         whole = reader.status is FileStatus.COMPLETE
         self._losses = {**reader.lost, **reader.lost_parts, **({} if whole else {reader.status.value: 1})}
 
     def batches(self, *names: str) -> Iterator[dict[str, Batched]]:
-        """Return an iterator over the rows of several tables in one pass over the recording.
+        """Return an iterator over the rows of several tables, which reads the recording once.
 
         Parameters
         ----------
         names
-            Tables; by default all.
+            Names of the tables; by default all tables.
 
         Raises
         ------
         RecordingError
-            A part cannot be read.
+            A file cannot be read.
         """
         wanted = names or self.names
         templates = publication_templates(self.header.frame_id, self.header.child_frame_id)
@@ -164,32 +175,32 @@ class Recording:
 
 @dataclass(frozen=True)
 class Table:
-    """One table of a recording: `stamp_ns` and columns in SI, named as in `columns`."""
+    """A table of a recording: stamps, and the values of `columns` in SI units."""
 
     recording: Recording
     name: str
     columns: tuple[str, ...]
 
     def batches(self) -> Iterator[Batched]:
-        """Return an iterator over the rows, part by part, so that a run of any length fits into memory."""
+        """Return an iterator over batches of rows, which fit in memory even if the run is long."""
         for found in self.recording.batches(self.name):
             yield found[self.name]
 
     def numpy(self) -> tuple[Indexes, Array]:
-        """Return stamps [ns], shape (n,), and values, shape (n, number of columns)."""
+        """Return the stamps [ns], shape (n,), and the values, shape (n, number of columns)."""
         parts = list(self.batches())
         if not parts:
             return np.zeros(0, np.int64), np.zeros((0, len(self.columns)))
         return np.concatenate([part.stamp_ns for part in parts]), np.concatenate([part.values for part in parts])
 
     def arrow(self) -> pa.Table:
-        """Return an Arrow table; this needs pyarrow."""
+        """Return an Arrow table. The package pyarrow must be installed."""
         import pyarrow as pa
 
         return pa.Table.from_batches(map(self.arrow_batch, self.batches()), self.arrow_schema())
 
     def pandas(self) -> pd.DataFrame:
-        """Return a data frame indexed by the stamps in UTC; this needs pandas."""
+        """Return a data frame whose index contains the stamps in UTC. The package pandas must be installed."""
         import pandas as pd
 
         stamps, values = self.numpy()
@@ -197,13 +208,13 @@ class Table:
         return pd.DataFrame(values, index, list(self.columns))
 
     def arrow_schema(self) -> pa.Schema:
-        """Return the Arrow schema of the columns."""
+        """Return the Arrow schema of the table."""
         import pyarrow as pa
 
         return pa.schema([("stamp", pa.timestamp("ns", "UTC")), *((name, pa.float64()) for name in self.columns)])
 
     def arrow_batch(self, part: Batched) -> pa.RecordBatch:
-        """Return rows as an Arrow record batch."""
+        """Return a batch of rows as an Arrow record batch."""
         import pyarrow as pa
 
         columns: list[Any] = [pa.array(part.stamp_ns.view("datetime64[ns]"), pa.timestamp("ns", "UTC"))]
@@ -212,22 +223,22 @@ class Table:
 
 
 def export(recording: Recording, kind: str, out: Path) -> dict[str, int]:
-    """Write all tables that have rows; return the number of rows by table.
+    """Write all tables that have rows, and return the number of rows of each table.
 
     Parameters
     ----------
     recording
         The recording.
     kind
-        `csv` or `parquet`: a file for each table in the folder `out`, written part by part. `npz`: one file, which has
-        `<table>/stamp_ns`, `<table>/values` and `<table>/columns`.
+        With `csv` or `parquet`, a file for each table is written to the folder `out`. With `npz`, the file `out`
+        contains the arrays `<table>/stamp_ns`, `<table>/values` and `<table>/columns` of all tables.
     out
         Folder or file.
 
     Raises
     ------
     RecordingError
-        `out` cannot be written.
+        A file cannot be written.
     """
     try:
         return _exported_npz(recording, out) if kind == "npz" else _exported_tables(recording, kind, out)

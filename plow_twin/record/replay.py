@@ -1,13 +1,14 @@
-"""Run a recording again: the journal alone moves the model, whose messages are compared with the recorded messages.
+"""Replay a recording: move the model by the journal alone, and compare its messages with the recorded messages.
 
 Terms of this module:
 
-- The replay is *synced* while its state must equal the state of the live session. A missing entry ends this; the next
-  snapshot restores it. All other snapshots are compared.
-- The *output window* is the motion since the previous publication. It must be known to compare a *cumulative* message,
-  such as a peak since the previous message.
-- A *run* of entries consists of samples and digests without a gap, which are applied together.
-- The *sink* is a new recording that a replay can write.
+- The replay is *synced* while its state must equal the state of the live session. After a missing journal entry, the
+  replay is not synced until the next snapshot, from which it takes the state. Other snapshots are compared.
+- A *cumulative* message contains, for example, the peak since the previous message.
+- The *output window* is the motion since the previous publication. Cumulative messages can be compared only if the
+  replay has computed the whole output window.
+- A *run* of entries is a series of samples and digests without a missing entry. A run is applied in one call.
+- The *sink* is a new recording, which a replay writes on request.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ from plow_twin.stream.topics import TOPICS
 if TYPE_CHECKING:
     from plow_twin.record.writer import RunWriter
 
-#: Names of the cumulative topics.
+#: Base names of the topics with cumulative messages.
 _CUMULATIVE: Final = frozenset(topic.name for topic in TOPICS if topic.cumulative)
 _IS_CUMULATIVE: Final = np.array([name in _CUMULATIVE for name in PUBLICATION_TOPICS])
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
@@ -79,24 +80,26 @@ ProgressCallback = Callable[[float], object]
 def replay(
     path: Path, on_progress: ProgressCallback | None = None, *, digests_only: bool = False, write: Path | None = None
 ) -> ReplayReport:
-    """Run a recording again and compare each digest and each message that follows from the journal, bit for bit.
+    """Replay a recording, and compare each digest and each message that can be computed from the journal.
+
+    Values are equal only if all their bits are equal.
 
     Parameters
     ----------
     path
-        The recording: its folder or one `.mcap` file.
+        Folder of the recording, or one of its `.mcap` files.
     on_progress
-        Function that receives the share of the recording's bytes that has been replayed, 0..1.
+        Function that receives the share of the recording that has been replayed, from 0 to 1.
     digests_only
-        Compare the digests alone; chunks that contain only messages are not read.
+        Compare only the digests. Chunks without journal entries are then skipped.
     write
-        Folder for a full recording made from the journal, with all outputs after each advance; only digests are
+        Folder of a new recording, which contains the journal and all outputs after each advance. Only digests are then
         compared.
 
     Raises
     ------
     RecordingError
-        The file is not a recording, or its scene or journal cannot be used.
+        The file is not a recording of plow_twin, or its scene or journal is invalid.
     """
     reader = RunReader(Path(path))
     run = _Replay(reader.header, ReplayReport(reader.path), digests_only or write is not None)
@@ -122,14 +125,14 @@ def _sink(folder: Path, header: RunHeader) -> RunWriter:
 
 
 def following_twin(header: RunHeader, scene: Scene) -> Driven:
-    """Return a twin that follows measurements as the twin of the run with this header did."""
+    """Return a twin that follows measurements with the settings in the header of a run."""
     from plow_twin.estimate.follow import MEMBERS, follower
 
     return follower(scene, header.follow, int(header.parameters.get("follow_members", MEMBERS)), header.tol)
 
 
 class _Replay:
-    """The state of a replay."""
+    """State of a replay."""
 
     def __init__(self, header: RunHeader, report: ReplayReport, digests_only: bool) -> None:
         self.digests_only = digests_only
@@ -156,7 +159,7 @@ class _Replay:
             _warm_up(scene, header.tol, self.templates, rows=not digests_only)
         self.sink: RunWriter | None = None
         self.rows = np.zeros(0, ROW)
-        # publications of the newest run; messages of the last of them may still follow
+        # publications of the last run of entries; further messages of the last publication may follow in the recording
         self.published: Published | None = None
         self.session = Session(
             twin, header.origin_ns, rollback_span_s=float(header.parameters.get("rollback_span", 0.0))
@@ -166,18 +169,18 @@ class _Replay:
         self.next_sequence = 0
         self.in_a_row = 0
         self.synced = False
-        self.outputs_synced = False  # whether the output window is known
-        self.outputs_whole = True  # whether the current batch has a note for each missing message
-        self.resumed = False  # whether the session has not advanced since it restored a snapshot
+        self.outputs_synced = False  # whether the replay has computed the whole output window
+        self.outputs_whole = True  # whether the current batch contains a note about each missing message
+        self.resumed = False  # whether the session has restored a snapshot and has not advanced since
         self.messages: Mapping[str, Message] | None = None
         self.first_ns: int | None = None
         self.gaps = 0
-        self.lost_entries = 0  # as noted in the journal
+        self.lost_entries = 0  # number of lost entries according to the notes in the journal
         self.inputs = InputCounts(header.excitation_source)
         self.alarms = AlarmCheck(header, self.all_outputs)
 
     def batch(self, batch: Batch) -> None:
-        """Apply and compare a batch: runs at once, other entries one by one."""
+        """Apply and compare a batch. Each run is applied in one call, and all other entries are applied singly."""
         self.outputs_whole = not batch.damaged
         self.outputs_synced = self.outputs_synced and self.outputs_whole
         if batch.damaged:
@@ -205,10 +208,13 @@ class _Replay:
             self._compare_alarms(batch)
 
     def _run_ends(self, entries: Entries) -> Indexes:
-        """Return the rising indexes at which runs end, the last of which is the number of entries.
+        """Return the indexes at which runs end, in ascending order. The last index is the number of entries.
 
-        A run ends at a missing entry. Some entries are applied alone, so that runs end before and after them: late
-        samples, entries that change the motion, and a digest with which a run would begin.
+        A run ends at a missing entry. It also ends before and after each entry that must be applied singly:
+
+        - a late sample
+        - an entry that changes the motion
+        - a digest without a preceding sample in the run
         """
         count = len(entries)
         breaks = np.ones(count, bool)
@@ -246,13 +252,17 @@ class _Replay:
             self._note(Divergence(*difference))
 
     def _messages(self, sent: SentMessages, begin: int, end: int) -> None:
-        # the sink gets copies of the messages that a replay cannot compute; without a sink, the others are compared
+        # With a sink, messages that a replay cannot compute are copied to the sink. Without a sink, messages that a
+        # replay can compute are compared.
         chosen = (sent.kind[begin:end] >= 0) == (self.sink is None)
         for index in (begin + np.flatnonzero(chosen)).tolist():
             self.output(sent.record(index))
 
     def _run(self, entries: Entries, sent: SentMessages, begin: int, end: int) -> bool:
-        """Apply a run and compare its messages; return False, with nothing applied, if a sample is refused."""
+        """Apply a run and compare its messages.
+
+        If the session refuses a sample, no entry is applied and the method returns False.
+        """
         done: Indexes = np.cumsum(entries.sample, dtype=np.int64)
         digests = entries.digest_at
         stamps, wrench = entries.samples()
@@ -271,7 +281,7 @@ class _Replay:
             rows = self.rows[: len(stamps)]
         try:
             found = self.session.advance(stamps, wrench, rows, taken, done[digests])
-        except ValueError:  # the entries are then applied one by one
+        except ValueError:  # the caller applies the entries singly
             return False
         self.inputs.add(entries)
         self.report.entries += len(entries)
@@ -303,7 +313,7 @@ class _Replay:
         return True
 
     def _write_run(self, entries: Entries, found: Applied) -> None:
-        """Write a run, with a publication after each sample."""
+        """Write a run to the sink, with a publication after each sample."""
         assert self.sink is not None
         begin = 0
         for end in (*sorted(entries.others), len(entries)):
@@ -323,11 +333,11 @@ class _Replay:
         self.sink.write_publications(entries.sequence[samples], entries.log_time_ns[samples], published)
 
     def _write_entry(self, record: EntryRecord) -> None:
-        """Write an entry that has been applied, and the publication after it."""
+        """Write an entry that has been applied, and the publication that follows it, to the sink."""
         assert self.sink is not None
         entry = record.entry
         if isinstance(entry, Snapshot) and self.synced:
-            # the session's own snapshot has the output window of the publications written here
+            # the recorded snapshot refers to the recorded publications, and this one to the publications in the sink
             entry = self.session.snapshot()
         self.sink.write_entry(record.sequence, record.log_time_ns, entry)
         published = self.session.outputs.pop() if self.synced and isinstance(entry, Sample | Hold | Unload) else NOTHING
@@ -344,7 +354,7 @@ class _Replay:
         done: Indexes,
         first_step: int,
     ) -> list[tuple[int, int, str, str, str, str]]:
-        """Return the differences between the sent and the computed messages of a run."""
+        """Return the differences between the recorded and the computed messages of a run."""
         poses = [
             (int(entries.sequence[index]) & _SEQUENCE_MASK, first_step + int(done[index]) - 1, entry)
             for index, entry in sorted(entries.rest.items())
@@ -368,7 +378,7 @@ class _Replay:
         return differences
 
     def _difference(self, record: OutputRecord, published: Published) -> tuple[str, str, str] | None:
-        """Return the first difference between a recorded and a computed message."""
+        """Return the first difference between a recorded message and the computed message, or None."""
         name = self.topics[record.topic]
         computed = publication_messages(published, self.header.frame_id, self.header.child_frame_id).get(name)
         if computed is None:
@@ -377,7 +387,7 @@ class _Replay:
 
     def entry(self, record: EntryRecord) -> None:
         if not self.report.entries and self.header.part:
-            self.next_sequence = record.sequence  # the earlier parts are missing
+            self.next_sequence = record.sequence  # the recording has no earlier part
             self.alarms.give_up()
         missing = (record.sequence - self.next_sequence) & _SEQUENCE_MASK
         if 0 < (-missing & _SEQUENCE_MASK) <= self.in_a_row:
@@ -390,11 +400,11 @@ class _Replay:
             self.alarms.give_up()
             self.synced = self.outputs_synced = False
         elif record.sequence == 0 and not isinstance(record.entry, Snapshot):
-            # the first entry of a run: the state is the scene's initial state
+            # the recording is complete from its first entry, so the state is the initial state of the scene
             self.synced, self.outputs_synced = True, self.all_outputs and self.outputs_whole
         self.next_sequence = (record.sequence + 1) & _SEQUENCE_MASK
         self.in_a_row += 1
-        if not isinstance(record.entry, Dropped):  # a note of a loss may stand between the messages of one publication
+        if not isinstance(record.entry, Dropped):  # a note of a loss may lie between the messages of a publication
             self.messages = self.published = None
         self.report.entries += 1
         match record.entry:
@@ -430,13 +440,14 @@ class _Replay:
         try:
             self.session.apply(entry)
         except ValueError:
-            # if the live session used this entry, the next comparison fails
+            # if the live session accepted this entry, the next comparison shows a difference
             self.report.refused += 1
 
     def _snapshot(self, snapshot: Snapshot) -> None:
         if self.synced and self.outputs_synced:
             self.report.snapshots_compared += 1
-            # like the live session, `renew` drops all earlier states
+            # The live session discarded its earlier states when it took the snapshot. `renew` takes a snapshot and
+            # discards the earlier states, too, so that both sessions treat late samples alike.
             computed = self.session.renew().data
             self._compare("snapshot", snapshot.stamp_ns, "state", _hash(snapshot.data), _hash(computed))
             return
@@ -445,14 +456,17 @@ class _Replay:
             self.session.apply(snapshot)
         except (ValueError, struct.error) as error:
             raise RecordingError(f"{self.report.path}: snapshot at {snapshot.stamp_ns} ns: {error}") from error
-        # messages were lost but no entry, so only the motion can be compared
+        # no entry was lost, so the motion can be compared; the output window cannot, because messages were lost
         if before is not None:
             self._compare("snapshot", snapshot.stamp_ns, "state", self.session.twin.digest(), before)
         self.synced = self.resumed = True
         self.outputs_synced = self.all_outputs and self.outputs_whole
 
     def output(self, record: OutputRecord) -> None:
-        """Compare a recorded message with the message computed after the same journal entry."""
+        """Compare a recorded message with the message that the replay computes after the same journal entry.
+
+        With a sink, copy the message to the sink instead.
+        """
         if self.sink is not None:
             place = (record.topic, record.sequence, record.log_time_ns, record.publish_time_ns)
             self.sink.write_output(*place, record.message())
@@ -513,7 +527,7 @@ class _Replay:
 
 
 def _warm_up(scene: Scene, tol: float, templates: Templates, *, rows: bool) -> None:
-    """Compile the kernels of a replay beforehand, so that its measured time excludes compiling."""
+    """Compile the kernels of a replay, so that the measured time of the replay does not contain the compilation."""
     session = Session(Twin(scene, tol=tol, excitation="sampled"))
     stamps = np.arange(1, 3, dtype=np.int64) * 1000
     memory = np.zeros(2, ROW) if rows else None
@@ -533,7 +547,7 @@ def _hash(data: bytes) -> str:
 
 
 def _first_difference(record: OutputRecord, computed: Message) -> tuple[str, str, str]:
-    """Return the first field in which two messages differ, with its recorded and computed value."""
+    """Return the first field in which two messages differ, with the recorded and the computed value of the field."""
     try:
         recorded = decode(record.data, record.message_type)
     except RecordingError:

@@ -1,4 +1,4 @@
-"""The result of a replay."""
+"""Report of a replay."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from plow_twin.record.reader import FileStatus
 
 @dataclass(frozen=True)
 class Divergence:
-    """A difference between recording and replay at advance number `step` (from 0), on `topic`, in `field`."""
+    """A value that differs between recording and replay. `step` is the number of the advance, counted from 0."""
 
     step: int
     stamp_ns: int
@@ -29,11 +29,20 @@ class Divergence:
 
 @dataclass
 class ReplayReport:
-    """The result of a replay; `compared` and `not_compared` count messages by base name of their topic.
+    """Result of a replay.
 
-    `inputs` counts messages by input and outcome, and `repeated` the entries that occur more than once.
-    `repeated_parts` maps each file that repeats a part to the file that is read, and `foreign_parts` maps each file of
-    another run to the keys of its header that differ.
+    Attributes
+    ----------
+    refused, repeated : int
+        Number of entries that the session refused, and number of entries that occurred before.
+    compared, not_compared : Counter
+        Numbers of messages that were compared, and that could not be compared, by base name of the topic.
+    repeated_parts : dict
+        Files that repeat a part, with the file that was read instead.
+    foreign_parts : dict
+        Files of another run, with the keys of the header that differ.
+    inputs : dict
+        Number of received messages, by input and by outcome.
     """
 
     path: Path
@@ -61,20 +70,20 @@ class ReplayReport:
 
     @property
     def messages_compared(self) -> int:
-        """Number of messages compared on all topics."""
+        """Number of messages that were compared, on all topics."""
         return self.compared.total()
 
     @property
     def loss(self) -> bool:
-        """Whether a part of the run is missing in the file, or no message in it could be compared."""
+        """Whether the recording is incomplete, or nothing in it could be compared."""
         return bool(self.lost) or self.status is not FileStatus.COMPLETE or self.nothing
 
     @property
     def nothing(self) -> bool:
-        """Whether no message in the file could be compared."""
+        """Whether no message and no digest could be compared."""
         return self.messages_compared + self.digests_compared == 0
 
     @property
     def exit_code(self) -> int:
-        """0: equal bit for bit; 1: diverged; 3: equal as far as it could be compared, with losses."""
+        """Exit code of the command: 0 (equal), 1 (a value differs) or 3 (equal, but the recording is incomplete)."""
         return 1 if self.first_divergence is not None else 3 if self.loss else 0

@@ -1,4 +1,4 @@
-"""The ring: the newest seconds of a run, kept in memory as parts of a recording and written to a folder on request."""
+"""Keep the last seconds of a run in memory, as parts of a recording, and write them to a folder on request."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from plow_twin.record.mcap_file import ByteFile, MemoryFile
 from plow_twin.record.metadata_yaml import PartFacts, bag_metadata, write_metadata
 from plow_twin.record.writer import RunWriter, make_folder, shortage
 
-#: Number of parts of a full ring; the oldest part is dropped as a whole.
+#: Number of parts in a full ring. Only whole parts are dropped.
 PARTS: Final = 8
 
 
 class RingWriter(RunWriter):
-    """A recording in memory that drops its oldest parts.
+    """Recording in memory that drops its oldest parts.
 
-    `folder` only names the recording. At least the newest `ring_s` seconds are kept, and up to an eighth more. With
-    `sync_dumps`, `dump` waits for the disk.
+    The ring contains at least the last `ring_s` seconds, and up to an eighth more. The folder is not created; it only
+    gives the recording its name. With `sync_dumps`, the method `dump` waits until the data are on the disk.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class RingWriter(RunWriter):
         sync_dumps: bool = False,
     ) -> None:
         self._ring_s, self._sync_dumps = ring_s, sync_dumps
-        self._kept: list[tuple[float, PartFacts, bytes]] = []  # start [s], facts and content of each part
+        self._kept: list[tuple[float, PartFacts, bytes]] = []  # start [s], description and content of each part
         self._begun = time.monotonic()
         super().__init__(folder, header, chunk_size, min_free_bytes)
         self.path = folder
@@ -46,7 +46,7 @@ class RingWriter(RunWriter):
         return MemoryFile()
 
     def _prepare(self, folder: Path) -> None:
-        """A ring needs no folder."""
+        """Do nothing, because a ring needs no folder."""
 
     @property
     def bytes_written(self) -> int:
@@ -54,11 +54,11 @@ class RingWriter(RunWriter):
         return sum(len(content) for _, _, content in self._kept) + self.part_bytes
 
     def shortage(self) -> str | None:
-        """Return None, because a ring needs no disk."""
+        """Return None, because a ring uses no disk space."""
         return None
 
     def split(self, loss: Mapping[str, int], keep_bytes: int = 0) -> None:
-        """Start a new part and drop the parts that are older than the length of the ring."""
+        """Start a new part, and drop the parts that the ring no longer needs."""
         old = self._part
         super().split(loss, 0)
         assert isinstance(old.file.out, MemoryFile)
@@ -68,17 +68,17 @@ class RingWriter(RunWriter):
             self._kept.pop(0)
 
     def dump(self, folder: Path, loss: Mapping[str, int]) -> None:
-        """Write all parts that have ended to a new folder and drop them.
+        """Write all completed parts to a new folder, and remove them from memory.
 
         Raises
         ------
         TakenError
-            The folder has another recording.
+            The folder contains another recording.
         OSError, RecordingError
-            The folder cannot be written; the ring stays as it is.
+            The folder cannot be written. The parts then stay in memory.
         """
         make_folder(folder)
-        with ExitStack() as undone:  # removes an incomplete ring
+        with ExitStack() as undone:  # after an error, the files written so far are removed
             undone.callback(_remove, folder)
             self._dump(folder, loss, undone)
             undone.pop_all()
@@ -87,7 +87,7 @@ class RingWriter(RunWriter):
         self._kept = []
 
     def _dump(self, folder: Path, loss: Mapping[str, int], undone: ExitStack) -> None:
-        """Write the parts to a folder; `undone` receives the removal of each file, for a failure."""
+        """Write the parts to a folder, and register the removal of each file with `undone`."""
         if (short := shortage(folder, self._min_free_bytes)) is not None:
             raise RecordingError(short)
         facts = []
@@ -107,7 +107,7 @@ class RingWriter(RunWriter):
         write_metadata(folder, bag_metadata(facts, loss), sync=self._sync_dumps)
 
     def close(self, loss: Mapping[str, int], stop_reason: str | None = None) -> None:
-        """Free the memory."""
+        """Remove all parts from memory."""
         self._kept = []
 
 

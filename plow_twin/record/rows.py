@@ -1,4 +1,4 @@
-"""The messages of a batch as arrays of numbers, which are cheaper than message objects."""
+"""Read the numbers in the messages of a batch as arrays, which is faster than decoding each message."""
 
 from __future__ import annotations
 
@@ -19,7 +19,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rows:
-    """Messages on one topic in order: `sequence` and `stamp_ns` (n,), `numbers` (n, k) in the order of the template."""
+    """Numbers of the messages on one topic.
+
+    Attributes
+    ----------
+    sequence, stamp_ns : ndarray of int64, shape (n,)
+        Sequence number and stamp [ns] of each message.
+    numbers : ndarray, shape (n, k)
+        Numbers of each message, in the order of the template.
+    """
 
     sequence: Indexes
     stamp_ns: Indexes
@@ -30,7 +38,7 @@ class Rows:
 
     @classmethod
     def joined(cls, parts: list[Self]) -> Self:
-        """Return the rows of several chunks as one."""
+        """Return the rows of several chunks in one object."""
         if len(parts) == 1:
             return parts[0]
         sequence, stamp_ns, numbers = (
@@ -42,10 +50,11 @@ class Rows:
 def rows_by_topic(
     outputs: list[Outputs], topics: Mapping[str, str], templates: Mapping[str, Template]
 ) -> dict[str, Rows]:
-    """Return the rows of each topic that has messages.
+    """Return the numbers of all messages on each topic that has messages.
 
-    `topics` has the base name of each topic, and `templates` the template of each base name. A message whose texts
-    differ from its template is decoded; a message with another count of numbers is left out.
+    `topics` maps each topic to its base name, and `templates` maps each base name to its template. A message that does
+    not match the template, because a string in it differs, is decoded. A message with another number of values is
+    omitted.
     """
     found: dict[str, list[Rows]] = {}
     for part in outputs:

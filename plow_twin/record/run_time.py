@@ -1,4 +1,4 @@
-"""The time that the journal of a run covers: its span and its silences."""
+"""Determine the duration of a run, and its intervals without samples (silences), from the journal."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _TIMEOUT = "excitation_timeout"
 
 
 class RunTime:
-    """Measure the time of a run from its entries in order.
+    """Duration and silences of a run, from its journal entries in order.
 
-    `parameters` are the node's parameters in the run's header, of which `excitation_timeout` is used.
+    Of the node's parameters, `excitation_timeout` is used: a longer interval without samples is a silence.
     """
 
     def __init__(self, parameters: Mapping[str, Any]) -> None:
@@ -30,13 +30,18 @@ class RunTime:
 
     @property
     def span_s(self) -> float:
-        """Time from the first advance to the last [s]; steps of the clock at resets are not counted."""
+        """Time from the first advance to the last advance [s], without steps of the clock at resets."""
         return self._span_ns * 1e-9
 
     def add(self, entries: Entries) -> list[tuple[int, int, int]]:
-        """Add entries; return the silences that end in them: index of the ending sample, begin and end [ns].
+        """Add entries, and return the silences that end at these entries.
 
-        A time with missing entries is no silence.
+        An interval with missing entries is not a silence.
+
+        Returns
+        -------
+        list of tuple
+            Index of the sample that ends the silence, and begin and end of the silence [ns].
         """
         found, done, missing = [], 0, self._holes.find(entries)
         samples = np.flatnonzero(entries.sample)
@@ -61,7 +66,7 @@ class RunTime:
             case Reset() | SetWear() | Restore():
                 self._reached_ns = None
                 self.silences.restart()
-            case Loss():  # samples may be among the lost entries
+            case Loss():  # some of the lost entries may be samples
                 self.silences.restart()
             case Parameter(name, value) if name == _TIMEOUT:
                 self.silences.timeout_s = float(value)

@@ -1,4 +1,4 @@
-"""Search for the recording that is being written now."""
+"""Find a recording that is being written."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from plow_twin.record.reader import read_header, run_parts
 
 
 def find_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False) -> Path:
-    """Return `running_run`, or else the existing recording at `path`.
+    """Return the result of `running_run` or, if it is None, the path of the existing recording `path`.
 
     Raises
     ------
     RecordingError
-        There is no recording.
+        No recording exists.
     """
     found = running_run(path, wait_s, stop)
     if found is None and not path.exists():
@@ -27,9 +27,10 @@ def find_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False
 
 
 def running_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False) -> Path | None:
-    """Return the recording that is being written at `path` or beside it (`<path>_2`, ...).
+    """Return the recording that is being written to the folder `path`, or to `<path>_2`, `<path>_3`, ....
 
-    Returns None if no recording is being written within `wait_s` [s], or once `stop` returns True.
+    If no recording is being written, the function waits. It returns None after `wait_s` [s], or when `stop` returns
+    True.
     """
     deadline = time.monotonic() + wait_s
     while True:
@@ -40,7 +41,7 @@ def running_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: Fa
                     claimed = is_claimed(stream.fileno())
                 if claimed and read_header(parts[0]) is not None:
                     return candidate
-            except (RecordingError, OSError):  # the recording has not begun yet, or was just removed
+            except (RecordingError, OSError):  # the recording is not complete enough to be read, or was just removed
                 continue
         if stop() or time.monotonic() >= deadline:
             return None
@@ -48,7 +49,7 @@ def running_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: Fa
 
 
 def _candidates(path: Path) -> list[Path]:
-    """Return `path` and the folders `<path>_2`, ... that a recorder makes when `path` exists, the newest first."""
+    """Return `path` and the existing folders `<path>_2`, `<path>_3`, ..., in descending order."""
     numbered: list[tuple[int, Path]] = [(1, path)]
     if path.parent.is_dir():
         for other in path.parent.glob(f"{path.name}_*"):

@@ -1,4 +1,4 @@
-"""The messages of a publication as bytes to send; one compiled call makes all messages of a record."""
+"""Encode the messages of a publication; one compiled call writes all messages that contain the same record."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from plow_twin.solve.state import ROW
 from plow_twin.stream.outputs import NOTHING, Published
 from plow_twin.stream.topics import Cadence, Topic, topics_of
 
-#: Size of a number in a record [B].
+#: Size of each number in a record [B].
 _WORD: Final = 8
 
 
 class Messages:
-    """Write the messages of each publication to the same memory.
+    """Encoder that writes the messages of each publication to the same memory.
 
-    `frame_id` and `child_frame_id` are named in the messages. With `intervals`, there are also messages with the 5 % to
-    95 % intervals of forces.
+    `frame_id` and `child_frame_id` are the frames in the messages. With `intervals`, there are also messages that
+    contain the intervals from 5 % to 95 % of the forces.
     """
 
     def __init__(self, frame_id: str, child_frame_id: str, *, intervals: bool = False) -> None:
@@ -31,14 +31,19 @@ class Messages:
             for cadence in (Cadence.EACH, Cadence.SLOW, Cadence.MARKED, Cadence.FOLLOWED)
         ]
         self._followed = followed if intervals else None
-        #: for each topic (base name), the memory that receives its message
+        #: memory that contains the message of each topic, by base name
         self.memory = dict(part for group in groups[: 3 + intervals] for part in group.parts)
 
     def write(self, published: Published) -> tuple[tuple[str, memoryview], ...]:
-        """Return the topic and bytes of each message of a publication of one row, in the order of sending.
+        """Return the messages of a publication that has one row, in the order of sending.
 
-        The bytes are valid until the next call. The result is empty if a number is not finite. The messages of
-        `intervals` are not included.
+        Messages with intervals are not included; the method `intervals` returns them. The next call overwrites the
+        bytes.
+
+        Returns
+        -------
+        tuple of (str, memoryview)
+            Base name of the topic, and bytes of the message. The tuple is empty if a number is not finite.
         """
         rows, slow = published
         if not self._each.fill(rows) or (len(slow) and not self._slow.fill(slow)):
@@ -52,23 +57,24 @@ class Messages:
         return found
 
     def intervals(self, published: Published) -> tuple[tuple[str, memoryview], ...]:
-        """Return the topic and bytes of each message with intervals of a publication, like `write`."""
+        """Return the messages with the intervals of a publication, in the form of `write`."""
         wanted = self._followed is not None and published.with_intervals and self._followed.fill(published.rows)
         return self._followed.parts if self._followed is not None and wanted else ()
 
 
 class _Group(NamedTuple):
-    """Buffer of the messages that are made from one record; only stamps and numbers change."""
+    """Buffer with the messages that contain the same record. Only the stamps and numbers change."""
 
-    #: base name of each topic, and the part of `buffer` with its message
+    #: base name of each topic, and the part of `buffer` that contains its message
     parts: tuple[tuple[str, memoryview], ...]
     buffer: NDArray[np.uint8]
     #: offset of each message in the buffer [B]
     starts: NDArray[np.int64]
-    #: for each number: its offset in the buffer [B] and in the record [words], and whether it is an integer in the
-    #: record
+    #: offset of each number in the buffer [B]
     places: NDArray[np.int64]
+    #: offset of each number in the record [words of 8 bytes]
     sources: NDArray[np.int64]
+    #: whether each number is an integer in the record
     integers: NDArray[np.bool_]
 
     @classmethod
@@ -90,7 +96,7 @@ class _Group(NamedTuple):
 
 
 def _sources(topic: Topic) -> NDArray[np.int64]:
-    """Return the offsets of a message's numbers in its record [words]."""
+    """Return the offset of each number of a message in the record [words of 8 bytes]."""
     fields: Any = topic.record_type.fields
     return np.concatenate([fields[name][1] // _WORD + np.arange(count) for name, count in topic.parts])
 
@@ -101,7 +107,7 @@ def _integers(topic: Topic) -> NDArray[np.bool_]:
 
 
 def warm_up() -> None:
-    """Compile the kernels, or load them from the cache on disk."""
+    """Compile the kernel, or load it from the cache on the disk."""
     Messages("", "").write(Published(np.zeros(1, ROW), NOTHING.slow))
 
 

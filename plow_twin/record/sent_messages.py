@@ -1,4 +1,4 @@
-"""The messages that a run has sent, as one sequence in the order of the journal."""
+"""The recorded messages of a run as one sequence in the order of the journal."""
 
 from __future__ import annotations
 
@@ -16,9 +16,17 @@ from plow_twin.record.template import Indexes
 
 @dataclass(frozen=True)
 class SentMessages:
-    """Sent messages of many chunks in order of sequence number; an index counts over all chunks.
+    """Recorded messages of several chunks in the order of their sequence numbers.
 
-    `kind` is the index of a message's topic in `PUBLICATION_TOPICS`, -1 for other topics. Part k begins at `begins[k]`.
+    Attributes
+    ----------
+    parts : list of Outputs
+        Messages of each chunk.
+    begins : ndarray of int64, shape (k + 1,)
+        Index of the first message of each part in the whole sequence, and the number of all messages.
+    sequence, kind : ndarray of int64, shape (n,)
+        Sequence number of each message, and index of its topic in `PUBLICATION_TOPICS`. The index is -1 for any other
+        topic.
     """
 
     parts: list[Outputs]
@@ -28,13 +36,14 @@ class SentMessages:
 
     @classmethod
     def of(cls, outputs: list[Outputs], topics: Mapping[str, str]) -> Self:
-        """Collect messages; `topics` has the base names of the topics that a replay can compute."""
-        # many parts share one mapping of topics
+        """Collect messages; `topics` maps the topics that a replay can compute to their base names."""
+        # the tables are created once for each dictionary of topics, which many parts have in common
         tables = {id(part.topics): _kinds(part.topics, topics) for part in outputs}
         sequence = _joined(part.sequence for part in outputs)
         kind = _joined(tables[id(part.topics)][part.messages.channel] for part in outputs)
         begins = np.cumsum([0, *map(len, outputs)])
-        if (sequence[1:] < sequence[:-1]).any():  # the file is from another recorder, so each message becomes a part
+        if (sequence[1:] < sequence[:-1]).any():
+            # another program wrote the file; with a part for each message, the parts can be sorted
             order = np.argsort(sequence, kind="stable")
             owner = np.searchsorted(begins, order, side="right") - 1
             places = zip(owner.tolist(), (order - begins[owner]).tolist(), strict=True)
@@ -46,16 +55,19 @@ class SentMessages:
         return len(self.sequence)
 
     def before(self, sequence: int) -> int:
-        """Return the number of messages sent before the entry with this number."""
+        """Return the number of messages that were sent before the journal entry with this sequence number."""
         return int(np.searchsorted(self.sequence, sequence))
 
     def record(self, index: int) -> OutputRecord:
-        """Return one message."""
+        """Return the message at `index`."""
         part = int(np.searchsorted(self.begins, index, side="right")) - 1
         return self.parts[part].record(index - int(self.begins[part]))
 
     def pieces(self, begin: int, end: int) -> Iterator[tuple[Messages, int, int]]:
-        """Yield the messages from `begin` to before `end` chunk by chunk, each with its first and end index."""
+        """Yield the messages with the indexes `begin` to `end - 1`, chunk by chunk.
+
+        The two integers are the index of the first message of a piece, and the index after its last message.
+        """
         first = int(np.searchsorted(self.begins, begin, side="right")) - 1
         while begin < end:
             origin, behind = self.begins[first : first + 2].tolist()

@@ -1,7 +1,7 @@
-"""Any recording as a stream of messages: MCAP or rosbag2's sqlite3 (a file or a folder of parts), CSV, or Parquet.
+"""Read the messages of any recording: MCAP or sqlite3 of rosbag2 (a file, or a folder of parts), CSV, or Parquet.
 
-Messages come in the order in which they were written, and only some chunks are in memory at a time. Unreadable messages
-are counted and skipped, and a truncated file is read as far as possible.
+Messages are read in the order in which they were written, and only a few chunks are in memory at a time. Messages that
+cannot be decoded are counted and skipped. A truncated file is read as far as possible.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from plow_twin.scene_file.parquet_lines import is_parquet
 
 _SQLITE_MAGIC: Final = b"SQLite format 3\0"
 _ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
-#: Largest message that is unpacked [B].
+#: Largest size of a decompressed message [B].
 _LARGEST_MESSAGE: Final = 2**26
-#: Finds views, virtual tables and computed columns; reading a table with these may never end.
+#: Query that finds views, virtual tables and computed columns. Reading these may never end, so the file is refused.
 _COMPUTED: Final = """
     SELECT 1 FROM sqlite_master
     WHERE name COLLATE NOCASE IN ('topics', 'messages') AND (type != 'table' OR rootpage = 0)
@@ -41,18 +41,21 @@ _COMPUTED: Final = """
     UNION ALL SELECT 1 FROM pragma_table_xinfo('topics') WHERE hidden LIMIT 1
 """
 _MESSAGES: Final = "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
-#: Errors for a damaged file, for text that is not UTF-8, and for cells of impossible length.
+#: Errors that sqlite3 raises for a damaged file, for text that is not UTF-8, and for cells with an invalid length.
 _SQLITE_ERRORS: Final = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """The type of a topic whose messages are lines: the names of the columns, or the keys of the first JSON object."""
+    """Type of a topic whose messages are lines of text.
+
+    The names are the columns of a table, or the keys of the first JSON object.
+    """
 
     names: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Return the names as readable text, with a hint if the header row seems missing or the separator wrong."""
+        """Return the names for a message, with a hint if the header row or the separators seem to be missing."""
         if not any(self.names):
             return "columns (none: is it empty?)"
         names = ", ".join(ascii(name) if "," in name or not name.isprintable() else name for name in self.names)
@@ -64,45 +67,45 @@ class Columns:
         return f"columns {names}{hint}"
 
 
-#: Type of a topic: the name of a ROS type, `json`, or the columns of a table.
+#: Type of a topic, which is the name of a ROS type, `json`, or the columns of a table.
 TopicType: TypeAlias = str | Columns
 
 
 @dataclass(frozen=True, slots=True)
 class Arrived:
-    """A message: topic, when it was received [ns], and its fields by path (`wrench.force.x`)."""
+    """A received message. `content` contains the fields, which are accessed by paths such as `wrench.force.x`."""
 
     topic: str
-    #: receive time [ns], or `NO_TIME`
+    #: receive time [ns], or `NO_TIME` if it is unknown
     log_time_ns: int
     content: Any
-    #: whether the broker had retained the message from before the subscription
+    #: whether the message was sent before the subscription and retained by the MQTT broker
     retained: bool = False
-    #: whether messages before this message are missing, because a part is absent or damaged
+    #: whether messages before this message are missing, because a part is missing or damaged
     after_hole: bool = False
 
 
 @dataclass
 class Losses:
-    """Counts of unused messages of a recording by reason, and the topics of unknown type."""
+    """Numbers of unused messages of a recording by reason, and the topics whose type is unknown."""
 
     counts: Counter[str] = field(default_factory=Counter)
     unknown_types: dict[str, str] = field(default_factory=dict)
 
 
 class Source(Protocol):
-    """A recording; only messages of topics for which `wanted` is true are decoded.
-
-    If each topic has its own file, messages are put in order by `stamp_ns`.
-    """
+    """A recording."""
 
     losses: Losses
 
     def topics(self) -> Mapping[str, TopicType]:
-        """Return types by topic."""
+        """Return the type of each topic."""
 
     def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf[Arrived] | None = None) -> Iterator[Arrived]:
-        """Yield the messages on wanted topics."""
+        """Yield the messages on the topics for which `wanted` returns True.
+
+        If each topic has a file, the messages of several files are merged by their stamps, which `stamp_ns` returns.
+        """
 
 
 def open_source(path: Path) -> Source:
@@ -111,7 +114,7 @@ def open_source(path: Path) -> Source:
     Raises
     ------
     RecordingError
-        There is no recording that can be read.
+        The path is not a recording that can be read.
     """
     if path.is_dir():
         missing = [Path(name) for name in missing_files(path)]
@@ -144,7 +147,7 @@ def open_source(path: Path) -> Source:
 
 
 def packed(path: Path) -> str:
-    """Return a hint if rosbag2 has compressed whole files, which cannot be read; otherwise an empty text."""
+    """Return a hint if rosbag2 has compressed a whole file, which cannot be read; otherwise an empty string."""
     files = sorted(path.glob("*.zstd")) if path.is_dir() else [path] if path.suffix == ".zstd" else []
     return f" ({files[0].name} is compressed as a whole: unpack it with zstd -d)" if files else ""
 
@@ -161,7 +164,7 @@ def _decompressed(data: bytes) -> bytes:
 
 
 class Decoder:
-    """Decoder of CDR: the types of ROS 2 Jazzy, and types with a schema in the recording."""
+    """Decoder of CDR messages for the types of ROS 2 Jazzy, and for types whose schema the recording contains."""
 
     def __init__(self, losses: Losses) -> None:
         from rosbags.typesys import Stores, get_typestore
@@ -170,14 +173,14 @@ class Decoder:
         self._store = get_typestore(Stores.ROS2_JAZZY)
 
     def knows(self, topic: str, message_type: str, schema: str = "") -> bool:
-        """Return whether a type can be decoded; any other type is noted as unknown."""
+        """Return whether a type can be decoded; if it cannot, add the topic to the unknown types."""
         from plow_twin.record.foreign_types import parsed_types
 
         if message_type not in self._store.types and schema:
             try:
                 types = parsed_types(schema, message_type)
                 self._store.register({name: type_ for name, type_ in types.items() if name not in self._store.types})
-            except Exception:  # the schema may be in another language, damaged, or endless
+            except Exception:  # the schema may be damaged, too large, or in another schema language
                 self._losses.unknown_types[topic] = message_type
         if message_type in self._store.types:
             return True
@@ -185,20 +188,20 @@ class Decoder:
         return False
 
     def reads(self, channel: Channel) -> bool:
-        """Return whether an MCAP channel can be decoded; any other channel is noted as unknown with its encoding."""
+        """Return whether an MCAP channel can be decoded; if it cannot, add its topic to the unknown types."""
         if channel.encoding != "cdr":
             self._losses.unknown_types[channel.topic] = f"{channel.message_type} encoded as {channel.encoding}"
             return False
         return self.knows(channel.topic, channel.message_type, channel.schema.decode(errors="replace"))
 
     def decode(self, data: bytes, message_type: str) -> Any | None:
-        """Return a message, or None for bytes that cannot be decoded; these are counted."""
+        """Return the decoded message. If the bytes cannot be decoded, count the message and return None."""
         if data.startswith(_ZSTD_MAGIC):
             data = _decompressed(data)
-        for end in (len(data), len(data) - 8):  # rclpy adds 8 stray bytes after a final empty float64[]
+        for end in (len(data), len(data) - 8):  # after a final empty float64[], rclpy appends 8 meaningless bytes
             try:
                 return self._store.deserialize_cdr(data[:end], message_type)
-            except Exception:  # rosbags does not catch index, struct, unicode and assertion errors
+            except Exception:  # rosbags lets index, struct, unicode and assertion errors of damaged bytes escape
                 continue
         self._losses.counts["undecodable"] += 1
         return None
@@ -210,7 +213,7 @@ def _behind_holes(parts: Sequence[Path], missing: Sequence[Path]) -> set[Path]:
 
 
 class McapSource:
-    """The MCAP files of a recording in order; `missing` are the files that the recording should have and lacks."""
+    """A recording in MCAP files. `missing` contains the files in `metadata.yaml` that do not exist."""
 
     def __init__(self, parts: list[Path], missing: Sequence[Path] = ()) -> None:
         self.parts = parts
@@ -218,7 +221,7 @@ class McapSource:
         self._behind_holes = _behind_holes(parts, missing)
 
     def topics(self) -> dict[str, str]:
-        """Return types by topic, from the first chunks of each part."""
+        """Return the type of each topic in the first chunks of each part."""
         found: dict[str, str] = {}
         for part in self.parts:
             if len(self.parts) > 1 and not is_mcap(part):
@@ -231,7 +234,7 @@ class McapSource:
         return found
 
     def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf[Arrived] | None = None) -> Iterator[Arrived]:
-        """Yield the messages on wanted topics."""
+        """Yield the messages on the topics for which `wanted` returns True, in the order of the files."""
         decoder = Decoder(self.losses)
         hole = False
         for part in self.parts:
@@ -267,7 +270,10 @@ class McapSource:
 
 
 class SqliteSource:
-    """A recording in files of rosbag2's sqlite3 storage without the files `missing`; damaged files are skipped."""
+    """A recording in files of the sqlite3 storage of rosbag2; damaged files are skipped.
+
+    `missing` contains the files in `metadata.yaml` that do not exist.
+    """
 
     def __init__(self, parts: list[Path], missing: Sequence[Path] = ()) -> None:
         self.parts = sorted(parts, key=part_number)
@@ -277,7 +283,7 @@ class SqliteSource:
         self._behind_holes = _behind_holes(parts, missing)
 
     def _open(self, path: Path) -> sqlite3.Connection:
-        log = path.with_name(path.name + "-wal")  # the log has the last messages of a killed recorder
+        log = path.with_name(path.name + "-wal")  # if the recorder was killed, the log contains its last messages
         kept = log.is_file() and log.stat().st_size > 0
         place = quote(path.resolve().as_posix())
         connection = sqlite3.connect(f"file:{place}?mode=ro" + ("" if kept else "&immutable=1"), uri=True)
@@ -285,7 +291,7 @@ class SqliteSource:
             try:
                 connection.execute("SELECT 1 FROM sqlite_master")
             except sqlite3.OperationalError:
-                # in a read-only folder the log cannot be opened
+                # sqlite3 cannot open the log in a read-only folder, so the file is read without the log
                 connection.close()
                 connection = sqlite3.connect(f"file:{place}?mode=ro&immutable=1", uri=True)
                 self._unread.add(path)
@@ -298,7 +304,7 @@ class SqliteSource:
         return connection
 
     def topics(self) -> dict[str, str]:
-        """Return types by topic.
+        """Return the type of each topic.
 
         Raises
         ------
@@ -316,7 +322,10 @@ class SqliteSource:
 
     @contextmanager
     def _reading(self, part: Path) -> Iterator[tuple[sqlite3.Connection | None, list[tuple[int, str, str]]]]:
-        """Open a file and read its topics as (number, name, type); a damaged file gives None and no topics."""
+        """Open a file and read its topics, each with number, name and type.
+
+        For a damaged file, the connection is None and the list of topics is empty.
+        """
         topics: list[tuple[int, str, str]] = []
         with ExitStack() as opened:
             try:
@@ -331,7 +340,7 @@ class SqliteSource:
             yield connection, topics
 
     def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf[Arrived] | None = None) -> Iterator[Arrived]:
-        """Yield the messages on wanted topics."""
+        """Yield the messages on the topics for which `wanted` returns True, in the order of the files."""
         decoder = Decoder(self.losses)
         hole = False
         for part in self.parts:
@@ -361,14 +370,17 @@ class SqliteSource:
 
 
 class CsvSource:
-    """CSV files with a header line and Parquet files; each is a topic with the name of the file without its ending."""
+    """A recording in CSV files with a header row, or in Parquet files.
+
+    Each file is a topic, whose name is the file name without extension.
+    """
 
     def __init__(self, parts: list[Path]) -> None:
         self.parts = parts
         self.losses = Losses()
 
     def topics(self) -> dict[str, TopicType]:
-        """Return the columns by topic."""
+        """Return the columns of each topic."""
         found: dict[str, TopicType] = {}
         for part in self.parts:
             try:
@@ -380,7 +392,10 @@ class CsvSource:
         return found
 
     def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf[Arrived] | None = None) -> Iterator[Arrived]:
-        """Yield the rows of all files in order of their stamps, by default those in column `t`, `time` or the first."""
+        """Return an iterator over the rows of the wanted files in the order of their stamps.
+
+        Without `stamp_ns`, the stamp is read from the column `t`, the column `time`, or the first column.
+        """
         streams = [self._rows(part) for part in self.parts if wanted(part.stem)]
         if len(streams) == 1:
             return streams[0]
@@ -400,12 +415,14 @@ class CsvSource:
 
 
 def read_table(path: Path) -> tuple[Columns, Iterator[list[str]]]:
-    """Return the columns of a CSV or Parquet file and its rows, one at a time; lines that begin with `#` are skipped.
+    """Return the columns of a CSV or Parquet file, and an iterator over its rows.
+
+    Lines that begin with `#` are skipped.
 
     Raises
     ------
     RecordingError
-        The file cannot be read, or two columns have the same name. Reading the rows may raise it too.
+        The file cannot be read, or two columns have the same name. The iterator raises the error, too.
     """
     rows = _table_rows(path)
     names = tuple(name.strip() for name in next(rows, ()))
@@ -413,12 +430,12 @@ def read_table(path: Path) -> tuple[Columns, Iterator[list[str]]]:
 
 
 def read_columns(path: Path, names: Sequence[str]) -> NDArray[np.float64]:
-    """Return the numbers of these columns of a CSV or Parquet file, shape (n, k).
+    """Return the numbers in the columns `names` of a CSV or Parquet file, shape (n, k).
 
     Raises
     ------
     RecordingError
-        As in `read_table`, or a column or a number is missing.
+        The file cannot be read, a column occurs twice, or a column or a number is missing.
     """
     columns, rows = read_table(path)
     if not set(names) <= set(columns.names):
@@ -442,7 +459,7 @@ def _table_rows(path: Path) -> Iterator[list[str]]:
 
 
 def columns_of(source: Path | str, names: Sequence[str]) -> Columns:
-    """Return the columns of a source.
+    """Return the columns with these names; `source` is named in an error.
 
     Raises
     ------
@@ -461,5 +478,5 @@ def _log_time_ns(arrived: Arrived) -> int | None:
 
 
 def _row_time_ns(cell: str) -> int:
-    """Return the time in a cell, in seconds or, if it is too large for seconds, in a smaller unit."""
+    """Return the time in a cell [ns]. A number that is too large for seconds is read in a smaller unit."""
     return next((found for unit in STAMP_UNITS if (found := time_ns(cell, unit)) is not None), NO_TIME)

@@ -1,7 +1,8 @@
-"""Templates of messages of fixed length: bytes with places for numbers, which are filled in or compared many at a time.
+"""Templates, with which many messages of the same length are written or read in one compiled call.
 
-Messages with equal texts differ only in the stamp and in some float64 numbers. Their places are found by encoding the
-message once with numbers that occur nowhere else.
+If all strings of two messages are equal, the messages differ only in the stamp and in float64 numbers. A template
+contains the bytes that are equal, and the offsets of the numbers. The offsets are found by encoding a message with
+numbers that occur nowhere else in it.
 """
 
 from __future__ import annotations
@@ -22,22 +23,29 @@ from plow_twin.record.words import set_word, word
 Bytes = NDArray[np.uint8]
 Indexes = NDArray[np.int64]
 
-#: Offset of the stamp, after the four bytes that name the encoding.
+#: Offset of the stamp [B]. It follows the four bytes that identify the encoding.
 STAMP_AT: Final = 4
 _SECOND_NS: Final = 1_000_000_000
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function whose arguments are arrays of bytes."""
+    """Return the compiled function, whose arguments are arrays of bytes."""
     dispatcher: Callable[..., Any] = kept(function)
     return dispatcher
 
 
 @dataclass(frozen=True)
 class Template:
-    """The bytes of a message (`data`) and the offsets of its numbers (`places`, shape (count,)).
+    """Template of messages.
 
-    `fixed` is a mask whose bits are set in the bytes that do not change.
+    Attributes
+    ----------
+    data : ndarray of uint8, shape (size,)
+        Bytes of a message in which the stamp and the numbers are 0.
+    places : ndarray of int64, shape (count,)
+        Offset of each number [B].
+    fixed : ndarray of uint8, shape (size,)
+        Mask of the bytes that are equal in all messages: 255 for an equal byte, otherwise 0.
     """
 
     message_type: str
@@ -47,12 +55,12 @@ class Template:
 
     @classmethod
     def of(cls, build: Callable[[NDArray[np.float64]], Message], count: int) -> Self:
-        """Make the template of the messages that `build` makes from `count` numbers, with stamp 0.
+        """Return the template of the messages that `build` creates from an array of `count` numbers.
 
         Raises
         ------
         RecordingError
-            The message does not contain a number as given.
+            A message does not contain one of the numbers unchanged.
         """
         marks = np.frombuffer(np.arange(0x3FD1_2345_6789_0000, 0x3FD1_2345_6789_0000 + count, dtype=np.int64).tobytes())
         message = build(marks)
@@ -72,16 +80,16 @@ class Template:
 
     @property
     def count(self) -> int:
-        """Count of the numbers in a message."""
+        """Number of float64 numbers in a message."""
         return len(self.places)
 
 
 @compiled
 def _fits(buffer: Bytes, start: int, length: int, data: Bytes, fixed: Bytes) -> bool:
-    """Return whether the bytes from `start` on are a message of a template, with any numbers."""
+    """Return whether the message at offset `start` matches a template, whatever its stamp and numbers are."""
     if length != data.size or start < 0 or start + length > buffer.size:
         return False
-    last = length - 8  # this word may overlap the word before it
+    last = length - 8  # the last word may overlap the word before it, because the length may be no multiple of 8
     wrong = (word(buffer, start + last) ^ word(data, last)) & word(fixed, last)
     for k in range(length >> 3):
         wrong |= (word(buffer, start + 8 * k) ^ word(data, 8 * k)) & word(fixed, 8 * k)
@@ -90,14 +98,18 @@ def _fits(buffer: Bytes, start: int, length: int, data: Bytes, fixed: Bytes) -> 
 
 @compiled
 def stamp_word(stamp_ns: int) -> int:
-    """Return the stamp as one 64-bit word: seconds and nanoseconds as in a message."""
+    """Return the 64-bit word that represents a stamp in a message: seconds and nanoseconds."""
     seconds = stamp_ns // _SECOND_NS
     return (seconds & 0xFFFFFFFF) | ((stamp_ns - seconds * _SECOND_NS) << 32)
 
 
 @compiled
 def read_numbers(buffer, starts, lengths, data, fixed, places, stamps, values, good):  # type: ignore[no-untyped-def]
-    """Read stamp and numbers of each message that fits the template; `good` is False for any other message."""
+    """Read the stamp and the numbers of each message that matches the template.
+
+    The arrays `stamps`, shape (n,), and `values`, shape (n, count), receive the results. `good`, shape (n,), receives
+    False for a message that does not match.
+    """
     for n in range(starts.size):
         start = starts[n]
         good[n] = _fits(buffer, start, lengths[n], data, fixed)
@@ -111,9 +123,10 @@ def read_numbers(buffer, starts, lengths, data, fixed, places, stamps, values, g
 
 @dataclass(frozen=True)
 class Templates:
-    """Several templates one after the other; messages of different kinds are compared in one pass.
+    """Several templates in common arrays, so that messages of different kinds can be compared in one call.
 
-    `ends` (k + 1,) and `place_ends` (k + 1,) are the bounds of each template's bytes and places.
+    The kind of a message is the index `k` of its template. The template consists of the bytes
+    `data[ends[k] : ends[k + 1]]` and the offsets `places[place_ends[k] : place_ends[k + 1]]`.
     """
 
     data: Bytes
@@ -124,7 +137,7 @@ class Templates:
 
     @classmethod
     def of(cls, templates: Iterable[Template]) -> Self:
-        """Join templates; the kind of a message is the index of its template."""
+        """Concatenate templates."""
         parts = list(templates)
         return cls(
             np.concatenate([part.data for part in parts]),
@@ -137,7 +150,7 @@ class Templates:
 
 @compiled
 def fill(buffer, starts, data, places, stamps, values):  # type: ignore[no-untyped-def]
-    """Write the template with the stamp and numbers of each row n from `starts[n]` on."""
+    """Fill the template with the stamp `stamps[n]` and the numbers `values[n]`, and write it to `starts[n]`."""
     last = data.size - 8
     for n in range(starts.size):
         start = starts[n]

@@ -1,4 +1,4 @@
-"""The times in messages and rows: numbers in some unit, or dates."""
+"""Convert the times in messages and tables, which are numbers or dates, to stamps."""
 
 from __future__ import annotations
 
@@ -10,30 +10,33 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-#: Names of the column or key of the time, if the mapping does not name it.
+#: Names of the column or key that contains the time, unless the mapping states another name.
 TIMES: Final = ("t", "time")
 #: Length of each unit of time [ns].
 STAMP_UNITS: Final = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
-#: Time [ns] of a message without a time.
+#: Time of a message whose time is unknown [ns].
 NO_TIME: Final = -1
 NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|inf|nan)", re.IGNORECASE)
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _NANOSECONDS: Final = re.compile(r"[.,]\d{6}(\d{1,3})")
-#: A time below this [s] counts from an unknown start. `START_NS` is added to it, because a stamp of 0 would mean a
-#: missing stamp.
+#: Smallest time that is read as a date [s]. A smaller time counts from an unknown start; `START_NS` is added to it,
+#: because a stamp of 0 means that the stamp is missing.
 EPOCH_S: Final = 1e9
-#: Stamp that a time of 0 receives [ns].
+#: Stamp of the time 0 [ns].
 START_NS: Final = 1_000_000_000
 OF_NUMBERS: Final = b"0123456789+-.eE "
-#: Dates after this [ns] are placeholders: many databases write 9999-12-31 where there is no date.
+#: Latest time that is accepted [ns]. Many databases write a later date, 9999-12-31, for a missing date.
 _FARTHEST_NS: Final = 4_000_000_000_000_000_000
 
 
 def time_ns(value: Any, unit: str = "s") -> int | None:
-    """Return the stamp [ns] of a number or of an ISO 8601 text (UTC unless stated), or None for any other value."""
+    """Return the stamp [ns] of a number or of an ISO 8601 text, or None for any other value.
+
+    A text without a time zone is in UTC.
+    """
     if isinstance(value, str):
         value = value.strip()
-        # a number first, because 20260102 is a date too
+        # a text such as 20260102 is a valid date, but it is read as a number
         if value.isascii() and value.isdigit() and len(value) < 20:
             value = int(value)
         elif NUMBER.fullmatch(value):
@@ -43,20 +46,20 @@ def time_ns(value: Any, unit: str = "s") -> int | None:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e19:
         return None
     scale = STAMP_UNITS[unit]
-    # a float resolves today's date only to 0.2 us
+    # an integer is not converted to a float, which resolves the time since 1970 only to 0.2 us
     stamp_ns = _within(value * scale if isinstance(value, int) else round(value * scale))
     return stamp_ns if stamp_ns is None or stamp_ns >= EPOCH_S * 1e9 else stamp_ns + START_NS
 
 
 def likely_unit(value: Any) -> str | None:
-    """Return the coarsest unit in which a number that is too large for seconds is a date; otherwise None."""
+    """Return the coarsest unit in which a number is a date, or None if the number is a valid time in seconds."""
     if time_ns(value) is not None:
         return None
     return next((unit for unit in STAMP_UNITS if (time_ns(value, unit) or 0) >= EPOCH_S * 1e9), None)
 
 
 def times_ns(texts: Sequence[bytes], unit: str) -> NDArray[np.int64] | None:
-    """Return the stamps [ns] of texts, shape (n,), each as in `time_ns`; None if any text is not a time."""
+    """Return the stamps [ns] that `time_ns` returns for each text, shape (n,), or None if a text is not a time."""
     try:
         numbers = np.array(list(map(float, texts))) * STAMP_UNITS[unit]
     except ValueError:
@@ -67,7 +70,7 @@ def times_ns(texts: Sequence[bytes], unit: str) -> NDArray[np.int64] | None:
     stamps: NDArray[np.int64] = np.rint(numbers).astype(np.int64)
     stamps[stamps < EPOCH_S * 1e9] += START_NS
     for place, text in enumerate(texts):
-        if b"." not in text:  # an integer keeps its nanoseconds
+        if b"." not in text:  # unlike the float, an integer is exact to the nanosecond
             stamp_ns = time_ns(text.decode(), unit)
             if stamp_ns is None:
                 return None
@@ -76,7 +79,10 @@ def times_ns(texts: Sequence[bytes], unit: str) -> NDArray[np.int64] | None:
 
 
 def time_text(stamp_ns: int, *, own_start: bool = False) -> str:
-    """Return a stamp as a date, or as seconds if it is below `EPOCH_S`; `own_start` undoes the shift by `time_ns`."""
+    """Return a stamp as a date or, if it is below `EPOCH_S`, as a number of seconds.
+
+    With `own_start`, the number of seconds is as before the addition of `START_NS` in `time_ns`.
+    """
     if stamp_ns < EPOCH_S * 1e9:
         return f"{(stamp_ns - (START_NS if own_start else 0)) * 1e-9:.3f} s"
     date = datetime.fromtimestamp(stamp_ns // 10**9, UTC)
@@ -93,5 +99,5 @@ def _date_ns(text: str) -> int | None:
     except ValueError:
         return None
     time = time if time.tzinfo else time.replace(tzinfo=UTC)
-    digits = _NANOSECONDS.search(text)  # a datetime keeps six digits
+    digits = _NANOSECONDS.search(text)  # the digits after the microseconds, which a datetime drops
     return (time - _EPOCH) // timedelta(microseconds=1) * 1000 + (int(digits[1].ljust(3, "0")) if digits else 0)

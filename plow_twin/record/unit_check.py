@@ -1,4 +1,4 @@
-"""Check for wrong units in measured data, by magnitude and rate, where a mapping states no unit."""
+"""Detect wrong units of measured data, by the magnitude and the rate of the numbers, if a mapping states no unit."""
 
 from __future__ import annotations
 
@@ -23,50 +23,60 @@ from plow_twin.stream.limits import excitation_limits, largest_displacement
 Array = NDArray[np.float64]
 _START_S: Final = START_NS * 1e-9
 
-#: Number of messages that are checked; at 1 kHz these are 20 s, several periods of a load.
+#: Number of messages that are checked. At 1 kHz, this number covers 20 s and several periods of a load.
 CHECKED: Final = 20_000
-#: An idling machine has forces above this share of the scene's largest force.
+#: Smallest plausible ratio of the measured forces to the largest force of the scene; an idling machine exceeds it.
 _IDLE_SHARE: Final = 1e-2
-#: Forces between this share and `_IDLE_SHARE` of the scene's largest force look like kN.
+#: Smallest ratio at which forces are taken for numbers in kN. Smaller forces may be the noise of an idle sensor.
 _BROKEN_SHARE: Final = 1e-4
-#: Units of forces that are too small, each with a factor for both shares. Smaller forces may be the noise of an idle
-#: sensor.
+#: Units in which too small forces may be, with the factor by which the two ratios are multiplied for the unit.
 _SMALLER: Final = {"kN": 1.0, "MN": 1e-3}
 #: Largest angle of the model [rad], 45 degrees.
 _LARGEST_ANGLE_RAD: Final = 0.25 * np.pi
-#: A swing is half the range of an angle. Above this multiple of the angle that the clearance allows, it must be in
-#: degrees: wear and pressed contacts alone do not let a head turn so far.
+#: Largest plausible swing (half the range of an angle), as a multiple of the angle that the clearance allows. Wear and
+#: compressed contacts do not let a head turn farther, so the angle must be in degrees.
 _BEYOND_CLEARANCE: Final = 3.0
-#: A swing up to this [rad] is always accepted, because soft pads let a head turn farther than a narrow clearance does.
+#: Swing that is always accepted [rad]. With soft pads, a head turns farther than a narrow clearance allows.
 _BELIEVED_SWING_RAD: Final = 0.1
-#: Stamps further apart than this [s] are too coarse for a load that changes smoothly from sample to sample.
+#: Largest plausible distance of stamps [s] if the load changes smoothly from sample to sample.
 _SLOW_S: Final = 0.5
-#: A load is smooth if its median change between two samples is less than this share of its range.
+#: Largest median change between two samples of a smooth load, as a share of the range of the load.
 _SMOOTH: Final = 0.05
-#: Speed that no plough reaches [m/s]; the fastest travel at 3.6 m/s (Caterpillar GH1600).
+#: Largest plausible speed of a plough [m/s]. The fastest ploughs travel at 3.6 m/s (Caterpillar GH1600).
 _FASTEST_M_S: Final = 5.0
-#: Share of falling stamps above which the column is not a time, and above which the rows are in reverse order.
+#: Shares of descending stamps. Above the first share, the column is not a time; above the second share, the rows are
+#: in reverse order.
 _FALLING, _REVERSED = 0.2, 0.9
 _TIMES: Final = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-#: Spreadsheets count days since 1900; dates of this century lie between these two day numbers.
+#: Range of the dates of this century in a spreadsheet, which counts days from 1900.
 _SHEET_DAYS: Final = (36_525.0, 73_050.0)
-#: Smallest number of samples whose spacing can be judged.
+#: Smallest number of samples for a check of the stamps.
 _FEW: Final = 20
 _SORT: Final = "sort the rows by time"
 _NAME_TIME: Final = "name the column of the time in a mapping (stamp: NAME)"
 _WRITE_SECONDS: Final = "write seconds, or dates such as 2026-01-02T03:04:05.678Z"
-#: Load cells send at 10 kHz at most, so stamps closer together than this [s] are in another unit.
+#: Smallest plausible distance of stamps [s], because load cells measure at 10 kHz at most.
 _SHORTEST_SPACING_S: Final = 1e-4
-#: Stamps above this [s] are dates: 1e9 s is in the year 2001.
+#: Smallest stamp that is a date [s]; 1e9 s after 1970 is in the year 2001.
 _DATES_S: Final = 1e9
 
 
 @dataclass(frozen=True)
 class UnitDoubt:
-    """Numbers of a role that seem to be in another unit; the name `t` stands for the stamps of the load.
+    """Doubt that the numbers of a role are in SI units.
 
-    `found` and `expected` say why, and `likely` is the unit that they seem to have. `is_impossible` is True if no head
-    can move like this. `advice` is a remedy if no unit helps.
+    Attributes
+    ----------
+    names : tuple of str
+        Quantities that are in doubt. The name `t` means the stamps of the load.
+    found, expected : str
+        Found and expected magnitude of the numbers.
+    likely : str
+        Unit that the numbers seem to have.
+    is_impossible : bool
+        Whether no head can move as the numbers state.
+    advice : str
+        Advice to the user if a statement of the unit does not help.
     """
 
     role: str
@@ -82,7 +92,7 @@ class UnitDoubt:
 
     @property
     def remedy(self) -> str:
-        """How to state the unit."""
+        """Advice to the user, by default how to state the unit."""
         return self.advice or "state the unit: " + " ".join(
             f"--unit {name}={self.likely.replace(' ', '')}" for name in self.names
         )
@@ -91,10 +101,16 @@ class UnitDoubt:
 def unit_doubts(
     values: Mapping[tuple[str, str], Sequence[float] | Array], load_stamps_s: Sequence[float] | Array, scene: Scene
 ) -> list[UnitDoubt]:
-    """Return the numbers that seem to be in a unit other than SI.
+    """Return the doubts about the units of measured numbers, whose magnitudes are compared with the scene.
 
-    `values` are measured numbers by role and name, such as ("excitation", "fx"), NaN where missing; `load_stamps_s` are
-    the stamps of the load [s]. The scene's loads and sizes say which magnitudes are plausible.
+    Parameters
+    ----------
+    values
+        Measured numbers of each quantity, by role and name, such as ("excitation", "fx"). A missing number is NaN.
+    load_stamps_s
+        Stamps of the load [s].
+    scene
+        Scene whose loads and sizes determine plausible magnitudes.
     """
     magnitudes = {key: _usual_magnitude(np.asarray(found, float)) for key, found in values.items()}
     load = [values["excitation", name] for name in ("fx", "fy", "m") if ("excitation", name) in values]
@@ -104,7 +120,7 @@ def unit_doubts(
 
 
 def small_thresholds(thresholds: Sequence[float], scene: Scene) -> str:
-    """Return a warning if thresholds of a force in N seem to be in kN, otherwise an empty text."""
+    """Return a warning if the thresholds of the contact force [N] seem to be in kN, otherwise an empty string."""
     usual = _largest_force(scene)
     small = [found for found in thresholds if 0.0 < found < _IDLE_SHARE * usual]
     if not small:
@@ -113,10 +129,19 @@ def small_thresholds(thresholds: Sequence[float], scene: Scene) -> str:
 
 
 def large_loads(values: Mapping[tuple[str, str], Array], units: Mapping[str, str], scene: Scene) -> dict[str, str]:
-    """Return the loads that a live twin would refuse: for each name, a text that says why and which unit would fit.
+    """Return a warning for each component of the load that a live twin would refuse, by name of the component.
 
-    A load is refused if more than one number in a hundred exceeds the scene's `excitation_limits`. `values` are in SI,
-    by role and name; `units` are the original units, by name.
+    A live twin refuses numbers above the limits that `excitation_limits` returns for the scene. The warning is given if
+    more than one number in a hundred exceeds the limit.
+
+    Parameters
+    ----------
+    values
+        Measured numbers by role and name [SI units].
+    units
+        Original unit of each component, by name.
+    scene
+        Scene of the twin.
     """
     found = {}
     for name, most in zip(("fx", "fy", "m"), excitation_limits(scene).largest, strict=True):
@@ -135,14 +160,14 @@ def large_loads(values: Mapping[tuple[str, str], Array], units: Mapping[str, str
 
 
 def check_units(messages: Iterable[Arrived], roles: Mapping[str, Role], scene: Scene, source: object) -> None:
-    """Refuse a recording whose numbers seem to be in another unit.
+    """Check the units in the first 20,000 messages of a recording.
 
-    The first 20,000 messages are checked. Numbers are believed if the mapping states their unit, scale or limits.
+    A quantity is not checked if the mapping states its unit, scale or limits.
 
     Raises
     ------
     UnitError
-        Numbers seem to be in another unit; the error says how to state the unit.
+        The numbers of a quantity seem to be in another unit. The error contains advice on how to state the unit.
     """
     stamps: list[float] = []
     values: dict[tuple[str, str], list[float]] = {}
@@ -163,12 +188,23 @@ def check_units(messages: Iterable[Arrived], roles: Mapping[str, Role], scene: S
 
 
 def check_poses(t: Array, q: Array, scene: Scene, source: object) -> None:
-    """Refuse measured poses `q`, shape (n, 3), at times `t`, shape (n,), that seem to be in another unit.
+    """Check the units of measured poses.
+
+    Parameters
+    ----------
+    t : ndarray, shape (n,)
+        Times [s].
+    q : ndarray, shape (n, 3)
+        Poses: x, y [m], theta [rad].
+    scene
+        Scene whose sizes determine plausible magnitudes.
+    source
+        Name of the recording for an error message.
 
     Raises
     ------
     UnitError
-        Numbers seem to be in another unit; the error names them and the recording `source`.
+        The numbers of a quantity seem to be in another unit.
     """
     magnitudes = {("head_pose", name): _usual_magnitude(q[:, place]) for place, name in enumerate(("x", "y"))}
     doubts = [*_lengths(magnitudes, scene), *_angle(q[:, 2], scene), *_spacing(t, q)]
@@ -183,13 +219,17 @@ def _stated(doubt: UnitDoubt, roles: Mapping[str, Role]) -> bool:
 
 
 def _usual_magnitude(values: Array, percent: float = 99.0) -> float:
-    """Return the magnitude that only one value in a hundred exceeds, because an outlier does not show the unit."""
+    """Return a percentile of the magnitudes; unlike the maximum, it does not depend on outliers."""
     known = np.abs(values)[np.isfinite(values)]
     return float(np.percentile(known, percent)) if known.size else 0.0
 
 
 def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[UnitDoubt]:
-    """Doubt the forces together, because one may be small, and the moment in proportion to the forces."""
+    """Return doubts about the forces and the moment.
+
+    The larger force is checked, because the other force may be small in any unit. The expected moment is proportional
+    to the forces.
+    """
     found = [magnitudes[key] for key in (("excitation", "fx"), ("excitation", "fy")) if key in magnitudes]
     usual = _largest_force(scene)
     largest = max(found, default=0.0)
@@ -201,7 +241,7 @@ def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
             largest *= UNITS["force"][unit]
     if largest < _IDLE_SHARE * usual:
         return doubts
-    # small forces come with a small moment
+    # the expected moment is reduced in proportion if the forces are smaller than in the scene
     beside = float(compile_loads(scene.loads).largest()[2]) * min(1.0, largest / usual) if usual else 0.0
     moment = magnitudes.get(("excitation", "m"), 0.0)
     if _BROKEN_SHARE * beside < moment < _IDLE_SHARE * beside:
@@ -211,11 +251,11 @@ def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
 
 
 def _angle(theta: Array, scene: Scene) -> list[UnitDoubt]:
-    """Doubt angles outside the model, and swings that no clearance allows."""
+    """Return a doubt if an angle exceeds the range of the model, or if the swing exceeds what the clearance allows."""
     largest = _usual_magnitude(theta)
     if scene.head.carries == "corners" or not 0.0 < largest < np.degrees(_LARGEST_ANGLE_RAD):
         return []
-    # the swing is judged too, because the zero of a sensor may differ from the head's
+    # the swing does not depend on the zero of the sensor, which may differ from the zero of the head
     low, high = np.percentile(theta[np.isfinite(theta)], (0.5, 99.5))
     swing = 0.5 * float(high - low)
     allowed = max(_BELIEVED_SWING_RAD, _BEYOND_CLEARANCE * largest_angle(scene))
@@ -252,7 +292,7 @@ def _largest_force(scene: Scene) -> float:
 
 
 def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
-    """Doubt stamps that fall, and stamps that are too far apart for a load that changes smoothly between them."""
+    """Return a doubt if stamps descend, or if they are too far apart for the smoothness of the load."""
     if len(stamps_s) < _FEW:
         return []
     steps = np.diff(stamps_s)
@@ -267,7 +307,7 @@ def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
     if stamps_s.max() > _DATES_S:
         return []
     spacing = float(np.median(np.abs(steps)))
-    # `time_ns` has added a second to times that count from an unknown start
+    # the function `time_ns` has added a second to times that count from an unknown start
     low, high = (days + _START_S for days in _SHEET_DAYS)
     if low <= stamps_s[0] <= high and np.ptp(stamps_s) < 1.0 and spacing < _SHORTEST_SPACING_S:
         found = f"{stamps_s[0] - _START_S:.6g} and stamps {spacing:.2g} s apart"

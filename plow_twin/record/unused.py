@@ -1,4 +1,4 @@
-"""Messages at the inputs of a run, from its journal: counts of all messages, and each unused message."""
+"""Count the input messages of a run, and list the unused messages, from the journal."""
 
 from __future__ import annotations
 
@@ -16,22 +16,23 @@ from plow_twin.stream.journal import Entry, Gaps, PartOfPose, Pose, Sample, Trav
 
 @dataclass
 class InputCounts:
-    """Counts of messages by input and outcome, which is `used` or a reason of `Unused`.
+    """Number of input messages, by input and by outcome.
 
-    For the input `source`, all counts except `not_followed` add up to the messages that its publisher has sent.
+    The outcome is `used`, or the reason in an entry of the type `Unused`. For the input `source`, the sum of all counts
+    except `not_followed` is the number of messages that the publisher sent.
     """
 
     source: str
     counts: dict[str, Counter[str]] = field(default_factory=dict)
 
     def add(self, entries: Entries) -> None:
-        """Count entries of a journal."""
+        """Count the messages in a batch of journal entries."""
         self._count(self.source, "used", int(entries.sample.sum()))
         for entry in entries.rest.values():
             self.add_entry(entry)
 
     def add_entry(self, entry: Entry | Dropped) -> None:
-        """Count an entry."""
+        """Count the messages in one journal entry."""
         match entry:
             case Sample():
                 self._count(self.source, "used", 1)
@@ -45,7 +46,7 @@ class InputCounts:
                 self._count("gaps", "used", 1)
 
     def facts(self) -> dict[str, dict[str, int]]:
-        """Return all counts that are not zero."""
+        """Return all counts except zeros."""
         return {topic: {why: count for why, count in found.items() if count} for topic, found in self.counts.items()}
 
     def _count(self, topic: str, reason: str, count: int) -> None:
@@ -54,9 +55,10 @@ class InputCounts:
 
 
 def unused_messages(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield each unused message in the journal of a run: input, sender, reason, stamp, values.
+    """Yield a row for each unused message in the journal of a run: input, sender, reason, stamp and values.
 
-    An entry's messages without values come last, as one row with their `count` and no stamp.
+    The journal stores only the number of some messages. These messages have one common row with their number `count`
+    and without a stamp.
 
     Raises
     ------

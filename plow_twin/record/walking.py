@@ -1,6 +1,6 @@
-"""Advance of a session by many samples at a time, from the journal of a run or from the load of any recording.
+"""Advance sessions by many samples at a time, from the journal of a run or from the load in any recording.
 
-A *walker* advances one session. Time follows the stamps; the load is linear from sample to sample and is never held.
+A *walker* advances one session. The load is interpolated linearly between all samples, however far apart they are.
 """
 
 from __future__ import annotations
@@ -39,36 +39,41 @@ from plow_twin.stream.session import DIGEST_INTERVAL, Applied, Session
 if TYPE_CHECKING:
     from plow_twin.record.writer import RunWriter
 
-#: Number of samples by which the session advances at once.
+#: Largest number of samples by which a session advances in one call.
 BATCH: Final = 4096
-#: Entries at which a walk stops; late samples are sorted in across all other entries.
+#: Types of entries that change the session. The samples between two such entries are sorted by their stamps.
 _ACTING: Final = (Travel, Reset, Loss, Restore, Snapshot, SetModel, SetWear)
-#: Further entries at which a walk stops if the motion follows measurements.
+#: Further types of entries that change the session if its motion follows measurements.
 _FOLLOWED: Final = (Pose, PartOfPose, Estimated, Parameter)
-#: Number of failed advances in a row after which the model is reset.
+#: Number of consecutive failed advances after which the model is reset.
 _FAILURE_LIMIT: Final = 10
 
 
 @dataclass(frozen=True)
 class Walked:
-    """Several advances: stamps (n,) [ns], wrench (n, 3), and the rows to be published after each advance."""
+    """Result of several advances of a session."""
 
+    #: stamps [ns], shape (n,)
     stamp_ns: NDArray[np.int64]
+    #: load at the stamps [N, N, N m], shape (n, 3)
     wrench: NDArray[np.float64]
-    #: the rows of `published`, with the number of touches so far
+    #: motion at the stamps, with the number of touches since the start of the run
     rows: AdvanceSeries
+    #: publications after all advances
     published: Published
-    #: touches since the previous advance, shape (n, 8)
+    #: number of touches of each pair since the previous advance, shape (n, 8)
     makes: NDArray[np.int64]
+    #: travel speed during the advances [m/s]
     speed_m_s: float
-    #: scene with all changes of the model so far
+    #: scene of the run, including all changes of the model up to these advances
     scene: Scene
 
 
 class Walker:
-    """Advance a session by many samples at a time, write its journal and outputs to `writer`, and pass the rows on.
+    """Advance a session by many samples at a time.
 
-    Only the walker may change the session. `on_walked` receives the rows of each batch.
+    The walker writes the journal and the outputs of the session to `writer`, and calls `on_walked` with the result of
+    each batch. No other code may change the session.
     """
 
     def __init__(
@@ -99,7 +104,7 @@ class Walker:
             self._writer.write_entry(self._sequence, self._log_time_ns, entry)
 
     def apply(self, entry: Entry, log_time_ns: int = 0) -> None:
-        """Apply an entry other than a sample."""
+        """Apply a journal entry that is not a sample."""
         self._log_time_ns = log_time_ns or self._log_time_ns
         self._entry(entry)
         self.session.apply(entry)
@@ -107,7 +112,7 @@ class Walker:
             self.on_reset()
 
     def samples(self, stamp_ns: NDArray[np.int64], wrench: NDArray[np.float64], log_time_ns: NDArray[np.int64]) -> None:
-        """Apply samples whose stamps do not fall."""
+        """Advance the session by samples, whose stamps must not descend."""
         for begin in range(0, len(stamp_ns), BATCH):
             part = slice(begin, begin + BATCH)
             self._walk(stamp_ns[part], wrench[part], log_time_ns[part])
@@ -147,20 +152,33 @@ class Walker:
             self._writer.write_publications(sequence, log_ns, done.published)
 
     def close(self) -> None:
-        """End the journal."""
+        """Write a digest of the final state to the journal."""
         if self.session.stamp_ns is not None:
             self._entry(Digest(self.session.stamp_ns, self.session.twin.digest()))
 
 
 class JournalWalk:
-    """Pass the journal of a run through walkers of its scene (`own`) and of other scenes (`others`).
+    """Pass the journal of a run to walkers.
 
-    `used` and `late` count samples; a late sample is sorted in unless the walkers have passed its stamp. `missing`
-    counts missing entries; after each gap a new part of the motion begins.
+    After missing entries, the motion of all walkers begins anew. A late sample is inserted at its stamp if the walkers
+    have not reached the stamp; otherwise it is not used.
 
-    The walkers `own` take over the state in the journal after a loss, and after wear was set. If `same_scene` is set,
-    their scene is that of the run: they also apply changes of the model and restored motions, and measurements if their
-    twin follows these. Unless the journal is `whole`, its first snapshot is restored.
+    Parameters
+    ----------
+    own
+        Walkers that restore the first snapshot after a loss, and that apply settings of the wear.
+    others
+        Walkers of other scenes, which never restore a state from the journal.
+    whole
+        Whether the journal begins with the first entry of the run. If not, `own` restore the first snapshot.
+    same_scene
+        Whether `own` have the scene of the run. They then also apply changes of the model, restored motions, and, if
+        their twin follows measurements, the measurements.
+
+    Attributes
+    ----------
+    used, late, missing : int
+        Numbers of used samples, of late samples that were not used, and of missing entries.
     """
 
     def __init__(
@@ -170,7 +188,7 @@ class JournalWalk:
         self._same = own if same_scene else ()
         self._following = [walker for walker in self._same if walker.session.following is not None]
         self._acting = (*_ACTING, *_FOLLOWED) if self._following else _ACTING
-        #: speeds whose stamps have not been reached, in order of the stamps
+        #: changes of the travel speed whose stamps have not been reached, in the order of the stamps
         self._travels: list[Travel] = []
         self._lost = not whole
         self._reached_ns = -1
@@ -178,7 +196,7 @@ class JournalWalk:
         self._holes = Holes()
 
     def add(self, entries: Entries) -> None:
-        """Process entries."""
+        """Process a batch of journal entries."""
         begin = 0
         for place, count in self._holes.find(entries).items():
             self._whole(entries[begin:place])
@@ -187,7 +205,7 @@ class JournalWalk:
         self._whole(entries[begin:])
 
     def _hole(self, count: int) -> None:
-        """Begin a new part of the motion: no load is interpolated over missing entries."""
+        """Restart the motion after `count` missing entries, so that no load is interpolated across the gap."""
         self.missing += count
         self._entry(Loss(count))
 
@@ -209,7 +227,7 @@ class JournalWalk:
         stamps, wrench = stamps[order], wrench[order]
         while len(stamps):
             count = len(stamps)
-            if self._travels:  # a speed acts from its stamp on
+            if self._travels:  # the samples after the next change of speed are processed in the next iteration
                 count = int(np.searchsorted(stamps, self._travels[0].stamp_ns, "right"))
             if count:
                 self._reached_ns = int(stamps[count - 1])
@@ -222,7 +240,7 @@ class JournalWalk:
     def _speed(self, speed_m_s: float) -> None:
         for walker in self._all:
             walker.speed_m_s = speed_m_s
-            # a speed with a stamp that is already reached acts at once
+            # if the stamp of the speed has already been reached, the speed takes effect immediately
             walker.apply(Travel(max(0, self._reached_ns), speed_m_s))
 
     def _begin_anew(self) -> None:

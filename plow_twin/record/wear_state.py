@@ -1,4 +1,4 @@
-"""The file that keeps the wear of one head's pads in one slide from process to process."""
+"""Read and write the file that stores the wear of a head's pads, so that the next process can continue with it."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class WearStateError(PlowTwinError, ValueError):
 
 
 def scene_identity(scene: Scene) -> str:
-    """Return a hash of the numbers that define the pads: frame, clearance, head and initial depths.
+    """Return a hash of the numbers that identify a set of pads: frame, clearance, head and initial wear depths.
 
-    Loads, contact parameters and the wear coefficient may change for the same pads.
+    Loads, contact parameters and the wear coefficient are not included, because they may change for the same pads.
     """
     numbers = (
         *(scene.frame.width_m, scene.frame.height_m),
@@ -39,14 +39,14 @@ def scene_identity(scene: Scene) -> str:
 
 
 def check_depth(depth_m: Sequence[float], scene: Scene) -> None:
-    """Raise a `ValueError` for a depth that is impossible for the frame of a scene."""
+    """Raise a `ValueError` if a depth is negative or larger than the frame of the scene allows."""
     most = 0.5 * min(scene.frame.width_m, scene.frame.height_m)
     if not all(0.0 <= depth <= most for depth in depth_m):
         raise ValueError(f"got {list(depth_m)}, expected depths from 0 to half the frame's smaller side, {most:g} m")
 
 
 def read_wear(folder: Path) -> bytes | None:
-    """Return the content of the file in a folder, or None without a file.
+    """Return the content of the wear file in a folder, or None if the folder has no wear file.
 
     Raises
     ------
@@ -63,12 +63,12 @@ def read_wear(folder: Path) -> bytes | None:
 
 
 def parse_wear(content: bytes, path: Path, head: str, scene: Scene) -> tuple[float, ...]:
-    """Return the depths [m] in the content of a file.
+    """Return the wear depths [m] from the content of a wear file.
 
     Raises
     ------
     WearStateError
-        The content is damaged, or belongs to another head or scene.
+        The content is invalid, or belongs to another head or scene.
     """
     try:
         record: dict[str, Any] = json.loads(content)
@@ -94,12 +94,12 @@ def parse_wear(content: bytes, path: Path, head: str, scene: Scene) -> tuple[flo
 
 
 def claim_folder(folder: Path) -> int:
-    """Lock a folder against other twins as long as the returned descriptor is open.
+    """Create and lock a folder for the wear file of one twin, until the returned descriptor is closed.
 
     Raises
     ------
     WearStateError
-        The folder cannot be written to, or another twin keeps its wear there.
+        The folder cannot be written to, or another twin has locked it.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -129,10 +129,7 @@ def _unwritable(folder: Path, error: OSError) -> WearStateError:
 
 
 def wear_content(head: str, scene: str, depth_m: Sequence[float]) -> bytes:
-    """Return the content of a file with the wear depths [m] of the head `head`, which runs in the slide of a scene.
-
-    `scene` is a `scene_identity`.
-    """
+    """Return the content of a wear file with the wear depths [m] of a head; `scene` is a `scene_identity`."""
     record = {
         "version": VERSION,
         "head": head,
@@ -144,12 +141,12 @@ def wear_content(head: str, scene: str, depth_m: Sequence[float]) -> bytes:
 
 
 def save_wear(folder: Path, content: bytes) -> None:
-    """Write the file in one step; after a crash it is the complete old or the complete new file.
+    """Replace the wear file atomically: after a crash, the complete old file or the complete new file exists.
 
     Raises
     ------
     OSError
-        The disk refuses the file, or has not confirmed the new content.
+        The file cannot be written, or the disk has not confirmed the new content.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / FILE_NAME, content, sync=True)

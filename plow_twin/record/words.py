@@ -1,6 +1,6 @@
-"""Access for compiled code to eight bytes at any place of an array, as one number.
+"""Functions with which compiled code reads and writes eight bytes at any offset of an array as one integer.
 
-Numbers are little-endian, as in MCAP and in the CDR of this package.
+The integers are little-endian, like the numbers in MCAP files and in CDR messages.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def _place(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 
 
 def _word(typingctx: Any, data: Any, place: Any) -> Any:
-    """Return the eight bytes of a contiguous array from byte `place` on as an int64, without a check of bounds."""
+    """Return the eight bytes at offset `place` of a contiguous array as an int64. Bounds are not checked."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.load(_place(context, builder, signature, arguments), align=1)
@@ -32,7 +32,7 @@ def _word(typingctx: Any, data: Any, place: Any) -> Any:
 
 
 def _set_word(typingctx: Any, data: Any, place: Any, value: Any) -> Any:
-    """Write an int64 to the eight bytes of a contiguous array from byte `place` on, without a check of bounds."""
+    """Write an int64 to the eight bytes at offset `place` of a contiguous array. Bounds are not checked."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         number = context.cast(builder, arguments[2], signature.args[2], types.int64)
@@ -52,7 +52,7 @@ def _bits(typingctx: Any, number: Any) -> Any:
 
 
 def _eight_differ(typingctx: Any, data: Any, place: Any, address: Any) -> Any:
-    """Return 0 if the 64 bytes of a contiguous array from byte `place` on equal the 64 bytes at an address."""
+    """Return 0 if the 64 bytes at offset `place` of a contiguous array equal the 64 bytes at an address."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         vector = ir.VectorType(_WORD, 8)
@@ -69,7 +69,7 @@ def _eight_differ(typingctx: Any, data: Any, place: Any, address: Any) -> Any:
 
 
 def _word_at(typingctx: Any, address: Any) -> Any:
-    """Return the eight bytes at an address as an int64."""
+    """Return the eight bytes at a memory address as an int64."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.load(builder.inttoptr(arguments[0], _WORD.as_pointer()), align=8)

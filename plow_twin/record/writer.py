@@ -1,4 +1,7 @@
-"""Writer of a recording: `run/run_0.mcap`, `run/run_1.mcap`, ... and `run/metadata.yaml`, all from one thread."""
+"""Write a recording to a folder: `run/run_0.mcap`, `run/run_1.mcap`, ... and `run/metadata.yaml`.
+
+All functions must be called from one thread.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,7 @@ from plow_twin.stream.journal import Digest, Entry, Sample
 from plow_twin.stream.outputs import Published
 from plow_twin.stream.topics import TOPICS, Cadence, topics_of
 
-#: Folder for other topics in the folder of a run; if it exists, `beside_2`, `beside_3`, ... are used.
+#: Subfolder of a run for recordings of other topics. If it exists, `beside_2`, `beside_3`, ... are used.
 BESIDE: Final = "beside"
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
 Made = TypeVar("Made")
@@ -39,9 +42,9 @@ Made = TypeVar("Made")
 class _Part:
     path: Path
     file: McapFile
-    #: number, message type and QoS text of the channel, by topic
+    #: for each topic, the number, message type and QoS text of its channel
     channels: dict[str, tuple[int, str, str]] = field(default_factory=dict)
-    #: number of the channel, by base name of the topic
+    #: for each base name of a topic, the number of its channel
     sent: dict[str, int] = field(default_factory=dict)
 
     def facts(self) -> PartFacts:
@@ -53,12 +56,13 @@ class _Part:
 
 
 class RunWriter:
-    """Write entries and outputs in the order of the calls; the arguments are as for `Recorder`.
+    """Write journal entries and outputs to the parts of a recording. The arguments are those of `Recorder`.
 
-    Journal and outputs have separate chunks; the chunk of entries precedes the chunk of the outputs sent after them.
+    Journal entries and outputs are written to separate chunks. A chunk of entries precedes the chunk of the outputs
+    that were sent after these entries.
 
-    Every method may raise `OSError` (disk full). After a failed write or `flush`, the file is complete up to the
-    previous flush and can be continued; after any other failed method only `abandon` may be called.
+    Every method raises `OSError` if the disk is full. After a failed write or `flush`, the file contains all data of
+    the previous flush, and further data can be written. After any other failed call, only `abandon` may be called.
     """
 
     def __init__(
@@ -98,7 +102,7 @@ class RunWriter:
 
     @property
     def bytes_written(self) -> int:
-        """Size of all parts so far [B]."""
+        """Size of all parts that have been written [B]."""
         return self._bytes_before + self._part.file.size
 
     @property
@@ -107,7 +111,7 @@ class RunWriter:
         return self._part.file.size
 
     def write_entry(self, sequence: int, log_time_ns: int, entry: Entry | Dropped) -> None:
-        """Write a journal entry with its sequence number."""
+        """Write a journal entry with the sequence number `sequence`."""
         topic = self.header.entries_topic
         if isinstance(entry, Sample | Digest):
             topic = self.header.samples_topic if isinstance(entry, Sample) else self.header.digests_topic
@@ -117,7 +121,7 @@ class RunWriter:
     def write_samples(
         self, sequence: Indexes, log_time_ns: Indexes, stamp_ns: Indexes, wrench: NDArray[np.float64]
     ) -> None:
-        """Write many samples of the journal."""
+        """Write load samples as journal entries."""
         numbers = np.zeros((len(stamp_ns), 6))
         numbers[:, [0, 1, 5]] = wrench
         length = MESSAGE_HEAD + len(self._sample)
@@ -136,9 +140,9 @@ class RunWriter:
         wrench: NDArray[np.float64],
         digests: Mapping[int, str],
     ) -> Indexes:
-        """Write samples and digests as entries from number `sequence` on; return the number of each sample.
+        """Write samples and digests as journal entries, and return the sequence number of each sample.
 
-        Each digest is written after as many samples as its key says.
+        The first entry has the number `sequence`. The key of a digest is the number of samples before the digest.
         """
         index = np.arange(len(stamp_ns))
         numbers = sequence + index + np.searchsorted(sorted(digests), index, "right")
@@ -152,7 +156,10 @@ class RunWriter:
         return numbers
 
     def write_publications(self, sequence: Indexes, log_time_ns: Indexes, published: Published) -> None:
-        """Write the messages of many publications, each sent after journal entry number `sequence`."""
+        """Encode and write the messages of publications.
+
+        `sequence`, shape (n,), is the number of the journal entry before each publication.
+        """
         log_time_ns = np.maximum(log_time_ns, 0)
         everywhere = np.arange(len(published.rows))
         rows = dict.fromkeys(REPLAYED, everywhere)
@@ -186,7 +193,10 @@ class RunWriter:
     def write_sent(
         self, sequence: Indexes, log_time_ns: Indexes, stamp_ns: Indexes, sent: Sequence[Mapping[str, bytes]]
     ) -> None:
-        """Write publications that were sent; `sent` has the bytes of each publication's messages by base name."""
+        """Write publications that the node has sent.
+
+        `sent` contains the bytes of the messages of each publication, by base name of the topic.
+        """
         channels = self._part.sent
         if not channels:
             followed = (Cadence.FOLLOWED,) if self.header.follow == "full" else ()
@@ -205,13 +215,13 @@ class RunWriter:
         self._close_full_chunks()
 
     def write_output(self, topic: str, sequence: int, log_time_ns: int, stamp_ns: int, message: Message) -> None:
-        """Write a message that the node sent after journal entry number `sequence`."""
+        """Write a message that the node sent after the journal entry with the number `sequence`."""
         self._write(self._outputs, topic, sequence, log_time_ns, stamp_ns, message)
 
     def _write(
         self, chunk: ChunkBuilder, topic: str, sequence: int, log_time_ns: int, stamp_ns: int, message: Message
     ) -> None:
-        # MCAP times are unsigned; the message keeps the exact stamp
+        # times in MCAP are unsigned, so a negative stamp becomes 0; the message itself contains the exact stamp
         log_time_ns, stamp_ns = max(0, log_time_ns), max(0, stamp_ns)
         channel = self._channel(topic, message.TYPE)
         chunk.add(channel, sequence & _SEQUENCE_MASK, log_time_ns, stamp_ns, encode(message))
@@ -237,29 +247,30 @@ class RunWriter:
             self._part.file.chunk(self._journal)
             self._part.file.chunk(self._outputs)
         except OSError:
-            self._outputs.clear()  # outputs are useless without the journal before them
+            self._outputs.clear()  # a replay cannot compare outputs without the journal entries before them
             raise
 
     def flush(self) -> None:
-        """Pass all bytes to the operating system, so that they survive a kill of the process."""
+        """Write all data to the file, so that they are not lost if the process is killed."""
         self._close_chunks()
         if self._sync:
             self._part.file.out.sync()
 
     def reason_to_stop(self) -> str | None:
-        """Return the reason why recording must end for good, or None."""
+        """Return the reason why recording must stop, or None."""
         if not self._part.file.out.is_linked():
             return "the file was removed or replaced"
         return None
 
     def shortage(self) -> str | None:
-        """Return a text when the disk has too little space to end the file, or None."""
+        """Return a text if the disk has too little space to complete the file, otherwise None."""
         return shortage(self.folder, self._min_free_bytes)
 
     def split(self, loss: Mapping[str, int], keep_bytes: int = 0) -> None:
-        """Start a new part, which is opened before the old part is closed; the caller must write a snapshot next.
+        """Start a new part and complete the old part. The caller must write a snapshot next.
 
-        With `keep_bytes`, the oldest parts are removed while the total size is larger.
+        The new part is opened first, so that a reader of the folder always finds an open part. With `keep_bytes`, the
+        oldest completed parts are removed until their total size [B] is at most `keep_bytes`.
         """
         self._close_chunks()
         old, self._number = self._part, self._number + 1
@@ -285,7 +296,7 @@ class RunWriter:
         self._done.append(part.facts())
 
     def close(self, loss: Mapping[str, int], stop_reason: str | None = None) -> None:
-        """Write the loss counters, the reason of an early end, the index and `metadata.yaml`."""
+        """Complete the file and write `metadata.yaml`, with the loss counters and the reason of an early end."""
         record = {topic: str(count) for topic, count in loss.items()}
         custom: dict[str, str] = {}
         if stop_reason is not None:
@@ -296,25 +307,25 @@ class RunWriter:
         write_metadata(self.folder, bag_metadata(self._done, loss, custom), sync=self._sync)
 
     def abandon(self) -> None:
-        """Close the file without an index, after an error."""
+        """Close the file after an error, without an index."""
         self._part.file.out.close()
 
 
 def shortage(folder: Path, min_free_bytes: int) -> str | None:
-    """Return a text when the disk of a folder has too little free space, or None."""
+    """Return a text if the disk of a folder has too little free space, otherwise None."""
     free = shutil.disk_usage(folder).free
     return f"{free} B free on the disk, expected at least {min_free_bytes} B" if free < min_free_bytes else None
 
 
 def _is_free(folder: Path) -> bool:
-    """Return whether a recording can be made in a folder, which may already have folders of other topics."""
+    """Return whether a folder can receive a recording; it may already contain recordings of other topics."""
     if not folder.exists():
         return True
     return folder.is_dir() and all(item.name.startswith(BESIDE) and item.is_dir() for item in folder.iterdir())
 
 
 def free_folder(folder: Path) -> Path:
-    """Return the folder, or the first free folder of `<folder>_2`, `<folder>_3`, ..."""
+    """Return `folder` if it can receive a recording, otherwise the first such folder of `<folder>_2`, ...."""
     path, number = folder, 1
     while not _is_free(path):
         number += 1
@@ -323,7 +334,7 @@ def free_folder(folder: Path) -> Path:
 
 
 def in_free_folder(folder: Path, make: Callable[[Path], Made]) -> Made:
-    """Make a recording in `free_folder`, or in the next free folder if another process has taken it meanwhile."""
+    """Call `make` with a free folder, and repeat the call if another process uses the folder first."""
     while True:
         try:
             return make(free_folder(folder))
@@ -339,14 +350,14 @@ def _size(path: Path) -> int:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder for a recording.
+    """Create a folder for a recording.
 
     Raises
     ------
     TakenError
         The folder is not empty.
     RecordingError
-        The folder cannot be made.
+        The folder cannot be created.
     """
     if not _is_free(folder):
         raise TakenError(f"{folder}: exists already, expected a new or empty folder for the recording")
@@ -357,7 +368,7 @@ def make_folder(folder: Path) -> None:
 
 
 def warm_up_writer(header: RunHeader) -> None:
-    """Compile the functions that write messages into chunks, before the first sample."""
+    """Compile the functions that write messages to chunks, so that the first sample is not delayed."""
     templates: dict[str, Any] = {"sample": sample_template(header.frame_id)}
     templates |= publication_templates(header.frame_id, header.child_frame_id)
     one = np.zeros(1, np.int64)
