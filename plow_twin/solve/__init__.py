@@ -1,1 +1,1 @@
-"""The solver: series, events and the loop that advances the motion, and fixed-step methods."""
+"""The solver: Taylor series with event detection, the main loop, and fixed-step methods."""

@@ -1,4 +1,4 @@
-"""State, wear, penetrations and forces at any time within the current step."""
+"""State, wear depths, penetrations and forces at any time within the current step."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from plow_twin.solve.support import see_from_frame
 
 @kernel(inline="source")
 def time_along(alpha, beta, sigma):
-    """Return the time since the step's start at the variable sigma, t = alpha sigma + beta sigma^2 / 2."""
+    """Return the time since the start of the step, alpha sigma + beta sigma^2 / 2, with the series variable sigma."""
     return alpha * sigma + 0.5 * beta * sigma * sigma
 
 
 @kernel(inline="source")
 def sigma_at(state, used):
-    """Return the series' variable sigma at `used` seconds after the step's start."""
+    """Return the series variable sigma at `used` seconds after the start of the step."""
     if used >= state.step_size:
         return state.sigma_end
-    # in a step that begins at a touch (alpha = 0) the formula gives 0 / 0 at used = 0
+    # in a step that begins at a touch, alpha = 0, and the formula below would be 0 / 0 at used = 0
     if state.beta == 0.0 or used == 0.0:
         return used
-    # the root of alpha sigma + beta sigma^2 / 2 = used, in the form without cancellation
+    # root of alpha sigma + beta sigma^2 / 2 = used, in a form without cancellation
     return 2.0 * used / (state.alpha + math.sqrt(max(state.alpha**2 + 2.0 * state.beta * used, 0.0)))
 
 
 @kernel(fast=True)
 def sum_series(support, state, w, sigma, out) -> None:
-    """Write the state's series at sigma to `out`, shape (8,), relative to the frame if it is on springs."""
+    """Write the state from its series at sigma to `out`, shape (8,). It is relative to a frame on springs."""
     order, series = state.order, w.series
     value = row(series, order)
     for k in range(order - 1, -1, -1):
@@ -47,7 +47,7 @@ def sum_series(support, state, w, sigma, out) -> None:
 
 @kernel(inline="code")
 def evaluate(p, harmonics, flight, support, state, w, sigma, out) -> None:
-    """Write the body-coordinate state at sigma to `out`, shape (8,)."""
+    """Write the state in body coordinates at sigma to `out`, shape (8,)."""
     if state.in_flight == 1:
         fly(p, harmonics, flight, state, w, sigma, out)
     else:
@@ -56,11 +56,11 @@ def evaluate(p, harmonics, flight, support, state, w, sigma, out) -> None:
 
 @kernel(fast=True)
 def wear_depth_at(state, w, sigma, out) -> None:
-    """Write each pad's wear depth at sigma of the step to `out`, shape (8,)."""
+    """Write the wear depth of each pad at sigma to `out`, shape (8,)."""
     wear_depth = row(state.wear_depth, 0)
     if any_penetrates(state):
-        # without a penetrating pair no pad wears. The sum leaves out row 0 of `w.wear`, so that it is the growth since
-        # the step's start
+        # pads wear only under penetrating pairs; the sum starts at row 1 of `w.wear`, because row 0 is the wear before
+        # the step
         order = state.order
         growth = row(w.wear, order)
         for k in range(order - 1, 0, -1):
@@ -71,7 +71,7 @@ def wear_depth_at(state, w, sigma, out) -> None:
 
 @kernel(fast=True)
 def pair_outputs(p, state, wear_depth, y, penetration, rate, force) -> None:
-    """Write penetration, rate and force of the eight pairs, shape (8,) each, at body coordinates y."""
+    """Write penetration, its rate and the force of the eight pairs, shape (8,) each, at body coordinates y."""
     c, s, om = y[COS], y[SIN], y[OMEGA]
     set_row(
         penetration,

@@ -1,4 +1,4 @@
-"""The equations of motion (paper, eq. 5) as functions of the state, in world axes about the centre of mass."""
+"""Equations of motion (paper, eq. 5) as functions of the state, in world axes about the centre of mass."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from plow_twin.solve.state import ON, Harmonics, Segments
 
 
 class Acting(NamedTuple):
-    """Arguments of the equations of motion other than the law.
+    """Loads and terms of the equations of motion, without the terms of the contact law.
 
-    Few combinations of their types occur, so that scenes share compiled code.
+    Scenes have few different combinations of these types, so they share compiled code.
     """
 
     harmonics: Harmonics | None
@@ -43,17 +43,17 @@ class Acting(NamedTuple):
 
 @kernel(inline="source")
 def acting(parts):
-    """Return the `Acting` of a scene from its parts."""
+    """Return the `Acting` of a scene, taken from its parts."""
     terms = parts.terms
     return Acting(parts.harmonics, parts.segments, terms.offset, terms.free, terms.slip, terms.stick, terms.support)
 
 
 @kernel()
 def push(p, slip, stick, state, frozen, pair, force, c, s, theta, omega, x, y, vx, vy):
-    """Return force and moment of a pair with the normal force `force`, in body axes, and friction's power.
+    """Return force and moment of one pair in head axes, and the power of its friction, for the normal force `force`.
 
-    The wall's tangent is its normal turned by +90 degrees. In `p.penetration_rows` the rows for X and Y are the normal
-    with the opposite sign.
+    The wall's tangent is its outward normal, rotated by +90 degrees. Rows 2 and 3 of `p.penetration_rows` contain the
+    components of the normal with the opposite sign.
     """
     fx, fy = -p.penetration_rows[2, pair] * force, -p.penetration_rows[3, pair] * force
     torque, power = row_value(p.arm_rows, pair, c, s, x, y) * force, 0.0
@@ -75,7 +75,7 @@ def push(p, slip, stick, state, frozen, pair, force, c, s, theta, omega, x, y, v
 def about_mass(p, c, s, load):
     """Return the angular acceleration that a load through the cavity's centre causes about the centre of mass.
 
-    Gravity is part of the load but acts at the centre of mass, so it is left out here.
+    Gravity is part of the load, but it acts at the centre of mass, so its contribution is removed.
     """
     across = (c * p.offset[0] - s * p.offset[1]) * (load[1] + p.gravity)
     return -(across - (s * p.offset[0] + c * p.offset[1]) * load[0]) * p.inverse_inertia / p.inverse_mass
@@ -83,10 +83,10 @@ def about_mass(p, c, s, load):
 
 @kernel()
 def accelerate(p, acts, frozen, state, t, z, load, out) -> None:
-    """Write the rate of z = (x, y, theta, vx, vy, omega); with a support z is as in `support.to_world_both`.
+    """Write the rate of z = (x, y, theta, vx, vy, omega) to `out`. With a support, z is that of `to_world_both`.
 
-    `acts` is an `Acting`. If `frozen`, the pairs that are ON act by their law even where it would pull; otherwise the
-    pairs that penetrate act and never pull.
+    If `frozen` is true, the pairs with mode ON exert the force of their law, even where it would pull. Otherwise all
+    penetrating pairs exert force, and no pair pulls.
     """
     load_at(p, acts.harmonics, acts.segments, t, load)
     _accelerate(p, acts.offset, acts.free, acts.slip, acts.stick, acts.support, frozen, state, z, load, out)
@@ -94,7 +94,7 @@ def accelerate(p, acts, frozen, state, t, z, load, out) -> None:
 
 @kernel()
 def _contacts(p, slip, stick, frozen, state, c, s, theta, om, x, y, vx, vy):
-    """Return the sum of the pairs' forces in head axes and of their moments about the centre of mass."""
+    """Return the sum of the pairs' forces in head axes, and the sum of their moments about the centre of mass."""
     fx = fy = torque = 0.0
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 0:
@@ -130,7 +130,7 @@ def _accelerate(p, offset, free, slip, stick, support, frozen, state, z, load, o
 
 @kernel()
 def _accelerate_head(p, offset, free, c, s, load, along_x, along_y, torque, first, out) -> None:
-    """Write the head's three accelerations to `out` from index `first` on; the contacts' force is in world axes."""
+    """Write the head's accelerations to `out[first:first + 3]`, for the contact force (along_x, along_y)."""
     out[first] = load[0] + along_x * p.inverse_mass
     out[first + 1] = load[1] + along_y * p.inverse_mass
     out[first + 2] = load[2] + torque * p.inverse_inertia
@@ -143,9 +143,9 @@ def _accelerate_head(p, offset, free, c, s, load, along_x, along_y, torque, firs
 
 @kernel()
 def _accelerate_both(p, offset, free, slip, stick, frozen, state, z, load, out) -> None:
-    """Write the rate of head and frame (`support.to_world_both`)."""
+    """Write the rate of the state of head and frame. `support.to_world_both` defines this state."""
     c, s, om, spin = math.cos(z[2]), math.sin(z[2]), z[8], z[11]
-    # the pose and the rates of the head relative to the frame
+    # pose and rates of the head relative to the frame
     angle = z[2] - z[5]
     x, y = to_body_axes(c, s, z[0] - z[3], z[1] - z[4])
     vx, vy = to_body_axes(c, s, z[6] - z[9], z[7] - z[10])

@@ -1,8 +1,8 @@
-"""The energy balance of a run compares the change of energy and momentum with the work and impulse of the forces.
+"""Energy balance of a run: comparison of the change of energy and momentum with the work and impulse of the forces.
 
-Forces are computed at single instants, independently of the series: loads from the time, contact forces by
-`model.contact` and `model.friction`. Power and force are integrated by Gauss-Legendre quadrature over each step of the
-series, or by the trapezoidal rule over fixed steps. Kinetic energy and momentum are computed from the state alone.
+The forces are computed at single times, independently of the series: loads from the time, and contact forces by
+`model.contact` and `model.friction`. Powers and forces are integrated by Gauss-Legendre quadrature over each step of
+the series, or by the trapezoidal rule over fixed steps. Kinetic energy and momentum are computed from the state.
 """
 
 from __future__ import annotations
@@ -23,35 +23,35 @@ from plow_twin.solve.loads import load_at
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y, new_record
 from plow_twin.solve.support import to_ground
 
-#: Number of nodes of the quadrature; with 8 nodes it is exact up to degree 15. More nodes would not reduce the
-#: imbalance, because the higher terms of a step's series are as small as the series' error.
+#: Number of nodes of the quadrature, which is exact up to degree 15. More nodes would not reduce the imbalance, because
+#: the higher terms of a step's series are as small as the error of the series.
 _NODES = 8
-#: Largest phase [rad] of the fastest harmonic over a panel, the interval of one quadrature in a flight or rest; up to
-#: this phase products of two harmonics are integrated to 1e-13.
+#: Largest phase [rad] of the fastest harmonic load over a panel, which is the interval of one quadrature in flight or
+#: at rest. Up to this phase, the quadrature of a product of two harmonics has an error of 1e-13.
 _PANEL_PHASE = 2.0
-# indices into the powers [W] and forces [N, N m] at one instant
+# indices into the powers [W] and forces [N, N m] at one time
 LOADS, NORMAL, FRICTION, SUPPORT, LOAD_X, LOAD_Y, LOAD_M, CONTACT_X, CONTACT_Y, CONTACT_M, SIZE = range(11)
 
 #: Sums over a run.
 SUMS = np.dtype(
     [
-        ("work", "f8", (SIZE,)),  # integrals of the powers and forces
-        ("turnover", "f8"),  # integral of the powers' magnitudes
-        ("energy", "f8", (2,)),  # kinetic energy of head and frame at the start and now
-        ("momentum", "f8", (2, 3)),  # m vx, m vy, I omega in world axes, at the start and now
+        ("work", "f8", (SIZE,)),  # time integrals of the powers and forces
+        ("turnover", "f8"),  # time integral of the absolute values of the powers
+        ("energy", "f8", (2,)),  # kinetic energy of head and frame: initial value, current value
+        ("momentum", "f8", (2, 3)),  # m vx, m vy, I omega in world axes: initial values, current values
         ("residual", "f8"),  # largest imbalance of energy so far
         ("momentum_residual", "f8", (3,)),  # largest imbalances of momentum so far
     ]
 )
 
 
-#: Record of the energy balance: its quadrature, work space and sums. If kernels get `None` instead, they are compiled
+#: Record of the energy balance: quadrature, work space and sums. Kernels that receive `None` instead are compiled
 #: without the balance.
 BALANCE = np.dtype(
     [
         ("nodes", "f8", (_NODES,)),
         ("weights", "f8", (_NODES,)),
-        ("now", "f8", (SIZE,)),  # powers and forces at one instant
+        ("now", "f8", (SIZE,)),  # powers and forces at one time
         ("before", "f8", (SIZE,)),  # powers and forces at the end of the previous fixed step
         ("body", "f8", (STATE_SIZE,)),  # body coordinates at a node
         ("ground", "f8", (STATE_SIZE,)),  # with a support: body coordinates relative to the ground
@@ -64,7 +64,7 @@ BalanceSums: TypeAlias = np.record
 
 
 def new_balance() -> BalanceSums:
-    """Return an empty balance."""
+    """Return a balance whose sums are zero."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     balance = new_record(BALANCE)
     balance.nodes[:], balance.weights[:] = 0.5 * (nodes + 1.0), 0.5 * weights
@@ -73,7 +73,7 @@ def new_balance() -> BalanceSums:
 
 @kernel()
 def _powers(p, parts, state, wear_depth, y, frame, t, balance, out) -> None:
-    """Write powers and forces at time t and body coordinates y; `frame` is the state of a frame on springs."""
+    """Write powers and forces at time t and body coordinates y. `frame` is the state of a frame on springs, or None."""
     terms, load = parts.terms, out[LOAD_X : LOAD_M + 1]
     load_at(p, parts.harmonics, parts.segments, t, load)
     angle = named_angle(p, y, y[THETA])
@@ -87,7 +87,7 @@ def _powers(p, parts, state, wear_depth, y, frame, t, balance, out) -> None:
 
 @kernel()
 def _taken_by_support(p, support, frame):
-    """Return the power in W that the springs and dampers under a frame absorb."""
+    """Return the power in W that the springs and dampers of a frame take."""
     power = 0.0
     if support is not None:
         for j in range(3):
@@ -98,7 +98,7 @@ def _taken_by_support(p, support, frame):
 
 @kernel()
 def _on_ground(support, y, frame, balance):
-    """Return the body coordinates relative to the ground; y is relative to the frame."""
+    """Return the body coordinates relative to the ground. y contains them relative to the frame."""
     if support is not None:
         to_ground(y, frame, balance.ground)
         return balance.ground
@@ -140,7 +140,7 @@ def _powers_under(p, offset, free, slip, stick, state, wear_depth, y, ground, lo
 
 @kernel()
 def _balance(p, support, seen, frame, balance, start) -> None:
-    """Compute energy and momentum from the state, and update the largest imbalances so far."""
+    """Compute energy and momentum from the state, and update the largest imbalances."""
     sums, y = balance.sums, _on_ground(support, seen, frame, balance)
     m, inertia = 1.0 / p.inverse_mass, 1.0 / p.inverse_inertia
     c, s = along(p, math.cos(y[THETA]), math.sin(y[THETA]))
@@ -165,7 +165,7 @@ def _balance(p, support, seen, frame, balance, start) -> None:
 
 @kernel()
 def _frame_of(support, state):
-    """Return the state of a frame on springs, None for a fixed frame."""
+    """Return the state of a frame on springs, or None for a fixed frame."""
     if support is not None:
         return state.frame
     return None
@@ -173,7 +173,7 @@ def _frame_of(support, state):
 
 @kernel()
 def _frame_now(support, w):
-    """Return the state of a frame on springs when the motion was last read, None for a fixed frame."""
+    """Return the last evaluated state of a frame on springs, or None for a fixed frame."""
     if support is not None:
         return w.frame_now
     return None
@@ -181,7 +181,7 @@ def _frame_now(support, w):
 
 @kernel()
 def start_balance(p, parts, state, y, t, balance) -> None:
-    """Record energy, momentum, powers and forces at the start of a run."""
+    """Store energy, momentum, powers and forces at the start of a run."""
     frame = _frame_of(parts.terms.support, state)
     _balance(p, parts.terms.support, y, frame, balance, True)
     _powers(p, parts, state, state.wear_depth, y, frame, t, balance, balance.before)
@@ -197,7 +197,7 @@ def _add(balance, powers, weight) -> None:
 
 @kernel()
 def balance_step(p, parts, wear, flight, state, w, balance) -> None:
-    """Add the integrals over the step whose series has been computed but which is not yet completed."""
+    """Add the integrals over the current step, after its series was computed and before it is completed."""
     y, wear_depth, end, support = balance.body, balance.wear_depth, state.sigma_end, parts.terms.support
     frame = _frame_now(support, w)
     set_row(wear_depth, 0, row(state.wear_depth, 0))

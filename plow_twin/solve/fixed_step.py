@@ -1,7 +1,7 @@
-"""Fixed-step methods without event location: RK4 as in the paper, and semi-implicit Euler.
+"""Fixed-step methods without event detection: RK4 as in the paper, and semi-implicit Euler.
 
-They integrate the equations of motion (paper, eq. 5) in world axes about the centre of mass, as a check of the series'
-steps and events. They share only the geometry and the contact law with the series.
+They serve as a check of the Taylor series. They share only the geometry and the contact law with the series, and
+integrate the equations of motion (paper, eq. 5) in world axes about the centre of mass.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _LOG_FULL = int(Status.LOG_FULL)
 
 @kernel()
 def _switch(p, state, penetration, rate, time, totals, log) -> None:
-    """Update the modes of pairs that have touched or parted by the step's end, and log these mode changes."""
+    """Update the modes of pairs that have touched or separated during a step, and log these changes."""
     for pair in range(PAIR_COUNT):
         inside = p.enabled[pair] == 1 and penetration[pair] > 0.0
         mode = ON if inside else OFF
@@ -59,7 +59,7 @@ def _add_to_totals(force_before, force, dt, totals) -> None:
 
 @kernel()
 def _runge_kutta(p, acts, state, t, dt, z, trial, k, load) -> None:
-    """Take one step of the classical Runge-Kutta method; z (n,) is updated in place, k (4, n) gets the four stages."""
+    """Take one step of the classical Runge-Kutta method from the state z, shape (n,), with stages k, shape (4, n)."""
     accelerate(p, acts, False, state, t, z, load, k[0])
     for stage in range(1, 4):
         part = dt if stage == 3 else 0.5 * dt
@@ -73,11 +73,12 @@ def _runge_kutta(p, acts, state, t, dt, z, trial, k, load) -> None:
 
 @kernel()
 def end_coarsely(p, parts, state, totals, target, bound) -> int:
-    """Advance the state to `target` by the few Runge-Kutta steps of `bound`, and estimate the error; return a `Status`.
+    """Advance the state to `target` by the Runge-Kutta steps of `bound`, and estimate the error. Return a `Status`.
 
-    The estimate of a step is |k2 - k3| dt / 3 from the two middle stages, one order below the method's error; errors
-    of the velocity are multiplied by the remaining time. If a pair has touched or parted within a step, its impulse is
-    uncertain by F dt / 2; this error is multiplied by the time in which the largest load crosses the clearance.
+    The error estimate of a step is |k2 - k3| dt / 3, computed from the two middle stages, and has one order less than
+    the method. Errors of the velocity are multiplied by the remaining time. If a pair touches or separates within a
+    step, the error of its impulse is F dt / 2. This error is multiplied by the time in which the largest load moves the
+    head across the clearance.
     """
     terms = parts.terms
     acts, y, size = acting(parts), state.y, 6 if terms.support is None else 12
@@ -87,7 +88,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
     dt = (target - start) / bound.steps
     _to_world(p, parts.terms.support, state, z)
     for pair in range(PAIR_COUNT):
-        # a CLIPPED or RELEASED pair is inside its wall too, so it counts as ON
+        # CLIPPED and RELEASED pairs penetrate, too, so they are treated as ON
         state.mode[pair] = OFF if state.mode[pair] == OFF else ON
     pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
     state.bounded += 1
@@ -130,10 +131,10 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
 def integrate_fixed(
     p, parts, state, totals, log, z, done, steps, dt, euler, stride, q, v, penetration, force, frame, balance
 ) -> int:
-    """Take steps of `dt` from number `done[0]` up to `steps`, and write a row every `stride` steps; return a `Status`.
+    """Take the steps `done[0]` to `steps` of size `dt`, and write a row every `stride` steps. Return a `Status`.
 
-    z, shape (6,) or (12,) (`support.to_world_both`), keeps the integrated variables from call to call, since converting
-    them to body coordinates and back would lose the last bits.
+    z, shape (6,) or (12,), contains the integrated variables between calls (`support.to_world_both`). A conversion to
+    body coordinates and back would change their last bits.
     """
     trial, k = np.empty(z.size), np.empty((4, z.size))
     load, y, acts = np.empty(3), state.y, acting(parts)
@@ -150,7 +151,7 @@ def integrate_fixed(
         if not within_range(p, state, y):
             return _RANGE
         if n % stride == 0 or n == steps:
-            # the last row may follow the previous row by fewer than `stride` steps, so its index is rounded up
+            # the last row can follow fewer than `stride` steps after the previous row, so its index is rounded up
             row = (n + stride - 1) // stride
             pose_of(p, y, parts.terms.offset, q[row], v[row])
             if frame is not None:

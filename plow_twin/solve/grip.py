@@ -1,16 +1,17 @@
-"""Friction with stick: the force of sticking corners, and the conditions for slip and stick.
+"""Friction with stick: force of sticking corners, and conditions for slip and stick.
 
-A spring and a damper connect a sticking corner to its anchor a on the wall; a slipping corner exerts sliding friction
-on the wall:
+A spring and a damper connect a sticking corner to its anchor a on the wall. A slipping corner exerts sliding friction:
 
     sticks    T = k (s - a) + c s'      while |T| <= mu_s N
     slips     T = +-mu N                while +-(k s' + c s'') >= mu N'
 
-T is the tangential force, N the normal force, s the corner's place along the wall; k and c are the stiffness and
-damping of spring and damper. While a corner slips, the anchor follows the corner so that spring and damper carry mu N.
-The corner slips as long as the force of spring and damper would grow at least as fast as mu N after a change to stick.
-If mu_s = mu, T and the accelerations are continuous at the change, so each pair can be decided separately. Sources:
-Cundall and Strack, Geotechnique 29 (1979) 47; Luding, Granul. Matter 10 (2008) 235, sec. 3.2.
+T is the tangential force, N the normal force, s the corner's position along the wall, k the stiffness of the spring and
+c the damping of the damper. While a corner slips, the anchor follows the corner, so that spring and damper carry mu N.
+A corner slips as long as the force of spring and damper would grow at least as fast as mu N if the corner started to
+stick.
+
+If mu_s = mu, T and the accelerations are continuous at the change, so the change of each pair can be determined
+separately. Sources: Cundall and Strack, Geotechnique 29 (1979) 47; Luding, Granul. Matter 10 (2008) 235, sec. 3.2.
 """
 
 from __future__ import annotations
@@ -37,30 +38,30 @@ from plow_twin.solve.state import (
     Y,
 )
 
-#: A guard's first value counts as rounding error up to the sum of two bounds: `_ROUNDING` times its terms at the step's
-#: start, and `_ROUNDING_OVER_STEP` times its largest term over the step.
+#: A negative first value of a guard function is treated as rounding error up to the sum of two bounds. `_ROUNDING` is
+#: relative to its terms at the start of the step, `_ROUNDING_OVER_STEP` to its largest term over the step.
 _ROUNDING, _ROUNDING_OVER_STEP = 1e-10, 1e-13
-#: Rounding error of a corner's place along its wall, as a share of `Params.leverage`, and of its slip rate, as a share
-#: of `Params.threshold[0]`.
+#: Rounding error of a corner's position along its wall, divided by `Params.leverage`, and of its slip rate, divided by
+#: `Params.threshold[0]`.
 _FINEST = 4e-15
 
 
 @kernel(inline="code")
 def _along(p, pair, y):
-    """Return the place of a corner along its wall and its slip rate, at body coordinates y."""
+    """Return the position of a corner along its wall and its slip rate, at body coordinates y."""
     place = slip_place(p, pair, y[COS], y[SIN], y[X], y[Y], y[THETA])
     return place, slip_rate(p, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
 
 
 @kernel(inline="code")
 def held_force(p, state, pair, place, rate):
-    """Return the tangential force T in N of a corner's spring and damper."""
+    """Return the tangential force T in N of the spring and the damper at a corner."""
     return p.stick_stiffness * (place - state.anchor[pair]) + p.stick_damping * rate
 
 
 @kernel(inline="code")
 def tangential_force(p, state, frozen, pair, normal, place, rate):
-    """Return the tangential force T in N; unless `frozen`, it is limited by the force at which the corner slips."""
+    """Return the tangential force T in N. Unless `frozen` is true, T is limited to the force that causes slip."""
     grip = state.grip[pair]
     if state.mode[pair] != ON:
         return 0.0
@@ -75,40 +76,39 @@ def tangential_force(p, state, frozen, pair, normal, place, rate):
 
 @kernel(inline="code")
 def _anchor(p, state, pair, force, place, rate) -> None:
-    """Set the anchor so that spring and damper carry `force`."""
+    """Set the anchor of a corner so that spring and damper carry `force`."""
     state.anchor[pair] = place - (force - p.stick_damping * rate) / p.stick_stiffness
 
 
 @kernel(inline="code")
 def _normal_force(p, state, pair, depth):
-    """Return the normal force of a pair that pushes, even if a rounding error makes the depth negative."""
+    """Return the normal force of a pair that pushes, even if rounding has made the penetration `depth` negative."""
     return max(law_force(p, state, pair, depth, rate_of(p, pair, state.y)), 0.0)
 
 
 @kernel()
 def grasp(p, state, pair, old) -> None:
-    """Let the corner of a pair that begins to push stick with a slack spring, or slip if T would exceed mu_s N.
+    """Set the corner of a pair that begins to push: it sticks with a relaxed spring, or slips if |T| exceeds mu_s N.
 
-    N follows from the previous mode `old`; if N followed from the depth, rounding would decide between stick and slip.
-    At a touch N is the force at depth 0, that of Kelvin-Voigt's damper; for a CLIPPED pair that pushes again N is 0.
+    N is computed from the previous mode `old`, because rounding of the depth would otherwise determine the result. At a
+    touch, N is the force at depth 0, which is the force of the Kelvin-Voigt damper. For a CLIPPED pair, N is 0.
     """
     place, rate = _along(p, pair, state.y)
     depth = 0.0 if old == OFF else penetration_of(p, state, pair, state.y)
     normal = 0.0 if old == CLIPPED else _normal_force(p, state, pair, depth)
     state.anchor[pair], state.grip[pair] = place, 0
     held = p.stick_damping * rate
-    # without a normal force every sliding corner slips; the guard of a slipping corner gives the same decision
+    # without normal force, every moving corner slips; the guard function of a slipping corner gives the same result
     if abs(held) > p.static_friction * normal or (normal <= 0.0 and rate != 0.0):
         state.grip[pair] = 1 if rate > 0.0 else -1
 
 
 @kernel()
 def switch_grip(p, state, pair, new) -> None:
-    """Change a corner's grip to stick or slip, as `new` says."""
+    """Set a corner to stick or slip, as the event `new` requires."""
     if new == STICKS:
         place, rate = _along(p, pair, state.y)
-        # a Kelvin-Voigt force acts from the touch on, so it is computed even if rounding has made the depth zero or
-        # negative
+        # a Kelvin-Voigt force acts from the touch on, even if rounding has made the depth zero or negative
         normal = _normal_force(p, state, pair, penetration_of(p, state, pair, state.y))
         _anchor(p, state, pair, state.grip[pair] * p.friction * normal, place, rate)
         state.grip[pair] = 0
@@ -118,11 +118,11 @@ def switch_grip(p, state, pair, new) -> None:
 
 @kernel()
 def settle_grips(p, state, force) -> None:
-    """Update after a fixed step which corners slip; `force` holds the normal forces, shape (8,)."""
+    """Determine after a fixed step which corners slip. `force` contains the normal forces, shape (8,)."""
     for pair in range(PAIR_COUNT):
         place, rate = _along(p, pair, state.y)
         if state.mode[pair] != ON or force[pair] <= 0.0:
-            # a new touch starts with a slack spring, as in `grasp`
+            # each touch starts with a relaxed spring, as in `grasp`
             state.anchor[pair], state.grip[pair] = place, 0
             continue
         held = held_force(p, state, pair, place, rate)
@@ -135,7 +135,7 @@ def settle_grips(p, state, force) -> None:
 
 @kernel()
 def weigh_grips(p, state, w) -> None:
-    """Write to `w.grip` the factors by which T depends on normal force, place and slip rate of each corner."""
+    """Write to `w.grip` the factors of normal force, position and slip rate in the tangential force of each corner."""
     for pair in range(PAIR_COUNT):
         acts = state.mode[pair] == ON
         sticks = acts and state.grip[pair] == 0
@@ -146,9 +146,9 @@ def weigh_grips(p, state, w) -> None:
 
 @kernel(fast=True, inline="code")
 def grip_terms(p, state, w, k, place, rate):
-    """Return order k of the tangential forces T of the eight pairs.
+    """Return order k of the series of the tangential forces T of the eight pairs.
 
-    `place` and `rate` are order k of the corners' places and slip rates; `w.force` holds the normal forces.
+    `place` and `rate` are order k of the corners' positions and slip rates. `w.force` contains the normal forces.
     """
     if k == 0:
         place = place - row(state.anchor, 0)
@@ -157,10 +157,10 @@ def grip_terms(p, state, w, k, place, rate):
 
 @kernel()
 def grip_guard(p, state, w, order, pair, side) -> int:
-    """Write a guard of a corner's grip to `w.column[0]`; return the switch that it causes, 0 without a guard.
+    """Write a guard function of a corner to `w.column[0]`. Return the event of its root, or 0 without a guard function.
 
-    A sticking corner has two guards mu_s N -+ T, one for each direction of slip (`side`). A slipping corner has a guard
-    for side 0 only: the condition for slip in the module's docstring, times the time per sigma.
+    A sticking corner has two guard functions, mu_s N -+ T, one for each direction of slip (`side`). A slipping corner
+    has one guard function, for side 0. It is the condition for slip in the docstring of this module, times dt/dsigma.
     """
     g, rate, force, drag = w.column[0], w.slip[0], w.force, w.slip[4]
     grip = state.grip[pair]
@@ -172,12 +172,11 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         sign = 1.0 if side == 0 else -1.0
         for k in range(order):
             g[k] = p.static_friction * force[k, pair] - sign * drag[k, pair]
-        # a negative force counts as 0: a pair that is ON can lie slightly outside its wall, because the place of its
-        # touch has an error
+        # a negative normal force is treated as 0: because of the error of its touch time, a pair with mode ON can be
+        # slightly outside its wall
         g[0] = p.static_friction * max(force[0, pair], 0.0) - sign * drag[0, pair]
         size, noise = p.static_friction * abs(force[0, pair]) + abs(drag[0, pair]), 0.0
-        # the guard is raised by the rounding error of the tangential force T; otherwise a corner could slip as soon as
-        # it sticks
+        # the guard function is increased by the rounding error of T; otherwise a corner could slip as soon as it sticks
         late = _FINEST * (p.stick_stiffness * p.leverage + p.stick_damping * p.threshold[0])
     else:
         for k in range(order - 1):
@@ -192,8 +191,8 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         for k in range(1, order):
             power *= state.sigma_end
             noise = max(noise, _ROUNDING_OVER_STEP * abs(g[k]) * power)
-    # a negative first value within rounding error is set to 0; the higher orders then decide whether the guard turns
-    # negative
+    # a negative first value within rounding error is set to 0; the higher orders then determine the sign of the guard
+    # function
     if abs(g[0]) <= _ROUNDING * size + noise:
         g[0] = max(g[0], 0.0)
     g[0] += late

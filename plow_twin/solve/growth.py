@@ -8,12 +8,12 @@ from typing import Final
 from plow_twin.kernel.arrays import copy_into
 from plow_twin.kernel.compiler import kernel
 
-#: Largest number of earlier times since which the growth of errors is computed; when this number is reached, every
-#: second of these times is dropped.
+#: Largest number of earlier times from which the growth of errors is computed. When this number is reached, every
+#: second time is removed.
 MOST_KEPT: Final = 256
-#: Largest number of squarings of a matrix; after this number, singular values whose ratio is within 1e-6 of 1 still
-#: count as equal. Squaring ends earlier if the matrix, scaled to trace 1, has a square whose trace is above
-#: `_RANK_ONE`: the matrix then has rank one.
+#: `_SQUARINGS`: largest number of squarings of a matrix. After this number, singular values whose ratio is within 1e-6
+#: of 1 are treated as equal. `_RANK_ONE`: a matrix with trace 1 is treated as having rank one if the trace of its
+#: square is larger than this value; the squarings then end.
 _SQUARINGS, _RANK_ONE = 18, 1.0 - 1e-9
 
 
@@ -32,9 +32,9 @@ def _multiply(a, b, out) -> None:
 def _larger_norm(a, height, most, gram, power, square) -> float:
     """Return the larger of `most` and the largest singular value of the first `height` rows of a matrix.
 
-    With A the matrix of these rows and G = A^T A, the square of the largest singular value lies between trace(G^(m+1))
-    / trace(G^m) and trace(G^m)^(1/m). G is squared repeatedly until the root of the upper bound is below `most`, or
-    until the power of G has rank one.
+    Let A be these rows and G = A^T A. The square of the largest singular value lies between trace(G^(m+1)) / trace(G^m)
+    and trace(G^m)^(1/m). G is squared repeatedly until the square root of the upper bound is less than `most`, or until
+    the power of G has rank one.
     """
     size, trace = a.shape[1], 0.0
     for i in range(size):
@@ -72,7 +72,7 @@ def _larger_norm(a, height, most, gram, power, square) -> float:
 
 @kernel(fast=True)
 def _multiply_all(matrix, since, count, grown) -> None:
-    """Multiply the matrices since[:, i, :] from the left by `matrix`; `since[k]` holds row k of all these matrices."""
+    """Write the products of `matrix` and each matrix since[:, i, :]. `since[k]` contains row k of all matrices."""
     size = len(matrix)
     length = count * size
     for i in range(size):
@@ -88,8 +88,8 @@ def _multiply_all(matrix, since, count, grown) -> None:
 def _largest(grown, count, height, scratch) -> float:
     """Return the largest spectral norm of the first `height` rows of the matrices grown[:, i, :], at least 1.
 
-    The norm of the matrix with the largest sum of squares is computed first. A sum of squares is an upper bound of the
-    squared norm, so few of the other matrices then need their norm computed.
+    The sum of squares of a matrix is an upper bound of its squared norm. The norm of the matrix with the largest sum is
+    computed first, so that few other norms have to be computed.
     """
     most, begin, size = 1.0, 0, len(grown)
     squares = scratch[5:].reshape(-1)
@@ -111,12 +111,12 @@ def _largest(grown, count, height, scratch) -> float:
 
 @kernel()
 def _stretch_basis(matrix, basis, moved, logs) -> None:
-    """Multiply a basis by a matrix and orthonormalise it; write the log of each vector's stretching factor."""
+    """Multiply a basis by a matrix, orthonormalise it, and write the logarithm of each vector's growth factor."""
     size = len(matrix)
     _multiply(matrix, basis, moved)
     for j in range(size):
         for i in range(2 * j):
-            # each vector is made orthogonal to the vectors before it in two passes, because a single pass would leave
+            # each vector is made orthogonal to the previous vectors in two passes, because a single pass leaves
             # rounding errors
             before, share = i % j, 0.0
             for k in range(size):
@@ -134,38 +134,39 @@ def _stretch_basis(matrix, basis, moved, logs) -> None:
 
 @kernel(entry=True)
 def follow_growth(matrices, changes, ends, since, kept, whole, basis, scratch, totals, rows, growth, logs) -> None:
-    """For n times in turn, compute products of fundamental matrices and the growth of errors.
+    """Compute products of fundamental matrices and the growth of errors, for n times in succession.
 
     Parameters
     ----------
     matrices : ndarray, shape (n, k, k)
-        Fundamental matrices from the end of the last whole stretch to the time of each row.
+        Fundamental matrices from the end of the last complete stretch to each of n times.
     changes : ndarray, shape (n, p, k)
-        Effects of the parameters on the state since the end of the last whole stretch.
+        Effects of the parameters on the state since the end of the last complete stretch.
     ends : ndarray of int64, shape (n,)
-        1 for a row at the end of a stretch. The other rows lie within a stretch; of the errors at their time, growth
-        counts those of places but not those of rates.
+        1 for a time at the end of a stretch, and 0 for a time within a stretch. Within a stretch, the growth includes
+        only errors of coordinates, not of rates.
     since : ndarray, shape (2, k, m, k)
-        since[0, :, i, :] is the product of the fundamental matrices since earlier time i, for i < `kept[0]`; since[1]
-        is scratch space.
+        since[0, :, i, :] is the product of the fundamental matrices since the earlier time i, for i < `kept[0]`.
+        since[1] is scratch space.
     kept : ndarray of int64, shape (1,)
         Number of earlier times in `since`.
     whole : tuple of ndarray, shapes (k, k) and (p, k)
-        Fundamental matrix and effects of the parameters over all whole stretches, renewed at the end of each.
+        Fundamental matrix and effects of the parameters over all complete stretches. Updated at the end of each
+        stretch.
     basis : ndarray, shape (k, k)
-        Orthonormal basis, renewed at the end of each stretch.
+        Orthonormal basis. Updated at the end of each stretch.
     scratch : ndarray, shape (5 + s, k, k)
-        Scratch space, with at least m numbers beyond the first five matrices.
+        Scratch space, with at least m numbers after the first five matrices.
     totals, rows, growth, logs : ndarray, shapes (n, k, k), (n, p, k), (n,) and (n, k)
-        Receive the products, the effects of the parameters, the largest growth since an earlier time, and the
-        logarithms of the factors by which the basis vectors are stretched.
+        Arrays that receive the products, the effects of the parameters, the largest growth since an earlier time, and
+        the logarithms of the growth factors of the basis vectors.
     """
     most = since.shape[2]
     for index in range(len(matrices)):
         matrix, count = matrices[index], kept[0]
         grown, size = since[1], len(matrix)
         _multiply_all(matrix, since[0], count, grown)
-        # entry `count` of `grown` is the growth since the beginning of this stretch, which is `matrix` itself
+        # entry `count` of `grown` is `matrix` itself, the growth since the beginning of the current stretch
         for k in range(size):
             copy_into(grown[k, count], matrix[k])
         ended = ends[index] == 1

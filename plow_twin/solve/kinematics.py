@@ -1,6 +1,6 @@
-"""Kinematics of the head: penetrations, their rates, and conversions between body and world axes.
+"""Kinematics of the head: penetrations, their rates, and conversions between body axes and world axes.
 
-`rows` are the coefficients of each pair for cosine and sine of the head's angle and for its place x, y
+The argument `rows` contains coefficients of each pair for cosine and sine of the head's angle and for its position x, y
 (`model.geometry`).
 """
 
@@ -15,24 +15,24 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, splat
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
-#: A quarter turn in rad; each time a tumbling block has turned by it, each corner takes the name of the next corner.
+#: A quarter turn in rad. After each quarter turn of a tumbling block, its corners are renamed (`solve.tumbling`).
 QUARTER_TURN = 0.5 * math.pi
 
 
-#: 1 if the state is in world axes, as it is for a head that carries corners; None if it is in the head's axes.
+#: 1 if the state is in world axes, as for a head that carries corners. None if it is in head axes.
 fixed_axes = by_field("tumbles", lambda p: 1, lambda p: None)
 #: Whether the head may turn beyond 45 degrees (`model.geometry.tumbles`).
 may_tumble = by_field("tumbles", lambda p: p.tumbles != 0.0, lambda p: False)
 
 
-#: 1 if the corners are rounded, so that the angle moves the touching point along its wall; otherwise None.
+#: 1 if the corners are rounded, so that a rotation moves the touching point along its wall. Otherwise None.
 _is_rounded = by_field("roll", lambda p: 1, lambda p: None)
 _roll = by_field("roll", lambda p: p.roll, lambda p: 0.0)
 
 
 @kernel(inline="code")
 def along(p, c, s):
-    """Return cosine and sine of the angle of the state's axes; (c, s) belong to the head's axes."""
+    """Return cosine and sine of the angle of the state's axes. The arguments c and s belong to the head's angle."""
     if fixed_axes(p) is not None:
         return 1.0, 0.0
     return c, s
@@ -48,10 +48,10 @@ def spin_of_axes(p, omega):
 
 @kernel(inline="code")
 def named_angle(p, y, theta):
-    """Return theta less the quarter turns by which the corners have been renamed (`solve.tumbling`).
+    """Return theta without the quarter turns after which the corners were renamed (`solve.tumbling`).
 
-    The body coordinates y contain the cosine and sine of the returned angle. For a head that carries walls, theta
-    itself is returned.
+    The body coordinates y contain the cosine and sine of the returned angle. For a head that carries walls, the
+    function returns theta.
     """
     if fixed_axes(p) is not None:
         turns = np.rint((y[THETA] - math.atan2(y[SIN], y[COS])) / QUARTER_TURN)
@@ -61,26 +61,26 @@ def named_angle(p, y, theta):
 
 @kernel(inline="source")
 def row_value(rows, pair, c, s, x, y):
-    """Return the scalar product of one pair's rows with (c, s, x, y)."""
+    """Return the scalar product of one pair's coefficients with (c, s, x, y)."""
     return rows[0, pair] * c + rows[1, pair] * s + rows[2, pair] * x + rows[3, pair] * y
 
 
 @kernel(fast=True)
 def row_values(rows, c, s, x, y):
-    """Return the scalar products of all pairs' rows with (c, s, x, y), side by side."""
+    """Return the scalar products of all pairs' coefficients with (c, s, x, y), as a vector of eight lanes."""
     return (row(rows, 0) * c + row(rows, 1) * s) + (row(rows, 2) * x + row(rows, 3) * y)
 
 
 @kernel(inline="source")
 def row_rate(p, rows, pair, c, s, omega, x, y, vx, vy):
-    """Return the rate of change of one pair's `row_value`."""
+    """Return the time derivative of one pair's `row_value`."""
     spin = spin_of_axes(p, omega)
     return row_value(rows, pair, -omega * s, omega * c, vx + spin * y, vy - spin * x)
 
 
 @kernel(inline="code")
 def slip_place(p, pair, c, s, x, y, theta):
-    """Return the place of a corner's touching point along its wall in m."""
+    """Return the position of a corner's touching point along its wall in m."""
     place = row_value(p.slip_rows, pair, c, s, x, y)
     if _is_rounded(p) is not None:
         place += _roll(p) * theta
@@ -98,7 +98,7 @@ def slip_rate(p, pair, c, s, omega, x, y, vx, vy):
 
 @kernel(inline="code")
 def slip_arm(p, pair, c, s, x, y):
-    """Return the moment arm in m of a force that acts along the wall at a corner's touching point."""
+    """Return the moment arm in m of a friction force that acts at a corner's touching point."""
     arm = row_value(p.slip_arm_rows, pair, c, s, x, y)
     if _is_rounded(p) is not None:
         arm -= _roll(p)
@@ -107,7 +107,7 @@ def slip_arm(p, pair, c, s, x, y):
 
 @kernel(fast=True, inline="code")
 def rolled(p, values, angle):
-    """Add to all places or slip rates the part due to rounded corners, proportional to `angle` or its rate."""
+    """Return all positions along the walls, or all slip rates, with the effect of the rounded corners' angle added."""
     if _is_rounded(p) is not None:
         values = values + splat(_roll(p) * angle)
     return values
@@ -115,7 +115,7 @@ def rolled(p, values, angle):
 
 @kernel(fast=True, inline="code")
 def slip_arms(p, arms, k):
-    """Return series order k of all pairs' arms (`slip_arm`), given that of sharp corners; only order 0 differs."""
+    """Return order k of the series of all friction arms, given order k for sharp corners. Only order 0 differs."""
     if _is_rounded(p) is not None and k == 0:
         arms = arms - splat(_roll(p))
     return arms
@@ -123,7 +123,7 @@ def slip_arms(p, arms, k):
 
 @kernel(inline="code")
 def penetration_at(p, state, pair, c, s, x, y):
-    """Return the penetration of one pair in m, with the wear at the step's start."""
+    """Return the penetration of one pair in m, with the wear depth at the start of the step."""
     return row_value(p.penetration_rows, pair, c, s, x, y) + p.penetration_rows[4, pair] - state.wear_depth[pair]
 
 
@@ -159,9 +159,9 @@ def to_world_axes(c, s, x, y):
 
 @kernel()
 def to_body(p, named, z, y) -> None:
-    """Write body coordinates from z = (x, y, theta, vx, vy, omega) of the centre of mass.
+    """Write body coordinates to y from z = (x, y, theta, vx, vy, omega) of the centre of mass.
 
-    The corners are named as in the body coordinates `named` (`named_angle`).
+    The corners have the same names as in the body coordinates `named` (`named_angle`).
     """
     angle = named_angle(p, named, z[2])
     c, s = math.cos(angle), math.sin(angle)
@@ -183,7 +183,7 @@ def to_world(p, y, z) -> None:
 
 @kernel()
 def pose_of(p, y, offset, q, v) -> None:
-    """Write pose and rate of the cavity's centre in world axes from body coordinates; inverse of `body_state`."""
+    """Write pose and rate of the cavity's centre in world axes from body coordinates. It inverts `body_state`."""
     x, yy, vx, vy, om = y[X], y[Y], y[VX], y[VY], y[OMEGA]
     if offset is not None:
         x, yy = x - p.offset[0], yy - p.offset[1]

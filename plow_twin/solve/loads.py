@@ -1,4 +1,4 @@
-"""The value of the loads at one time."""
+"""Evaluation of the loads at one time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from plow_twin.kernel.compiler import kernel
 
 @kernel()
 def load_at(p, harmonics, segments, t, out) -> None:
-    """Write the loads' force per mass and moment per inertia at time t to `out`, shape (3,), in world axes."""
+    """Write force per mass and moment per inertia of the loads at time t to `out`, shape (3,), in world axes."""
     for j in range(3):
         out[j] = p.constant[j]
     if harmonics is not None:
@@ -24,7 +24,7 @@ def load_at(p, harmonics, segments, t, out) -> None:
 
 @kernel()
 def add_harmonics(p, harmonics, t, out) -> None:
-    """Add the harmonics at time t to `out`, in the units of `load_at`."""
+    """Add the harmonic loads at time t to `out`, in the units of `load_at`."""
     for i in range(harmonics.size):
         one = harmonics[i]
         sine, cosine = math.sin(one.omega * t), math.cos(one.omega * t)

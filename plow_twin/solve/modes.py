@@ -1,4 +1,4 @@
-"""The eight pairs of corner and wall: penetrations, modes, factors in the series, and range of validity."""
+"""The eight pairs of corner and wall: penetrations, contact modes, damping factors, and range of validity."""
 
 from __future__ import annotations
 
@@ -33,33 +33,34 @@ from plow_twin.solve.state import (
     Y,
 )
 
-#: A penetration below this share of the release penetration counts as zero, and so does a speed below this share of the
-#: speed needed to reach the release penetration.
+#: Penetration that is treated as zero, divided by the release penetration. It also defines a speed that is treated as
+#: zero, divided by the speed that reaches the release penetration.
 SHALLOW = 1e-3
-#: Number of iterations that find the damping and the speed of an impact under way, which depend on each other.
+#: Number of iterations in which damping and impact speed of a pair that starts in contact are computed in turn.
 _ROUNDS = 8
-#: Number of bisections that find the impact speed, enough to settle the last bit of a double.
+#: Number of bisections for the impact speed. It determines the last bit of a double.
 _BISECTIONS = 60
-#: Largest |theta| in rad at which each corner meets the walls of its pairs: 45 degrees and a margin for rounding
-#: errors.
+#: Largest |theta| in rad at which each corner faces the walls of its pairs: 45 degrees, and a margin for rounding.
 LARGEST_ANGLE = 0.25 * math.pi + 1e-12
 _ALL_PAIRS = 2**PAIR_COUNT - 1
 
 
 @kernel()
 def penetration_and_rate(p, state, pair):
-    """Return the penetration of one pair and its rate at the step's start."""
+    """Return the penetration of one pair and its rate, at the start of the step."""
     return penetration_of(p, state, pair, state.y), rate_of(p, pair, state.y)
 
 
 @kernel()
 def _fallen_number(p, y, pair, speed):
-    """Return D for a restitution that falls with the impact (`model.scene.Contact`); `speed` is the approach speed."""
+    """Return D for a restitution that decreases with the impact speed (`model.scene.Contact`).
+
+    `speed` is the speed of approach in m/s.
+    """
     arm = row_value(p.arm_rows, pair, y[COS], y[SIN], y[X], y[Y])
     mobility = 1.0 + p.free[2] * arm * arm * p.inverse_inertia / p.inverse_mass
     impact = speed * mobility**-p.fall_mass
-    # rows 2 and 3 of the penetration (the factors of X and Y) hold the wall's normal, so `along` is the speed along the
-    # wall
+    # rows 2 and 3 of the penetration contain the wall's normal, so `along` is the speed along the wall
     along = p.penetration_rows[2, pair] * y[VY] - p.penetration_rows[3, pair] * y[VX]
     e = p.restitution * max(impact / p.fall_speed, 1.0) ** -p.fall - p.fall_along * abs(along)
     at = max(e, 1.0 / RESTITUTIONS) * RESTITUTIONS
@@ -68,7 +69,7 @@ def _fallen_number(p, y, pair, speed):
     return (low + (at - index) * (high - low)) * RESTITUTIONS / at
 
 
-#: Return D of an impact, which is constant unless the restitution falls with the impact.
+#: Return the damping number D of an impact. It depends on the speed only if the restitution does.
 _damping_number = by_field(
     "fall", lambda p, y, pair, speed: _fallen_number(p, y, pair, speed), lambda p, y, pair, speed: p.damping_number
 )
@@ -77,7 +78,7 @@ _falls = by_field("fall", lambda p: 1, lambda p: None)
 
 @kernel()
 def touch(p, state, pair) -> None:
-    """Start a contact: set its damping lambda = D / v0 from the impact speed v0."""
+    """Start a contact, with the damping factor lambda = D / v0 of its impact speed v0."""
     if p.damping_number >= 0.0:
         _, speed = penetration_and_rate(p, state, pair)
         number = _damping_number(p, state.y, pair, speed)
@@ -86,17 +87,16 @@ def touch(p, state, pair) -> None:
 
 @kernel()
 def _impact_speed(number, rate, energy) -> float:
-    """Return the speed v0 of the impact that led to a state inside a wall.
+    """Return the impact speed v0 in m/s that leads to the current penetration and rate of a pair.
 
-    `number` is D, `rate` the penetration rate d' in m/s, `energy` the elastic energy per mass E / m in m^2/s^2. The
-    speed v0 solves the first integral of the free impact, where u = D d' / v0: u - ln(1 + u) + D^2 E / (m v0^2) = D -
-    ln(1 + D).
+    `number` is D, `rate` the penetration rate d' in m/s, and `energy` the elastic energy per mass E / m in m^2/s^2. v0
+    solves the first integral of the free impact: u - ln(1 + u) + D^2 E / (m v0^2) = D - ln(1 + D) with u = D d' / v0.
     """
     if number <= 0.0 or (energy <= 0.0 and rate == 0.0):
         return 0.0
     full = number - math.log1p(number)
-    # `low` is the speed of an impact whose turning point, where the rate is 0, has this energy; if the rate is not 0,
-    # the impact was faster than `low`
+    # `low` is the speed of the impact that has this energy at its turning point, where the rate is zero; with another
+    # rate, the impact was faster
     low = math.sqrt(number * number * energy / full)
     high = max(low, abs(rate)) * (1.0 + number)
     low = max(low, rate, -number * rate)
@@ -113,14 +113,14 @@ def _impact_speed(number, rate, energy) -> float:
 
 @kernel()
 def _start_inside(p, state, pair, energy) -> None:
-    """Give a pair that starts inside its wall the damping of the impact that would have brought it there.
+    """Set the damping factor of a pair that starts in contact, as if an impact had led to its current state.
 
-    `energy` is the elastic energy of all pairs, since all of it may come from this impact.
+    `energy` is the elastic energy of all pairs, because all of it may come from this impact.
     """
     if p.damping_number >= 0.0:
         y = state.y
         arm = row_value(p.arm_rows, pair, y[COS], y[SIN], y[X], y[Y])
-        # a frame on springs adds a mobility of its own, with the arm about the frame's centre
+        # a frame on springs has its own mobility, with the arm about the frame's centre
         arm_of_frame = row_value(p.arm_rows, pair, y[COS], y[SIN], 0.0, 0.0)
         mobility = p.inverse_mass + p.free[2] * arm * arm * p.inverse_inertia
         mobility += p.frame_mobility[0] + arm_of_frame * arm_of_frame * p.frame_mobility[2]
@@ -128,7 +128,7 @@ def _start_inside(p, state, pair, energy) -> None:
         number = p.damping_number
         speed = _impact_speed(number, rate, energy * mobility)
         if _falls(p) is not None:
-            # speed and damping depend on each other, so they are computed in turns
+            # speed and damping depend on each other, so they are computed in turn
             for _ in range(_ROUNDS):
                 number = _damping_number(p, y, pair, speed)
                 speed = _impact_speed(number, rate, energy * mobility)
@@ -137,7 +137,7 @@ def _start_inside(p, state, pair, energy) -> None:
 
 @kernel()
 def mode_inside(p, state, pair):
-    """Return the mode of a penetrating pair, and record whether it is beyond the ramp of the damping."""
+    """Return the mode of a penetrating pair, and record whether its penetration exceeds the damping ramp."""
     penetration, rate = penetration_and_rate(p, state, pair)
     state.beyond_ramp[pair] = 1 if penetration > p.ramp else 0
     if law_force(p, state, pair, penetration, rate) < 0.0:
@@ -147,7 +147,7 @@ def mode_inside(p, state, pair):
 
 @kernel(entry=True)
 def settle_modes(p, state, stick) -> None:
-    """Choose each pair's mode from its penetration at the start of a motion."""
+    """Set each pair's mode from its penetration at the start of a motion."""
     energy = 0.0
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
@@ -171,9 +171,9 @@ def settle_modes(p, state, stick) -> None:
 
 @kernel(entry=True)
 def settle_moved(params, states, which, places, time, stick) -> None:
-    """Move the states with indices `which` to coordinates `places` at `time`, and choose their modes.
+    """Set the states with the indices `which` to the body coordinates `places` at `time`, and set their modes.
 
-    `places` are body coordinates. A pair that was already in contact keeps the damping that was set when it touched.
+    A pair that was already in contact keeps the damping factor that was set at its touch.
     """
     touched = np.zeros(PAIR_COUNT, np.int64)
     damping = np.zeros(PAIR_COUNT)
@@ -194,14 +194,14 @@ def settle_moved(params, states, which, places, time, stick) -> None:
 
 @kernel(entry=True)
 def settle_many(params, states, members) -> None:
-    """Call `settle_modes` for each of `members`; their scenes have no friction with stick."""
+    """Call `settle_modes` for each of `members`. Their scenes must have no friction with stick."""
     for member in members:
         settle_modes(params[member], states[member], None)
 
 
 @kernel(inline="source")
 def any_penetrates(state) -> bool:
-    """Return whether any pair is inside its wall, with or without force."""
+    """Return whether any pair penetrates, with or without force."""
     inside = 0
     for pair in range(PAIR_COUNT):
         inside += 0 if state.mode[pair] == OFF else 1
@@ -210,7 +210,7 @@ def any_penetrates(state) -> bool:
 
 @kernel()
 def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
-    """Write the factors of each pair's force in the series to `w.per_pair`; return whether any pair penetrates."""
+    """Write the factors of each pair's force in the series to `w.per_pair`. Return whether any pair penetrates."""
     mode, per_pair = state.mode, w.per_pair
     for pair in range(PAIR_COUNT):
         per_pair[BASE, pair] = 0.0
@@ -221,8 +221,8 @@ def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
             if penetration > SHALLOW * p.release:
                 per_pair[BASE, pair] = 0.5 / math.sqrt(penetration) if p.exponent == 1.5 else 1.0 / penetration
             else:
-                # the step after the touch was cut short while the penetration d is still too small for a series of d^n,
-                # so the pair becomes RELEASED
+                # the step after the touch was too short: the penetration d is still too small for a series of d^n, so
+                # the pair becomes RELEASED
                 mode[pair] = RELEASED
         acts = mode[pair] == ON
         per_pair[ACTS, pair] = p.stiffness if acts else 0.0
@@ -236,14 +236,14 @@ def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
 
 @kernel(inline="source")
 def slow_touch(p) -> float:
-    """Return the speed in m/s below which a touch alone does not carry a pair to the release penetration."""
+    """Return the speed in m/s below which a touch does not lead to the release penetration by its speed alone."""
     acceleration = p.threshold[0] * p.weight / p.radius
     return SHALLOW * math.sqrt(2.0 * acceleration * p.release)
 
 
 @kernel(fast=True)
 def _all_shallow(p, state, y) -> bool:
-    """Return whether every penetration, also of pairs that cannot touch, is less than half the cavity."""
+    """Return whether every penetration is less than half the cavity, including pairs that cannot touch."""
     penetration = row_values(p.penetration_rows, y[COS], y[SIN], y[X], y[Y])
     penetration = penetration + (row(p.penetration_rows, 4) - row(state.wear_depth, 0))
     return bool(below(penetration, splat(p.half_cavity)) == _ALL_PAIRS)
@@ -251,7 +251,7 @@ def _all_shallow(p, state, y) -> bool:
 
 @kernel()
 def read_range(p, state, y, out) -> None:
-    """Write the values that `within_range` checks: angle [rad], largest penetration [m] and its pair."""
+    """Write the values that `within_range` checks: angle [rad], largest penetration [m], and index of its pair."""
     out[0], out[1], out[2] = named_angle(p, y, y[THETA]), -np.inf, 0.0
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
@@ -262,7 +262,7 @@ def read_range(p, state, y, out) -> None:
 
 @kernel()
 def within_range(p, state, y) -> bool:
-    """Return whether the model is valid at body coordinates y: |theta| <= 45 degrees, no corner beyond mid-cavity."""
+    """Return whether the model is valid at y: |theta| <= 45 degrees, and penetrations at most half the cavity."""
     if _all_shallow(p, state, y):
         return abs(named_angle(p, y, y[THETA])) <= LARGEST_ANGLE
     deepest = 0.0

@@ -1,6 +1,7 @@
-"""Many separate impacts of bodies that touch a wall at one point; place and arms are constant during an impact.
+"""Many separate impacts of bodies that touch a wall at one point. Positions and arms are constant during an impact.
 
-The normal force is that of `model.contact`; friction is regularised (`model.friction`) or the spring of `solve.grip`.
+The normal force is that of `model.contact`. Friction is regularised (`model.friction`) or modelled by the spring of
+`solve.grip`.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.model.contact import normal_force
 from plow_twin.model.friction import friction_force
 
-#: Constants of the contact, per mass: stiffness K, exponent n, viscous damping C, ramp [m], friction coefficient mu,
-#: regularisation speed [m/s] (0 if a tangential spring models the friction), and stiffness and damping of this spring.
+#: Constants of the contact, divided by the mass: stiffness K, exponent n, viscous damping C, ramp [m], friction
+#: coefficient mu, regularisation speed [m/s], and stiffness and damping of the tangential spring. The spring is used if
+#: the regularisation speed is 0.
 POINT = np.dtype(
     [
         (name, "f8")
@@ -23,7 +25,7 @@ POINT = np.dtype(
         )
     ]
 )  # fmt: skip
-#: Number of steps in the duration of the undamped impact, and the longest impact as a multiple of this duration.
+#: Number of steps per duration of the undamped impact, and longest impact divided by this duration.
 _STEPS, _LONGEST = 800, 20
 
 
@@ -32,7 +34,7 @@ def _strike(point, damping, normal_arm, tangential_arm, inertia, speed, slip, ou
     normal = 1.0 + normal_arm * normal_arm / inertia
     along = 1.0 + tangential_arm * tangential_arm / inertia
     coupling = -normal_arm * tangential_arm / inertia
-    # the largest depth of the undamped impact gives the impact's duration up to a factor near 1
+    # the largest depth of the undamped impact determines the duration of the impact up to a factor near 1
     power = point.exponent + 1.0
     deepest = (power * speed * speed / (2.0 * point.stiffness * normal)) ** (1.0 / power)
     h = math.pi * deepest / (speed * _STEPS)
@@ -61,21 +63,21 @@ def _strike(point, damping, normal_arm, tangential_arm, inertia, speed, slip, ou
 
 @kernel(entry=True)
 def strike_points(point, damping, normal_arm, tangential_arm, inertia, speed, slip, impulse) -> None:
-    """Write each impact's impulses per mass, along the wall and away from it, to `impulse`.
+    """Write the impulses of each impact, divided by the mass, to `impulse`: along the wall and away from the wall.
 
     Parameters
     ----------
     point : ndarray of POINT, shape (1,)
     damping : ndarray, shape (m,)
-        lambda of each impact in s/m.
+        Damping factor lambda of each impact in s/m.
     normal_arm, tangential_arm : ndarray, shape (m,)
-        Place of the touching point relative to the centre of mass, along the wall and away from it, in m.
+        Position of the touching point relative to the centre of mass in m, along the wall and away from the wall.
     inertia : float
         Square of the radius of gyration in m^2.
     speed, slip : ndarray, shape (m,)
-        Speed of the point towards the wall (> 0) and along it, in m/s.
+        Speed of the point in m/s, towards the wall (> 0) and along the wall.
     impulse : ndarray, shape (m, 2)
-        Receives the impulses in m/s.
+        Array that receives the impulses in m/s.
     """
     for i in range(speed.size):
         _strike(point[0], damping[i], normal_arm[i], tangential_arm[i], inertia, speed[i], slip[i], impulse[i])

@@ -1,9 +1,10 @@
-"""Short motions of many square blocks with rounded corners that are tossed on a table, each with its own parameters.
+"""Short motions of many square blocks with rounded corners that are tossed on a table. Each block has its own
+parameters.
 
-Contacts have the normal force of `model.contact` and the spring friction of `solve.grip`. In addition, restitution and
-friction fall with the impact speed and differ from touch to touch by a given scatter. Flight has linear drag. In
-contact, a step is a fixed fraction of the contact time. In flight, a step is as long as possible without a corner
-reaching the table.
+Contacts have the normal force of `model.contact` and the spring friction of `solve.grip`. Restitution and friction
+decrease with the impact speed, and vary from touch to touch by a given scatter. In flight, the drag is linear in the
+velocity. A step in contact is a fixed fraction of the contact time. A step in flight is as long as possible before a
+corner can reach the table.
 """
 
 from __future__ import annotations
@@ -15,15 +16,15 @@ import numpy as np
 from plow_twin.kernel.compiler import kernel
 from plow_twin.model.contact import normal_force
 
-#: Parameters of a block, per mass.
+#: Parameters of a block, divided by its mass.
 #: `half`: half the distance between the centres of its corners' arcs [m]; `radius`: radius of these arcs [m]
 #: `gyration`: radius of gyration [m]; `table`: height of the table [m]
 #: `stiffness`: K [1/s^2]; `tangential`: tangential stiffness relative to K [1]
 #: `tangential_damping`: tangential damping relative to critical damping [1]
-#: `restitution`, `friction`: their values at an impact speed of 1 m/s [1]
-#: `restitution_fall`, `friction_fall`: the powers of the speed with which they fall [1]
-#: `mass_power`: power of the moving mass in the impact [1]; `gravity`: gravity [m/s^2]
-#: `drag`, `spin_drag`: drag of place and of angle [1/s]
+#: `restitution`, `friction`: coefficients at an impact speed of 1 m/s [1]
+#: `restitution_fall`, `friction_fall`: exponents of their decrease with the impact speed [1]
+#: `mass_power`: exponent of the effective mass in the impact speed [1]; `gravity`: acceleration by gravity [m/s^2]
+#: `drag`, `spin_drag`: drag coefficients of translation and of rotation [1/s]
 BLOCK = np.dtype(
     [
         (name, "f8")
@@ -34,20 +35,21 @@ BLOCK = np.dtype(
     ]
 )  # fmt: skip
 CORNERS = 4
-#: Number of steps in half a period of the stiffest contact.
+#: Number of steps per half period of the stiffest contact.
 _STEPS = 70.0
-#: Lower limit in m/s of the impact speed that determines the damping of a touch; smallest and largest restitution.
+#: `_SLOWEST`: lower limit in m/s of the impact speed in the damping of a touch. `_LEAST`, `_LARGEST`: smallest and
+#: largest restitution.
 _SLOWEST, _LEAST, _LARGEST = 0.01, 0.05, 0.9
 #: Impact speed in m/s below which restitution and friction are constant.
 _SMALLEST_IMPACT = 0.05
-#: Reference for the effective mass of an impact, given as the mobility of the corner times the mass: the value for a
-#: uniform square that lands on the end of an edge.
+#: Reference mobility of a corner times the mass, relative to which the effective mass of an impact is computed. It is
+#: the value for a uniform square that lands on the end of an edge.
 _USUAL_MOBILITY = 1.5
 
 
 @kernel(inline="code")
 def _number(table, restitution):
-    """Return the damping number D of a restitution, interpolated in a table over restitutions from 0 to 1."""
+    """Return the damping number D of a restitution, interpolated in a table for restitutions from 0 to 1."""
     at = restitution * (table.size - 1)
     index = min(int(at), table.size - 2)
     return table[index] + (at - index) * (table[index + 1] - table[index])
@@ -55,7 +57,7 @@ def _number(table, restitution):
 
 @kernel()
 def _fly(block, z, h) -> None:
-    """Advance a block in flight by h seconds; its state is z = (x, z, theta, vx, vz, omega)."""
+    """Advance a block in flight by h seconds. Its state is z = (x, z, theta, vx, vz, omega)."""
     for j in range(3):
         drag = block.spin_drag if j == 2 else block.drag
         rate = -drag * z[3 + j] - (block.gravity if j == 1 else 0.0)
@@ -95,7 +97,7 @@ def _toss(block, numbers, scatter, dt, rows) -> None:
                 if depth <= 0.0:
                     touching[corner] = 0
                     continue
-                # the arc rolls: its touching point lies one radius below its centre
+                # the arc rolls on the table, so its touching point is one radius below its centre
                 arm = az - block.radius
                 slip, rate = z[3] - z[5] * arm, -z[4] - z[5] * ax
                 place = z[0] + ax + block.radius * z[2]
@@ -137,15 +139,14 @@ def toss_blocks(blocks, numbers, scatter, dt, rows) -> None:
     ----------
     blocks : ndarray of BLOCK, shape (m,)
     numbers : ndarray, shape (k,)
-        Damping numbers D of evenly spaced restitutions from 0 to 1.
+        Damping numbers D for evenly spaced restitutions from 0 to 1.
     scatter : ndarray, shape (m, touches, 3)
-        For each touch: a term added to the restitution, a term added to the logarithm of friction, and the distance [m]
-        of the normal force from the lowest point of the corner. When all rows are used, later touches use the last row
-        again.
+        Scatter of each touch: a term added to the restitution, a term added to the logarithm of friction, and the
+        distance [m] of the normal force from the lowest point of the corner. Later touches use the last row.
     dt : float
         Time between rows in s.
     rows : ndarray, shape (m, n, 6)
-        x, z, theta and their rates. The caller gives the first row of each block.
+        x, z, theta and their rates. The caller provides the first row of each block.
     """
     for member in range(len(blocks)):
         _toss(blocks[member], numbers, scatter[member], dt, rows[member])

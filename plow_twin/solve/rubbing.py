@@ -1,10 +1,10 @@
-"""Further effects on a pad's wear, beside its force and the travel along the face: in-plane sliding and running-in.
+"""Factors of a pad's wear other than force and travel along the face: in-plane sliding and running-in.
 
     dh/dt = (k_s v / A) F sqrt(1 + (s' / v)^2) (1 + a exp(-h / h0))
 
-s' is the rate at which the corner slides along its wall, at right angles to the travel, whose speed is v; a plough that
-stands still does not wear. At v = 0 the sliding distance has a kink where s' = 0, which no power series can follow, so
-the v under the root is at least `SLOWEST_TRAVEL`.
+v is the speed of travel along the face. s' is the rate at which the corner slides along its wall, perpendicular to the
+travel. A plough that stands still does not wear. At v = 0, the sliding distance has a kink where s' = 0, which a power
+series cannot represent. The v under the root is therefore at least `SLOWEST_TRAVEL`.
 """
 
 from __future__ import annotations
@@ -16,14 +16,13 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.solve.kinematics import slip_rate
 from plow_twin.solve.state import COS, OMEGA, SIN, VX, VY, X, Y
 
-#: Lower limit in m/s of the speed v that divides the sliding rate s'; below this limit, wear by in-plane sliding falls
-#: in proportion to v.
+#: Lower limit in m/s of the speed v in s' / v. Below this limit, wear by in-plane sliding is proportional to v.
 SLOWEST_TRAVEL: Final = 0.01
 
 
 @kernel(inline="code")
 def time_per_way(p, pair) -> float:
-    """Return 1 / v of a pad in s/m, v at least `SLOWEST_TRAVEL`; 0 if in-plane sliding causes no wear."""
+    """Return 1 / v of a pad in s/m, with v at least `SLOWEST_TRAVEL`, or 0 if in-plane sliding causes no wear."""
     if p.speed_per_wear == 0.0:
         return 0.0
     return 1.0 / max(p.speed_per_wear * p.wear_per_impulse[pair], SLOWEST_TRAVEL)
@@ -31,7 +30,7 @@ def time_per_way(p, pair) -> float:
 
 @kernel()
 def rubbing(p, pair, y, depth, sliding, running_in) -> float:
-    """Return the wear factor of sliding and running-in, for a wear depth in m and state y, shape (8,)."""
+    """Return the wear factor of sliding and running-in, for a wear depth in m and the state y, shape (8,)."""
     factor = 1.0
     if sliding is not None:
         rate = slip_rate(p, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])

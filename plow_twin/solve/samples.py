@@ -1,4 +1,4 @@
-"""Conversion of samples to the units of the kernels: model times, and loads per mass and inertia."""
+"""Conversion of load samples to model times and to loads per mass and inertia, for the kernels."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from plow_twin.kernel.compiler import kernel
 
 @kernel(entry=True)
 def lay_out(before, samples, inertias, per) -> bool:
-    """Divide the wrenches of samples by mass and inertia, and write them to `per`, shape (n + 1, 3).
+    """Write load samples, divided by mass and inertia, to `per`, shape (n + 1, 3). Return whether they are finite.
 
-    `samples` are the new samples, shape (n, 3); `before` is the previous sample, shape (3,). Returns whether all new
-    samples are finite.
+    `samples`, shape (n, 3), contains the new samples, and `before`, shape (3,), the previous sample. Only the new
+    samples are checked.
     """
     finite = True
     for j in range(3):
@@ -25,6 +25,6 @@ def lay_out(before, samples, inertias, per) -> bool:
 
 @kernel(entry=True)
 def model_times(stamps, origin_ns, times) -> None:
-    """Write the model times [s] of stamps [ns], shape (n,), to `times`."""
+    """Write the model times [s] that belong to the stamps [ns], shape (n,), to `times`."""
     for n in range(len(stamps)):
         times[n] = (stamps[n] - origin_ns) * 1e-9

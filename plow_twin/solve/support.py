@@ -1,12 +1,11 @@
-"""A frame on springs: a second body on springs and dampers to ground, on which the reactions of the contacts act.
+"""A frame on springs: a second body on which springs, dampers and the reactions of the contact forces act.
 
     m_f u'' = -k_x u - c_x u' - sum F_x      (v likewise)      I_f phi'' = -k_phi phi - c_phi phi' - sum (p x F)
 
-u, v, phi is the frame's displacement in world axes, F the force of a pair on the head, and p the place of this force
-relative to the frame's centre. The head's equations of motion are for its place relative to the ground; penetrations,
-arms and slips depend on its place relative to the frame. `State.y` is relative to the frame, so that modes, events and
-outputs are computed as for a fixed frame. Both bodies are solved as one system, by the series in
-`solve.method.series`.
+u, v, phi is the frame's displacement in world axes, F the force of a pair on the head, and p the point of action of F
+relative to the frame's centre. The head's equations of motion use its position relative to the ground. Penetrations,
+arms and slip depend on its position relative to the frame. `State.y` is relative to the frame, so that modes, events
+and outputs are computed as for a fixed frame. The series of both bodies are computed together (`solve.method.series`).
 """
 
 from __future__ import annotations
@@ -21,16 +20,16 @@ from plow_twin.kernel.simd import row, set_row
 from plow_twin.solve.kinematics import to_body, to_body_axes, to_world
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
-#: Lanes of the frame's series `w.frame`: displacement and velocity in world axes, angular velocity, cosine and sine of
-#: the head's angle relative to the frame, the frame's angle.
+#: Columns of the frame's series `w.frame`: displacement and velocity in world axes, angular velocity, cosine and sine
+#: of the head's angle relative to the frame, and the frame's angle.
 FRAME_X, FRAME_Y, FRAME_VX, FRAME_VY, SPIN, SEEN_COS, SEEN_SIN, FRAME_THETA = range(8)
 
 
 @kernel()
 def to_ground(y, frame, out) -> None:
-    """Write the head's body coordinates relative to the ground to `out`; y has them relative to the frame.
+    """Write the head's body coordinates relative to the ground to `out`. y contains them relative to the frame.
 
-    `frame` is the frame's state, shape (6,).
+    `frame` is the state of the frame, shape (6,).
     """
     theta, spin = y[THETA] + frame[2], frame[5]
     c, s = math.cos(theta), math.sin(theta)
@@ -44,7 +43,7 @@ def to_ground(y, frame, out) -> None:
 
 @kernel()
 def from_ground(y, frame, out) -> None:
-    """Write the head's coordinates relative to the frame to `out`, which may be y; undoes `to_ground`."""
+    """Write the head's body coordinates relative to the frame to `out`, which may be y. It inverts `to_ground`."""
     theta, spin = y[THETA], frame[5]
     c, s = math.cos(theta), math.sin(theta)
     bx, by = to_body_axes(c, s, frame[0], frame[1])
@@ -57,7 +56,7 @@ def from_ground(y, frame, out) -> None:
 
 @kernel()
 def to_world_both(p, y, frame, z) -> None:
-    """Write z = (x, y, theta, u, v, phi) and its rate in world axes, shape (12,), from the states of head and frame."""
+    """Write z = (x, y, theta, u, v, phi) and its rates in world axes, shape (12,), from the states of both bodies."""
     absolute, head = np.empty(8), np.empty(6)
     to_ground(y, frame, absolute)
     to_world(p, absolute, head)
@@ -68,7 +67,7 @@ def to_world_both(p, y, frame, z) -> None:
 
 @kernel()
 def to_body_both(p, z, y, frame) -> None:
-    """Write the head's body coordinates relative to the frame, and the frame's state; inverse of `to_world_both`."""
+    """Write the head's body coordinates relative to the frame, and the frame's state. It inverts `to_world_both`."""
     head = np.empty(6)
     for j in range(3):
         head[j], head[3 + j] = z[j], z[6 + j]
@@ -79,7 +78,7 @@ def to_body_both(p, z, y, frame) -> None:
 
 @kernel()
 def start_frame(state, w) -> None:
-    """Write the first rows of the series of both bodies: the head's to `w.moved`, the frame's to `w.frame`."""
+    """Write the first rows of the series of both bodies: the head's row to `w.moved`, the frame's row to `w.frame`."""
     frame, here = state.frame, w.frame[0]
     to_ground(state.y, frame, w.moved)
     for j in range(2):
@@ -90,9 +89,9 @@ def start_frame(state, w) -> None:
 
 @kernel(fast=True)
 def see_from_frame(w, order, sigma, y) -> None:
-    """Make the head's coordinates y at `sigma`, which are relative to the ground, relative to the frame.
+    """Convert the head's coordinates y at `sigma` from relative to the ground to relative to the frame.
 
-    The frame's state at sigma is written to `w.frame_now`.
+    The state of the frame at `sigma` is written to `w.frame_now`.
     """
     value = row(w.frame, order)
     for k in range(order - 1, -1, -1):
@@ -105,7 +104,7 @@ def see_from_frame(w, order, sigma, y) -> None:
 
 
 def frame_at(series: NDArray[np.float64], order: int, sigma: float) -> NDArray[np.float64]:
-    """Return the frame's place and rate at sigma, shape (6,), from its series."""
+    """Return displacement and rates of the frame at sigma, shape (6,), from its series."""
     lanes = np.asarray(np.polynomial.polynomial.polyval(sigma, series[: order + 1]))
     found: NDArray[np.float64] = lanes[[FRAME_X, FRAME_Y, FRAME_THETA, FRAME_VX, FRAME_VY, SPIN]]
     return found

@@ -1,21 +1,22 @@
-"""Derivatives of a motion with respect to state and parameters, from equations linearised along each step's series.
+"""Derivatives of a motion with respect to state and parameters, by linearisation along the series of each step.
 
-Each column holds one derivative: xi and eta are the derivatives of the position and velocity of the centre of mass (in
-head axes), phi and psi the derivatives of the angle and its rate. With the contacts' force f = (fx, fy) in head axes, a
-column obeys
+Each column is one derivative. xi and eta are the derivatives of position and velocity of the centre of mass in head
+axes. phi and psi are the derivatives of the angle and its rate. With the contact force f = (fx, fy) in head axes, a
+column satisfies
 
-    xi'  = eta - omega J xi                   J = a quarter turn
+    xi'  = eta - omega J xi                   J = rotation by a quarter turn
     eta' = -omega J eta + (phi J f + df) / m  + the change of the load per mass
     phi' = psi,  psi' = (-fy xi_x + fx xi_y + phi dtau + sum arm dF) / I + the change of the moment per inertia
-    dd   = n . xi - arm phi + de,             dd' its rate,     dF = F_d dd + F_d' dd' + the change by the law's numbers
+    dd   = n . xi - arm phi + de,             dd' its rate,     dF = F_d dd + F_d' dd' + the change by the law's
+    constants
 
-where n holds the factors of X and Y in a penetration, de is the change of this penetration by a clearance, and dtau is
-the derivative of the contacts' moment with respect to the angle. The factors in these equations are known as series
-over the step, so each order of a column is a sum of Cauchy products; eight columns are computed side by side.
+where n contains the coefficients of X and Y in a penetration, de is the change of this penetration by a clearance, and
+dtau is the derivative of the contacts' moment with respect to the angle. The coefficients of these equations are series
+over the step, so each order of a column is a sum of Cauchy products. Eight columns are computed in one vector.
 
-At a touch the force jumps by C d' (Kelvin-Voigt). A motion displaced by a column touches earlier than the undisplaced
-motion by dd / d', so it has already received the impulse C dd when the undisplaced motion touches. At all other changes
-of contact the force is continuous.
+At a touch the Kelvin-Voigt force jumps by C d'. The displaced motion touches earlier by the time dd / d'. When the
+undisplaced motion touches, the displaced motion has therefore already received the impulse C dd. At all other changes
+of contact mode the force is continuous.
 """
 
 from __future__ import annotations
@@ -34,31 +35,30 @@ from plow_twin.solve.modes import within_range
 from plow_twin.solve.state import COS, MAX_ORDER, OFF, OMEGA, ON, SIN, VX, VY, Status, X, Y
 from plow_twin.solve.step import complete_step, lay_out_series_step
 
-#: Number of columns computed side by side.
+#: Number of columns that are computed in one vector.
 WIDTH: Final = 8
-#: Number of columns that are derivatives with respect to the state; they come first.
+#: Number of columns that are derivatives with respect to the state. They precede the derivatives by parameters.
 STATE_COLUMNS: Final = 6
-#: Indices of a column's components.
+#: Indices of the components of a column.
 PLACE_X, PLACE_Y, PLACE_THETA, RATE_X, RATE_Y, RATE_THETA = range(6)
 
 _ROWS: Final = MAX_ORDER + 1
 _EIGHT: Final = (PAIR_COUNT, WIDTH)
 _OF_PAIRS: Final = (PAIR_COUNT, _ROWS, WIDTH)
 
-#: Eight columns of derivatives: how they depend on parameters, and their series over a step.
+#: Eight columns of derivatives: their dependence on parameters, and their series over a step.
 COLUMNS: Final = np.dtype(
     [
         ("series", "f8", (6, _ROWS, WIDTH)),
-        # for pairs that exert force: `depth` is the change of the penetration, `rate` the change of its rate, and
-        # `force` the change of the force
+        # for pairs that exert force: change of the penetration, change of its rate, and change of the force
         ("depth", "f8", _OF_PAIRS),
         ("rate", "f8", _OF_PAIRS),
         ("force", "f8", _OF_PAIRS),
         ("load", "f8", (3, _ROWS, WIDTH)),  # change of the load per mass and inertia, in world axes
-        ("now", "f8", (6, WIDTH)),  # displacements along head axes at the step's start
+        ("now", "f8", (6, WIDTH)),  # columns in head axes at the start of the step
         ("factor", "f8", _EIGHT),  # change of each pair's lambda
         ("edge", "f8", _EIGHT),  # derivative of each pair's penetration with respect to a clearance
-        ("constant", "f8", (3, WIDTH)),  # derivative of the steady load
+        ("constant", "f8", (3, WIDTH)),  # derivative of the constant load
         ("stiffness", "f8", (WIDTH,)),
         ("viscous", "f8", (WIDTH,)),
         ("number", "f8", (WIDTH,)),  # derivative of D in lambda = D / v0
@@ -66,14 +66,14 @@ COLUMNS: Final = np.dtype(
     ]
 )
 
-#: Series of one step that all columns share, as factors of the Cauchy products; lanes are state components or pairs.
+#: Series of one step that all columns share as factors of their Cauchy products. Lanes are state components or pairs.
 ALONG: Final = np.dtype(
     [
         ("spin", "f8", (_ROWS, PAIR_COUNT)),  # omega in each lane
         ("turned", "f8", (_ROWS, PAIR_COUNT)),  # omega times the state
         ("arm_rate", "f8", (_ROWS, PAIR_COUNT)),
         ("arm_turned", "f8", (_ROWS, PAIR_COUNT)),  # derivative of an arm with respect to the angle
-        # derivatives of the force with respect to penetration and to its rate
+        # derivatives of the force with respect to the penetration and with respect to its rate
         ("by_depth", "f8", (_ROWS, PAIR_COUNT)),
         ("by_rate", "f8", (_ROWS, PAIR_COUNT)),
         ("elastic", "f8", (_ROWS, PAIR_COUNT)),  # d^n
@@ -81,8 +81,8 @@ ALONG: Final = np.dtype(
         ("lift", "f8", (_ROWS, PAIR_COUNT)),  # 1 + lambda d'
         ("damped", "f8", (_ROWS, PAIR_COUNT)),  # d^n d'
         ("push", "f8", (4, _ROWS)),  # fx, fy, derivative of the moment with respect to the angle, -fy
-        ("mode", "i8", (PAIR_COUNT,)),  # modes of the pairs before the step's event
-        ("waiting", "i8"),  # number of consecutive ends of stretches at which no new stretch began
+        ("mode", "i8", (PAIR_COUNT,)),  # modes of the pairs before the event of the step
+        ("waiting", "i8"),  # number of successive times at which a new stretch could not begin
     ]
 )
 Along: TypeAlias = np.record
@@ -94,7 +94,7 @@ _OK, _RANGE, _NON_FINITE, _BUDGET = (
 
 @kernel(fast=True)
 def _product(a, b, k):
-    """Return order k of the products of a's and b's series, column by column."""
+    """Return order k of the products of the series in a and b, column by column."""
     low, high = splat(0.0), splat(0.0)
     for j in range(k // 2 + 1):
         low = low + row(a, j) * row(b, k - j)
@@ -105,7 +105,7 @@ def _product(a, b, k):
 
 @kernel(fast=True)
 def _expand_along(p, state, w, along, order, viscous, hysteretic, integer, fraction) -> None:
-    """Write the factors that all columns share, from the series of a step in which pairs act."""
+    """Write the factors that all columns share, from the series of a step with acting pairs."""
     for k in range(order):
         set_row(along.spin, k, splat(w.series[k, OMEGA]))
         turned = _product(along.spin, w.series, k)
@@ -124,7 +124,7 @@ def _expand_along(p, state, w, along, order, viscous, hysteretic, integer, fract
 
 @kernel(fast=True)
 def _expand_law(p, state, w, along, order, viscous, hysteretic, integer, fraction) -> None:
-    """Write the derivatives, with respect to penetration and rate, of a force that is not linear in them."""
+    """Write the derivatives of a nonlinear contact force with respect to penetration and rate."""
     for k in range(order):
         elastic, slope = row(w.penetration, k), splat(1.0 if k == 0 else 0.0)
         if integer is not None:
@@ -155,7 +155,7 @@ def _expand_law(p, state, w, along, order, viscous, hysteretic, integer, fractio
 
 @kernel()
 def _slope_at_touch(w, along, order, pair) -> None:
-    """Write (d^n)' / d' of a pair that touches at the step's start, where d is of order sigma^2."""
+    """Write (d^n)' / d' of a pair that touches at the start of the step, where d is of order sigma^2."""
     first = 2.0 * w.penetration[2, pair]
     for k in range(order):
         along.slope[k, pair] = 0.0
@@ -168,9 +168,9 @@ def _slope_at_touch(w, along, order, pair) -> None:
 
 @kernel()
 def _expand_waves(omegas, amplitudes, state, w, columns, order) -> None:
-    """Write the series of the change of the loads that each of eight columns describes.
+    """Write the series of the changes of the loads in eight columns.
 
-    `amplitudes`, shape (h, 2, 3, 8), holds the change of the sine and cosine amplitudes along x, y and theta.
+    `amplitudes`, shape (h, 2, 3, 8), contains the changes of the sine and cosine amplitudes along x, y and theta.
     """
     load, t, alpha, beta = columns.load, state.step_start, state.alpha, state.beta
     for k in range(order):
@@ -191,7 +191,7 @@ def _expand_waves(omegas, amplitudes, state, w, columns, order) -> None:
 
 @kernel()
 def _times(factor, pair, series, k):
-    """Return order k of the eight `series`, each multiplied by column `pair` of `factor`."""
+    """Return order k of the products of the eight `series` with column `pair` of `factor`."""
     value = exact_splat(0.0)
     for j in range(k + 1):
         value = fused(exact_splat(factor[j, pair]), exact_row(series, k - j), value)
@@ -200,7 +200,7 @@ def _times(factor, pair, series, k):
 
 @kernel()
 def _change_force(p, state, w, along, columns, pair, k, moved, moved_rate, viscous, hysteretic, curved):
-    """Write and return order k of the change of a pair's force; `moved` and `moved_rate` are n . xi and its rate."""
+    """Write and return order k of the change of a pair's force. `moved` is n . xi, and `moved_rate` is its rate."""
     depth, rate, force, series = columns.depth[pair], columns.rate[pair], columns.force[pair], columns.series
     changed, changed_rate, by_angle = exact_splat(0.0), exact_splat(0.0), exact_splat(0.0)
     for j in range(k + 1):
@@ -299,7 +299,7 @@ def _expand_columns(p, state, w, along, columns, order, acts, viscous, hystereti
 
 @kernel()
 def _move_columns(columns, order, sigma) -> None:
-    """Move eight columns to the step's end."""
+    """Set eight columns to their values at the end of the step."""
     at = exact_splat(sigma)
     for i in range(6):
         series = columns.series[i]
@@ -311,7 +311,7 @@ def _move_columns(columns, order, sigma) -> None:
 
 @kernel()
 def _second_rate(state, w, pair):
-    """Return the second time derivative of a penetration at the step's end [m/s^2]."""
+    """Return the second time derivative of a penetration at the end of the step [m/s^2]."""
     sigma, slope, bend = state.sigma_end, 0.0, 0.0
     for k in range(state.order, 0, -1):
         bend = bend * sigma + slope
@@ -322,7 +322,7 @@ def _second_rate(state, w, pair):
 
 @kernel()
 def _touch(p, state, w, columns, pair, viscous) -> None:
-    """Add the effects of a touch to eight columns: the impulse of an earlier touch, and the changed impact speed."""
+    """Add the effects of a touch to eight columns: impulse of an earlier touch, and change of the impact speed."""
     y, now = state.y, columns.now
     c, s, om = y[COS], y[SIN], y[OMEGA]
     arm = row_value(p.arm_rows, pair, c, s, y[X], y[Y])
@@ -350,8 +350,8 @@ def _touch(p, state, w, columns, pair, viscous) -> None:
 def _start_columns(c, s, columns, first) -> None:
     """Begin a stretch: set columns of the state to a displacement of 1, and columns of parameters to 0.
 
-    A stretch is a part of the motion; derivatives are taken from its beginning. A contact whose impact speed is already
-    fixed keeps the derivatives of its lambda with respect to parameters.
+    A stretch is the part of the motion over which derivatives are taken. If a contact continues, the derivatives of its
+    lambda with respect to the parameters are unchanged, because its impact speed is fixed.
     """
     for lane in range(WIDTH):
         column = first + lane
@@ -369,7 +369,7 @@ def _start_columns(c, s, columns, first) -> None:
 
 @kernel()
 def _read_columns(c, s, columns, first, out) -> None:
-    """Convert eight columns to world axes and write them to `out`, shape (6, columns)."""
+    """Convert eight columns to world axes, and write them to `out`, shape (6, columns)."""
     for lane in range(min(WIDTH, out.shape[1] - first)):
         for i in range(6):
             out[i, first + lane] = columns.now[i, lane]
@@ -380,10 +380,10 @@ def _read_columns(c, s, columns, first, out) -> None:
 
 @kernel()
 def _is_clear(p, state, room) -> bool:
-    """Return whether a new stretch (`_start_columns`) may begin.
+    """Return whether a new stretch (`_start_columns`) can begin.
 
-    The gap or penetration of every pair must be at least `room`, and no contact may have a damping that its impact
-    speed has fixed.
+    The gap or penetration of every pair must be at least `room`. No contact may have a damping factor that depends on
+    its impact speed.
     """
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
@@ -396,7 +396,7 @@ def _is_clear(p, state, room) -> bool:
 
 @kernel()
 def _step(p, parts, state, w, along, columns, omegas, amplitudes, curved, end) -> bool:
-    """Take a step of the motion and of the columns; return False if it is not finite."""
+    """Take a step of the motion and of its columns. Return False if the motion is not finite."""
     terms = parts.terms
     if not lay_out_series_step(p, parts, state, w, end):
         return False
@@ -425,32 +425,31 @@ def follow_columns(
     p, parts, state, w, along, columns, omegas, amplitudes, curved, ends, room, longest_wait, reached, budget, out,
     whole,
 ) -> int:  # fmt: skip
-    """Advance a motion and its columns to each of `ends`, where a new stretch begins if possible; return a `Status`.
+    """Advance a motion and its columns to each of the times `ends`. A new stretch begins there if possible.
 
     Parameters
     ----------
     columns : ndarray of `COLUMNS`, shape (b,)
-        Blocks of eight columns; the first six columns are derivatives with respect to the state.
-    omegas, amplitudes
-        Angular frequencies [rad/s], shape (h,), of the loads that columns change, and the changes of their amplitudes,
-        shape (b, h, 2, 3, 8).
+        Blocks of eight columns. The first six columns are derivatives with respect to the state.
+    omegas, amplitudes : ndarray, shapes (h,) and (b, h, 2, 3, 8)
+        Angular frequencies [rad/s] of the loads that the columns change, and the changes of their amplitudes.
     curved : int or None
-        1 if the force is not linear in penetration and rate, else None.
+        1 if the contact force is nonlinear in penetration and rate, else None.
     ends : ndarray, shape (n,)
         Times in s.
     room : float
         Smallest gap or penetration in m that every pair must have for a stretch to begin.
     longest_wait : int
-        Number of consecutive ends without a new stretch after which a stretch begins even if a pair is closer than
+        Number of successive times without a new stretch, after which a stretch begins even if a pair is closer than
         `room`.
     reached : ndarray of int64, shape (1,)
-        Number of ends reached so far, from which the call continues.
+        Number of times in `ends` that have been reached, from which the call continues.
     budget : int
         Largest number of steps of the motion.
     out : ndarray, shape (n, 6, columns)
-        Receives the derivatives since the beginning of the stretch, in world axes.
+        Array that receives the derivatives since the beginning of the stretch, in world axes.
     whole : ndarray of int64, shape (n,)
-        Receives 1 for each end at which a stretch ends and the next begins.
+        Array that receives 1 for each time at which a stretch ends and the next stretch begins.
     """
     columns, omegas, amplitudes, ends, out = (
         unowned(columns), unowned(omegas), unowned(amplitudes), unowned(ends), unowned(out),

@@ -1,4 +1,4 @@
-"""Totals of a motion from the force polynomials (peaks, impulses, times in contact), and its event log."""
+"""Totals of a motion (peaks, impulses, times in contact) from the series of the forces, and the log of its events."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from plow_twin.solve.state import FIRST, ON, SECOND, SUM
 
 @kernel()
 def _seal(row_of, window) -> None:
-    """Write the sums since the last publication (window) to a row; clear all sums but the touch count."""
+    """Write the sums since the previous publication, `window`, to a row. Reset all sums but the number of touches."""
     for pair in range(PAIR_COUNT):
         row_of.makes[pair], row_of.impulse[pair] = window.makes[pair], window.impulse[pair]
         row_of.peak[pair], row_of.measured_peak[pair] = window.peak[pair], window.measured_peak[pair]
@@ -33,30 +33,30 @@ def _seal(row_of, window) -> None:
 
 @kernel(entry=True)
 def publish(rows, stamps, held, taken, windows, waits) -> int:
-    """Sum up advances; the rows taken for publication get the sums since the previous publication.
+    """Sum up advances, and write the sums since the previous publication to each row that is published.
 
-    If the advance of a published row failed, the row gets the motion of the newest good row before it and the sums of
-    the good rows since the previous publication; if there are no such rows, it gets the stamp 0.
+    If the advance of a published row failed, its motion and sums are taken from the successful rows since the previous
+    publication. Without such rows, its stamp is set to 0.
 
     Parameters
     ----------
     rows : ndarray of `ROW`, shape (n,)
-        Advances in the order of time; failed advances add nothing to the sums.
+        Advances in order of time. Failed advances do not contribute to the sums.
     stamps : ndarray of int64, shape (n,)
         Stamps of the advances [ns].
     held : int
-        1 if the advances were computed without samples, with held loads.
+        1 if the advances were computed without samples, under constant loads.
     taken : ndarray of int64, shape (m,)
-        Indices of the rows to publish, increasing.
+        Increasing indices of the rows to publish.
     windows : ndarray of `ROW`, shape (1,)
-        Sums since the previous publication, and the motion of the newest good advance not yet published.
+        Sums since the previous publication, and motion of the last successful advance that has not been published.
     waits : int
-        1 if an advance waits to be published.
+        1 if there is a successful advance that has not been published.
 
     Returns
     -------
     int
-        1 if an advance still waits to be published.
+        New value of `waits`.
     """
     window, place, newest = windows[0], 0, -1
     for n in range(rows.size):
@@ -109,20 +109,20 @@ def _copy_motion(row_of, target) -> None:
 
 @kernel(entry=True)
 def publish_window(windows, rows) -> None:
-    """Write the unpublished sums of a window to a row, shape (1,) each, and begin the next window."""
+    """Write the sums of a window since the previous publication to a row, shape (1,) each, and begin a new window."""
     rows[0] = windows[0]
     _seal(rows[0], windows[0])
 
 
 @kernel(entry=True)
 def summary(rows, n) -> tuple[int, int, int, int, float, float, float, bool]:
-    """Return the fields of row `n` that every publication needs, in one call, which is faster than single reads.
+    """Return the fields of row `n` that every publication needs. One call is faster than access to each field.
 
     Returns
     -------
     tuple
-        Stamp [ns], `marked`, `held`, number of samples, x, y [m], the largest force of a pair in advances with samples
-        [N], and whether pose, rates, contacts and sums are finite.
+        Stamp [ns], `marked`, `held`, number of samples, x, y [m], largest force of a pair in advances to a sample [N],
+        and whether pose, rates, contacts and sums are finite.
     """
     row_of = rows[n]
     largest, total = row_of.measured_peak[0], 0.0
@@ -140,7 +140,7 @@ def summary(rows, n) -> tuple[int, int, int, int, float, float, float, bool]:
 def _sums(w, order, h) -> None:
     """Write an upper bound of each force over [0, h], and the sums of f_k h^k / (k+1) and f_k h^k / (k+2).
 
-    The bound is the larger of the force's values at the two ends plus h^2 / 8 times a bound on its downward curvature.
+    The bound is the larger end value of the force, plus h^2 / 8 times an upper bound of its downward curvature.
     """
     end = bend = first = second = splat(0.0)
     for k in range(order, -1, -1):
@@ -157,7 +157,7 @@ def _sums(w, order, h) -> None:
 
 @kernel()
 def add_to_totals(state, w, low, high, totals) -> None:
-    """Add the peaks, impulses and contact times from sigma `low` to `high` of the step to the totals."""
+    """Add peaks, impulses and contact times from sigma `low` to sigma `high` of the current step to the totals."""
     mode = state.mode
     acting = 0
     for pair in range(PAIR_COUNT):
@@ -208,7 +208,7 @@ def add_set_times(totals, carrying, elapsed) -> None:
 
 @kernel()
 def log_event(log, totals, time, pair, mode_from, mode_to, rate) -> None:
-    """Write one change of contact to the event log; the caller makes sure that the log has room."""
+    """Write a change of contact mode to the event log. The caller ensures that the log is not full."""
     event = log[totals.logged]
     event.time, event.pair, event.rate = time, pair, rate
     event.mode_from, event.mode_to = mode_from, mode_to

@@ -1,10 +1,11 @@
-"""A tumbling block: beyond 45 degrees, and after each further quarter turn, its corners are renamed by their places.
+"""Tumbling of a block: its corners are renamed when it turns beyond 45 degrees, and after each further quarter turn.
 
-Up to 45 degrees the corner named bottom left is the lower left corner. Beyond 45 degrees another corner is the lower
-left corner and takes over this name. The state of each pair (mode, damping, anchor) is passed to the pair at the same
-wall that bears the corner's new name. A square block looks the same after a quarter turn, so the coefficients of its
-geometry do not change; the angle whose cosine and sine are in the state jumps back by 90 degrees
-(`kinematics.named_angle`).
+Up to 45 degrees, the corner with the name bottom left is the lower left corner. Beyond 45 degrees, another corner
+becomes the lower left corner and receives this name. The state of each pair (mode, damping, anchor) is copied to the
+pair with the same wall and the corner's new name.
+
+A square block looks the same after a quarter turn, so the coefficients of its geometry do not change. The angle whose
+cosine and sine are in the state changes by 90 degrees (`kinematics.named_angle`).
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import COS, OFF, OMEGA, ON, RELEASED, SIN, THETA
 from plow_twin.solve.totals import log_event
 
-#: The two pairs of each wall: first the pair of the corner that leads in a counter-clockwise turn, then the pair of the
-#: corner behind it.
+#: The two pairs of each wall: the pair of the corner that leads in a counter-clockwise turn, and the pair of the other
+#: corner.
 _HANDED_OVER = tuple(
     (PAIR_NAMES.index(leading), PAIR_NAMES.index(following))
     for leading, following in (
@@ -30,14 +31,13 @@ _HANDED_OVER = tuple(
         ("top_right_right", "bottom_right_right"),
     )
 )
-#: The block counts as having reached 45 degrees if less than this angle [rad] is missing; the angle covers the rounding
-#: errors of a root.
+#: Largest angle [rad] short of 45 degrees at which the corners are renamed. It covers the rounding error of a root.
 _THERE = 1e-12
 
 
 @kernel()
 def turn_at(p, state, w, order, best) -> float:
-    """Return the sigma at which the block reaches 45 degrees, or `best` if `best` is smaller."""
+    """Return the sigma at which the block reaches 45 degrees, at most `best`."""
     if not may_tumble(p):
         return best
     column, angle = w.column[0], named_angle(p, state.y, state.y[THETA])
@@ -70,7 +70,7 @@ def turn_corners(p, state, stick, totals, log) -> None:
 
 @kernel()
 def _hand_over(p, state, stick, totals, log, old, new) -> None:
-    """Copy the state of pair `old` to pair `new` of the same wall, unless `new` cannot touch."""
+    """Copy the state of the pair `old` to the pair `new` of the same wall, unless `new` cannot touch."""
     mode = state.mode[old] if p.enabled[new] == 1 else OFF
     if log is not None:
         rate = penetration_and_rate(p, state, old)[1]
@@ -88,7 +88,7 @@ def _hand_over(p, state, stick, totals, log, old, new) -> None:
 
 @kernel()
 def _log(log, totals, time, pair, old, new, rate) -> None:
-    # the log has no mode RELEASED, so a RELEASED pair counts as ON
+    # the log does not contain the mode RELEASED, so a RELEASED pair is logged as ON
     old, new = ON if old == RELEASED else old, ON if new == RELEASED else new
     if old != new:
         log_event(log, totals, time, pair, old, new, rate)
