@@ -1,8 +1,8 @@
-"""The wear coefficient, from clearances that were estimated over weeks.
+"""Posterior of the wear coefficient, from clearances that were estimated over weeks.
 
-For any coefficient k_s the clearance follows the same path h(E) of the exposure E = k_s s / A, where s is the travel. A
-history of clearances against travel therefore determines k_s. Its posterior is computed on a grid of ln k_s, with the
-log-normal prior of the scene's wear; the clearance at the beginning is integrated out.
+For any coefficient k_s, the clearance is the same function h(E) of the exposure E = k_s s / A, where s is the travel
+and A the area of a pad. A history of clearances against travel therefore determines k_s. The posterior is computed on a
+grid of ln k_s with the log-normal prior of the scene's wear. The initial clearance is integrated out.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Bound: number of points of the grid. Derived: range of the grid to both sides, in prior deviations; it leaves out a
-#: probability of 6e-5.
+#: Upper bound of the number of grid points, and half width of the grid in prior deviations, derived from a probability
+#: of 6e-5 outside the grid.
 _POINTS, _REACH = 801, 4.0
-#: Bound: the path ends when a clearance has grown by this multiple of the history's growth plus this depth in m.
+#: Bounds of the simulated wear path: it ends when a clearance has grown by `_FURTHER` times the growth in the history
+#: plus `_FURTHER_M` in m.
 _FURTHER, _FURTHER_M = 2.0, 5e-4
 
 
@@ -33,7 +34,7 @@ _FURTHER, _FURTHER_M = 2.0, 5e-4
 class History:
     """Estimated clearances against travel.
 
-    travel : (n,) travel along the face since the first row, in m, never decreasing
+    travel : (n,) travel along the face in m since the first row; it must not decrease
     clearance, deviation : (n, 2) horizontal and vertical clearance, and their standard deviations, in m
     """
 
@@ -42,7 +43,7 @@ class History:
     deviation: Array
 
     def __post_init__(self) -> None:
-        """Raise LifeError if the rows cannot be used."""
+        """Raise `LifeError` if the rows cannot be used."""
         shape, count = self.clearance.shape, len(self.travel)
         if shape != (count, 2) or self.deviation.shape != (count, 2) or count < 2:
             raise LifeError(f"history: got {count} travels and clearances {shape}, expected at least 2 rows of both")
@@ -57,11 +58,11 @@ class History:
 
 @dataclass(frozen=True, eq=False)
 class Coefficient:
-    """Posterior of the wear coefficient, and the clearances at the end of the history.
+    """Posterior of the wear coefficient, and the state at the end of the history.
 
     value, weight : (m,) values of k_s in m^2/N on a grid, and their probabilities
     clearance, deviation : (2,) clearances and their standard deviations in m
-    depth : (8,) wear depth of each pad in m, from the path of the history, because the pads wear differently
+    depth : (8,) wear depth of each pad in m, from the simulated wear path
     """
 
     value: Array
@@ -71,34 +72,38 @@ class Coefficient:
     depth: Array
 
     def interval(self) -> Interval:
-        """Return the median and the 5 % and 95 % quantiles in m^2/N."""
+        """Return the median and the 5 % and 95 % quantiles of k_s in m^2/N."""
         return Interval(self.quantile(0.5), self.quantile(0.05), self.quantile(0.95))
 
     def quantile(self, share: float) -> float:
-        """Return the quantile `share` in m^2/N of the distribution, widened by `tuning.PATH_DEVIATION`."""
+        """Return a quantile of k_s in m^2/N; the distribution is widened by the model error `tuning.PATH_DEVIATION`.
+
+        `share` is the probability below the quantile.
+        """
         middle, point = np.log(np.interp([0.5, share], np.cumsum(self.weight), self.value))
         off = math.hypot(point - middle, tuning.PATH_DEVIATION * float(ndtri(share)))
         return math.exp(float(middle) + math.copysign(off, share - 0.5))
 
     def draw(self, count: int, rng: np.random.Generator) -> Array:
-        """Return coefficients drawn from the posterior, shape (count,)."""
+        """Return random values of k_s in m^2/N from the posterior, shape (count,)."""
         drawn: Array = np.interp(rng.random(count), np.cumsum(self.weight), self.value)
         return drawn
 
 
 def coefficient(scene: Scene, history: History) -> Coefficient:
-    """Return the posterior of the wear coefficient from a history.
+    """Return the posterior of the wear coefficient, given a history.
 
     Parameters
     ----------
     scene : Scene
-        A scene with wear; `wear.prior_m2_n` is the prior. Its clearances are replaced by the first of the history.
-    history : History
+        A scene with wear; `wear.prior_m2_n` is the prior. Its clearances are replaced by the first row of the history.
+        history : History
+            Clearances against travel.
 
     Raises
     ------
     LifeError
-        If the scene has no wear or no period, or if the history contradicts the prior or is not explained by wear.
+        If the scene has no wear or no period, or if the history contradicts the prior or cannot be explained by wear.
     """
     wear = scene.wear
     if wear is None:
@@ -137,9 +142,9 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
 
 
 def _check_fit(history: History, grown: Array) -> None:
-    """Raise LifeError if clearances differ from `grown`, shape (n, 2), by more than their deviations allow.
+    """Raise `LifeError` if the clearances contradict the computed growth `grown`, shape (n, 2), in a chi-square test.
 
-    The growth itself has the relative deviation `tuning.PATH_DEVIATION`.
+    The computed growth has the relative standard deviation `tuning.PATH_DEVIATION`.
     """
     weight = 1.0 / (history.deviation**2 + (tuning.PATH_DEVIATION * grown) ** 2)
     apart = history.clearance - grown
@@ -156,7 +161,7 @@ def _check_fit(history: History, grown: Array) -> None:
 
 
 def _growth(path: Path, exposure: Array) -> Array:
-    """Return the growth of the clearances at each exposure, shape (n, 2), extrapolated with the path's last slope."""
+    """Return the growth of the clearances in m at each exposure, shape (n, 2), extrapolated with the last slope."""
     grown = path.clearance_growth()
     out = np.stack([np.interp(exposure, path.exposure, column) for column in grown.T], axis=1)
     if len(path.exposure) > 1:

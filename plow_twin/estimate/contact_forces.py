@@ -1,8 +1,9 @@
-"""Contact forces measured by load cells at the guides; they narrow the intervals of contact and clearances.
+"""Contact forces measured by load cells at the guides, which narrow the intervals of contact and clearances.
 
-After the fit the motion is known at every moment, and the contact law gives the force of each pair. If a cell
-contradicts the force of its pair, the forces are not used, and the reasons name the cell. If the cells together
-contradict the motion, the reasons name the law. Otherwise poses and forces are fitted together (`force_fit`).
+The fit of the poses gives the motion, and the contact law gives the force of each pair. If the force of a load cell
+contradicts the force of its pair, the measured forces are not used, and the reasons of the estimate name the cell. If
+the forces of all cells together contradict the motion, the reasons name the contact law. Otherwise poses and forces are
+fitted together (module `force_fit`).
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ from plow_twin.solve.compiled_scene import compile_scene
 
 Array = NDArray[np.float64]
 
-#: Guard: a number above this is not a force [N].
+#: Guard against faulty readings: largest force [N] that is accepted.
 _LARGEST = 1e12
-#: Bound: largest delay in s for which measured forces are compared with the motion's forces, and step between the
-#: delays. Derived: the largest delay is three prior deviations of a sensor's delay.
+#: Largest trial value of the delay of the load cells in s, derived as three prior deviations of a sensor's delay, and
+#: step between trial values.
 _LARGEST_DELAY, _DELAY_STEP = 0.15, 2e-3
-#: The law as a Python function, because Python cannot call the compiled function.
+#: The contact law as a Python function, because the compiled function cannot be called from Python.
 _LAW = getattr(free_force, "py_func", free_force)
 
 
@@ -40,16 +41,21 @@ class ContactForcesError(PlowTwinError):
 
 @dataclass(frozen=True, eq=False)
 class ContactForces:
-    """Measured contact forces: `t` (n,) stamps in s, rising; `force` (n, 8) in N, NaN where there is no cell."""
+    """Measured contact forces.
+
+    t : (n,) rising stamps in s
+    force : (n, 8) force of each pair in N, NaN without a measurement
+    """
 
     t: Array
     force: Array
 
     @staticmethod
     def of(t: ArrayLike, force: ArrayLike) -> tuple[ContactForces, int]:
-        """Return rows in order of time, and the number of rows left out.
+        """Return the usable rows in order of time, and the number of rows that are left out.
 
-        Rows are left out if their stamp is not finite or repeated, if they have no force, or a force beyond 1e12 N.
+        A row is left out if its stamp is not finite or occurs twice, if it contains no force, or if a force exceeds
+        1e12 N.
 
         Raises
         ------
@@ -60,22 +66,22 @@ class ContactForces:
         return ContactForces(times, rows), left_out
 
     def between(self, start: float, end: float) -> ContactForces:
-        """Return the rows stamped in [start, end)."""
+        """Return the rows with stamps in [start, end)."""
         inside = (self.t >= start) & (self.t < end)
         return ContactForces(self.t[inside], self.force[inside])
 
     def thinned(self, most: int) -> ContactForces:
-        """Return every n-th row, with n so large that at most `most` rows are left."""
+        """Return every n-th row, with the smallest n for which at most `most` rows remain."""
         apart = max(1, -(-len(self.t) // most))
         return ContactForces(self.t[::apart], self.force[::apart])
 
 
 @dataclass(frozen=True, eq=False)
 class Felt:
-    """Penetration and force of the fitted motion at the measured times.
+    """Penetration and contact force of the fitted motion at the times of the measured forces.
 
-    swing : (n,) swing of each row, -1 outside of all swings
-    penetration, force : (n, 8) in m and N; NaN outside the swings
+    swing : (n,) index of the swing of each row, -1 outside all swings
+    penetration, force : (n, 8) in m and N, NaN outside all swings
     """
 
     swing: NDArray[np.int64]
@@ -85,13 +91,13 @@ class Felt:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Usable cells.
+    """Load cells whose forces agree with the motion.
 
-    pairs : (k,) indices of their pairs
+    pairs : (k,) indices of the pairs of these cells
     force : (n, 8) measured forces minus `offset` in N
-    offset : (8,) readings in flight in N
+    offset : (8,) median reading during flight in N
     noise : (8,) standard deviation in N
-    delay : delay of the cells' stamps behind the motion in s
+    delay : delay in s of the stamps relative to the motion
     """
 
     pairs: NDArray[np.int64]
@@ -102,7 +108,7 @@ class Cells:
 
 
 class Feeling:
-    """The forces of a fit's swings at the times of the measured forces."""
+    """Computation of contact forces from the motion of a fit, at the times of the measured forces."""
 
     def __init__(self, problem: Problem, t: Array) -> None:
         window = Window(Poses(t, np.zeros((len(t), 3))), problem.window.starts, problem.window.states)
@@ -114,7 +120,9 @@ class Feeling:
         self._depth = depth_of(turns)
 
     def at(self, shared: Array, states: Array, delay: float) -> Felt | None:
-        """Return penetrations and forces with these unknowns; None if the model cannot be run."""
+        """Return penetrations and forces for given unknowns and a delay in s; None if the motion cannot be
+        simulated.
+        """
         own = shared.copy()
         own[BIAS], own[DELAY] = 0.0, delay
         point = self._problem.evaluate(own, states)
@@ -128,10 +136,11 @@ class Feeling:
 
 
 def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> tuple[Array, Array]:
-    """Return penetrations in m and forces in N of the pairs, (n, 8) each, from poses and rates, (n, 3) each.
+    """Return penetrations in m and forces in N of the pairs, shape (n, 8) each, from poses and rates, shape (n, 3)
+    each.
 
-    `depth`, shape (8,), is the outward displacement of each pad in m. The scene must state the damping, not a
-    restitution, whose damping depends on the speed of each touch.
+    `depth`, shape (8,), contains the outward displacement of each pad in m. The scene must state the damping. A
+    restitution is not supported, because its damping depends on the speed of each touch.
     """
     x, y, vx, vy, omega, c, s, _ = body_states(np.hstack((q, v)), scene.head.com_offset_m).T
     rows = penetration_rows(scene)
@@ -142,14 +151,17 @@ def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> t
     factor = 0.0 if viscous else float(scene.contact.damping or 0.0)
     numbers = float(params["stiffness"]), float(params["exponent"]), factor, viscous, float(params["ramp"])
     force, inside = np.zeros(penetration.shape), penetration > 0.0
-    linear = numbers[1] == 1.0 and not numbers[-1]  # the law accepts arrays only if it is linear and has no ramp
+    linear = numbers[1] == 1.0 and not numbers[-1]  # a law that is not linear, or has a ramp, accepts no arrays
     law = _LAW if linear else np.vectorize(_LAW, otypes=[np.float64])
     force[inside] = np.maximum(law(penetration[inside], rate[inside], *numbers), 0.0)
     return penetration, force
 
 
 def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells | None, list[str]]:
-    """Return the usable cells, or None if no cell can be judged, and the reasons against the other cells."""
+    """Return the usable cells, and a reason for each cell that contradicts the motion.
+
+    The cells are None if no cell can be compared with the motion.
+    """
     felt = feeling.at(found.shared, found.point.states, 0.0)
     if felt is None:
         return None, []
@@ -167,7 +179,7 @@ def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells
     measured = forces.force - offset
     found_out, pairs = [], []
     largest = float(np.nanmax(felt.force))
-    # a cell that reads exactly 0 in flight has a limited resolution too, so its noise is set to at least this
+    # lower limit of the noise, because a cell that reads exactly 0 in flight also has a limited resolution
     noise = np.maximum(noise, 1e-4 * largest)
     for i, name in enumerate(PAIR_NAMES):
         there = np.isfinite(measured[:, i]) & (felt.swing >= 0)
@@ -184,7 +196,10 @@ def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells
 
 
 def _contradiction(measured: Array, felt: Array, pair: int, largest: float, noise: float) -> str:
-    """Return the reason against a cell, or an empty text, from measured and modelled forces, shape (n, 8) each."""
+    """Return why a cell contradicts the motion, or an empty text.
+
+    `measured` and `felt` contain the measured forces and the forces of the fitted motion in N, shape (n, 8) each.
+    """
     own = felt[:, pair]
     if (own > 0.0).sum() < FEWEST_IN_CONTACT:
         most = float(np.abs(measured[:, pair]).max())
@@ -216,7 +231,7 @@ def _contradiction(measured: Array, felt: Array, pair: int, largest: float, nois
 
 
 def _delay(forces: ContactForces, felt: Felt) -> float:
-    """Return the delay in s with the largest correlation between measured forces and the motion's forces."""
+    """Return the delay in s with the largest correlation between measured forces and forces of the fitted motion."""
     t, measured, given = forces.t, np.nan_to_num(forces.force), np.nan_to_num(felt.force)
     pairs = np.flatnonzero(given.any(axis=0) & measured.any(axis=0))
     lags = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 0.5 * _DELAY_STEP, _DELAY_STEP)
@@ -225,7 +240,7 @@ def _delay(forces: ContactForces, felt: Felt) -> float:
 
 
 def correlation(one: Array, other: Array) -> float:
-    """Return the correlation of two series; 0 if one of them is constant."""
+    """Return the correlation coefficient of two series; 0 if a series is constant."""
     one, other = one - one.mean(), other - other.mean()
     size = float(np.sqrt((one @ one) * (other @ other)))
     return float(one @ other) / size if size > 0.0 else 0.0

@@ -1,15 +1,18 @@
-"""Discrepancy between machine and model: further unknowns beside a fit, an uncertain load, and correlated noise.
+"""Discrepancy between machine and model, which changes the result of a fit and widens its intervals.
 
-No machine is exactly the model. Inertia, size of the frame, friction, exponent, differences of the walls and errors of
-the sensor are further unknowns, each with a prior. One linearised step from a fit estimates them, and Bayesian variable
-selection draws which of them differ from the scene. A quantity without evidence keeps its value in the scene. A
-quantity that the motion does not determine widens the interval. The load of each swing has a constant error; the size
-of these errors is learned from all swings (empirical Bayes). The remaining residuals are treated as noise: large
-residuals, and residuals that stay correlated for long, increase the variance of the measurements (tempered likelihood).
+No machine matches the model exactly. Three kinds of discrepancy are considered:
 
-References: George and McCulloch, J. Am. Stat. Assoc. 88 (1993) 881 (selection by Gibbs sampling); Hoeting et al.,
-Stat. Sci. 14 (1999) 382 (averaging over models); Dempster, Laird and Rubin, J. R. Stat. Soc. B 39 (1977) 1 (the sizes
-of random effects); Kennedy and O'Hagan, J. R. Stat. Soc. B 63 (2001) 425 (discrepancy).
+- Further unknowns, each with a prior: inertia, size of the frame, friction, exponent, differences between the walls,
+  and errors of the sensor. They are estimated in one linearised step from the fit. Bayesian variable selection samples
+  which of these quantities differ from the scene. A quantity without evidence keeps its value in the scene. A quantity
+  that the motion does not determine widens the interval.
+- A constant error of the load in each swing. The size of these errors is estimated from all swings (empirical Bayes).
+- Remaining residuals, which are treated as noise. Large residuals, and residuals that stay correlated for long,
+  increase the variance of the measurements (tempered likelihood).
+
+References: George and McCulloch, J. Am. Stat. Assoc. 88 (1993) 881 (selection by Gibbs sampling); Hoeting et al., Stat.
+Sci. 14 (1999) 382 (averaging over models); Dempster, Laird and Rubin, J. R. Stat. Soc. B 39 (1977) 1 (the sizes of
+random effects); Kennedy and O'Hagan, J. R. Stat. Soc. B 63 (2001) 425 (discrepancy).
 """
 
 from __future__ import annotations
@@ -36,8 +39,8 @@ from plow_twin.model.scene import Friction, Scene
 
 Array = NDArray[np.float64]
 
-#: Step: for the difference quotients with respect to quantities of a scene, which are named by their paths. A step is a
-#: fifth to a half of the quantity's prior deviation.
+#: Step of the difference quotient with respect to each quantity of a scene, by the path of the quantity. The steps are
+#: a fifth to a half of the prior deviations.
 STATED: Final = {
     "head.mass_kg": 0.02,
     "head.inertia_kg_m2": 0.02,
@@ -46,41 +49,41 @@ STATED: Final = {
     "contact.exponent": 0.02,
     "friction.coefficient": 0.01,
 }
-#: Step: for the difference quotients with respect to a wall's relative stiffness, and with respect to a constant load
-#: in units of half the load's range.
+#: Steps of the difference quotients with respect to the relative stiffness of a wall, and with respect to a constant
+#: load in units of half the load's range.
 _WALL_STEP, _PUSH_STEP = 0.02, 5e-3
-#: Guard: smallest error of the load in units of half the load's range.
+#: Guard against division by zero: smallest error of the load in units of half the load's range.
 _LEAST_PUSH = 1e-5
-#: Bound: lengths of the three series of rounds of expectation-maximisation; the noise is tempered after each series.
+#: Upper bounds of the iterations of expectation-maximisation in three series; the noise is tempered after each series.
 _ROUNDS = (8, 5, 3)
-#: Bound: number of the sampler's sweeps, and number of the first sweeps that are discarded.
+#: Upper bound of the number of sweeps of the sampler, and number of initial sweeps that are discarded.
 _SWEEPS, _BURNT = 50, 10
-#: Bound: longest lag in rows at which the correlation of residuals is computed.
+#: Upper bound of the lag in rows at which the correlation of residuals is computed.
 _LONGEST_LAG = 60
 
 
 @dataclass(frozen=True, eq=False)
 class Graded:
-    """An estimate that allows for a machine that differs from the model.
+    """Result of a fit for a machine that may differ from the model.
 
     Attributes
     ----------
     shared, covariance : ndarray, shape (SIZE,), (SIZE, SIZE)
-        The shared unknowns and their covariance. If the fit passes all checks, they belong to a machine that differs
-        from the scene only as in the fit.
+        The shared unknowns and their covariance. If the fit passes all checks, they hold for a machine that differs
+        from the scene only in the quantities of the fit.
     clearance, clearance_deviation : ndarray, shape (2,)
-        The clearances in m, and their standard deviations, if the machine may differ in any quantity.
+        Clearances in m and their standard deviations, for a machine that may differ from the scene in any quantity.
     differs : dict of str to (float, float, float)
-        For each further quantity, the probability that it differs from the scene, and mean and standard deviation of
+        For each further quantity, the probability of a difference from the scene, and mean and standard deviation of
         the difference.
     load : ndarray, shape (3,)
         Standard deviation of the load's error in a swing, in units of half the load's range.
     inflation : ndarray, shape (3,)
-        Factor by which the variance of x, y, theta exceeds the fit's noise.
+        Ratio of the variance of x, y and theta to the variance of the noise in the fit.
     surprise : float
         Mean square of the differences in units of their prior deviations, at least 1.
     harmonics : Harmonics, optional
-        The harmonics that were added to the load, if any.
+        The harmonics that were added to the load.
     """
 
     shared: Array
@@ -95,14 +98,14 @@ class Graded:
 
 
 def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) -> Graded:
-    """Return the result of a fit when the machine may differ from the model.
+    """Return the result of a fit for a machine that may differ from the model.
 
     Parameters
     ----------
     problem, found : Problem, Fit
         The fit, which need not have reached an optimum.
     doubtful : bool
-        Whether the fit itself shows that the machine differs.
+        Whether the fit fails a check or has not reached an optimum, so that a difference is likely.
     seed : int
         Seed of the sampler.
 
@@ -127,7 +130,7 @@ def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) 
     ratio = max(1.0, linear.scatter()) * surprise
 
     def widened(step: Array, covariance: Array) -> Array:
-        """Return the covariance of the shared unknowns, with the errors of the linearised step."""
+        """Return the covariance of the shared unknowns plus the errors of the linearised step."""
         out: Array = ratio * covariance[:SIZE, :SIZE] + np.diag((tuning.BENT * step[:SIZE]) ** 2)
         out[[GX, GY], [GX, GY]] += bent**2 + unexplained**2
         return out
@@ -145,9 +148,11 @@ def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) 
 
 @dataclass(frozen=True, eq=False)
 class _Column:
-    """A further quantity: prior deviation, derivative of the prediction, (n, 3), and value in the fit.
+    """A further quantity.
 
-    The value is None if the fit uses the scene's value.
+    deviation : prior standard deviation
+    derivative : (n, 3) derivative of the predicted measurements
+    value : value in the fit; None if the fit uses the value of the scene
     """
 
     deviation: float
@@ -158,7 +163,7 @@ class _Column:
 def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
     """Return the further quantities, and the derivatives of the prediction with respect to a constant load, (n, 3, 3).
 
-    A quantity is left out if its prior holds it fixed, or if the model cannot be run with its changed value.
+    A quantity is left out if its prior deviation is zero, or if the motion with its changed value cannot be simulated.
     """
     point = found.point
 
@@ -202,7 +207,7 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
 
 
 def _of_sensor(problem: Problem, point: Point) -> Iterator[tuple[str, Array]]:
-    """Yield the derivative of the prediction, (n, 3), with respect to each scale and the clock drift, with its name."""
+    """Yield name and derivative of the prediction, (n, 3), for each scale factor and for the drift of the clock."""
     t = problem.window.poses.t
     for index, axis in enumerate(("x", "y", "theta")):
         column = np.zeros_like(point.predicted)
@@ -212,14 +217,15 @@ def _of_sensor(problem: Problem, point: Point) -> Iterator[tuple[str, Array]]:
 
 
 def variants(scene: Scene) -> tuple[Scene, ...]:
-    """Return two changed scenes that need other compiled terms: one with another exponent, and one with friction."""
+    """Return two changed scenes that need other compiled terms, with a different exponent and with friction."""
     return tuple(_moved(scene, path, STATED[path], 1.0) for path in ("contact.exponent", "friction.coefficient"))
 
 
 def _moved(scene: Scene, path: str, step: float, depth: float) -> Scene:
-    """Return a scene with one number changed by `step`, a relative step for mass and inertia.
+    """Return a scene in which the number at a path is changed by `step`, a relative step for mass and inertia.
 
-    A change of the exponent keeps the force at the penetration `depth` in m.
+    If the exponent is changed, the stiffness is changed too, so that the force at the penetration `depth` in m is the
+    same.
     """
     part, name = path.split(".")
     if part == "friction":
@@ -235,23 +241,25 @@ def _moved(scene: Scene, path: str, step: float, depth: float) -> Scene:
 
 
 class _Linearised:
-    """The linearised problem: its border holds shared and further unknowns; each swing has its state and load error.
+    """The linearised problem.
+
+    The shared and the further unknowns form the border of the normal equations. Each swing has its own unknowns, the
+    starting state and the error of the load.
 
     inflation : (3,) factor on the variance of each component
-    load : (3,) deviation of the load's error in a swing
+    load : (3,) standard deviation of the load's error in a swing
     """
 
     def __init__(self, problem: Problem, found: Fit, columns: dict[str, _Column], pushes: Array) -> None:
         every, waves = columns.values(), 0 if problem.harmonics is None else problem.harmonics.amplitude.size
-        #: `names`: names of the quantities other than the harmonics, which come last
-        #: `waves`: slice of the harmonics in the border
+        # the harmonics are last in the border, at the slice `waves`; `names` are the names of the other further
+        # quantities
         self.names = list(columns)[: len(columns) - waves]
         self.waves = slice(SIZE + len(self.names), SIZE + len(columns))
         self._found, self._swing = found, found.point.swing
         further = np.stack([one.derivative for one in every], axis=2)
         self._precision = np.concatenate([problem.deviation, [one.deviation for one in every]]) ** -2.0
-        #: `_value`: values of the further quantities in the fit, shape (k,)
-        #: `_held`: whether the fit includes each of these quantities, shape (k,)
+        # `_held` marks the further quantities that the fit includes, with the values `_value`, shape (k,) each
         self._value = np.array([one.value or 0.0 for one in every])
         self._held = np.array([one.value is not None for one in every])
         self._pull = np.concatenate([problem.mean - found.shared, -self._value]) * self._precision
@@ -275,7 +283,7 @@ class _Linearised:
         self.inflation, self.load = np.ones(3), np.full(3, tuning.PUSH)
 
     def eliminate(self) -> None:
-        """Eliminate the unknowns of each swing."""
+        """Eliminate the unknowns of each swing from the normal equations."""
         held = np.diag(np.concatenate([self._start_spread**-2.0, self.load**-2.0]))
         self._blocks, self._swings = [], []
         for rows, border, own, residual, there, left in zip(
@@ -294,7 +302,7 @@ class _Linearised:
         self._score = np.sum([score for _, score in self._blocks], axis=0) + self._pull
 
     def learn(self, rounds: int) -> None:
-        """Learn the size of the load's error in a swing by expectation-maximisation, with all quantities free."""
+        """Estimate the size of the load's error in a swing by expectation-maximisation, with all quantities free."""
         for _ in range(rounds):
             self.eliminate()
             covariance = np.linalg.inv(self._normal)
@@ -312,7 +320,7 @@ class _Linearised:
             self.load = np.maximum(np.sqrt(square / len(self._swings)), _LEAST_PUSH)
 
     def temper(self) -> None:
-        """Inflate the variance by the size of the residuals and by how long they stay correlated."""
+        """Inflate the variance according to the size of the residuals and the length of their correlation."""
         left = np.full(self._found.point.residual.shape, np.nan)
         for rows, some, there in zip(self._rows, self._left, self._there, strict=True):
             left[rows] = np.where(there, some, np.nan).reshape(-1, 3)
@@ -326,11 +334,13 @@ class _Linearised:
             self.inflation[index] = max(1.0, square / usual) * _lasting(column, self._swing, square)
 
     def exact(self) -> tuple[Array, Array]:
-        """Return mean and covariance of the border's unknowns if only the quantities that the fit includes differ."""
+        """Return mean and covariance of the border's unknowns if only quantities that the fit includes may differ."""
         return self._of(self._held)
 
     def _of(self, differs: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Return mean and covariance if some quantities differ, and the others have their values in the scene."""
+        """Return mean and covariance if the marked quantities differ, and the other quantities have the scene's
+        values.
+        """
         size, use = len(self._precision), np.append(np.arange(SIZE), SIZE + np.flatnonzero(differs))
         mean, covariance = np.zeros(size), np.zeros((size, size))
         inverse = np.linalg.inv(self._normal[np.ix_(use, use)])
@@ -338,15 +348,15 @@ class _Linearised:
         return mean, covariance
 
     def averaged(self, rng: np.random.Generator, prior: float) -> tuple[Array, Array, Array]:
-        """Return the draws' mean and covariance, and how often each quantity differs.
+        """Return mean and covariance of the samples, and the share of samples in which each quantity differs.
 
-        `prior` is the prior probability that a quantity differs. A quantity that the fit includes always differs.
+        `prior` is the prior probability of a difference. A quantity that the fit includes differs in all samples.
         """
         size, log_precision = len(self._precision), np.log(self._precision)
         known: dict[bytes, float] = {}
 
         def evidence(which: NDArray[np.bool_]) -> float:
-            key = which.tobytes()  # results are kept, because the sampler visits most sets several times
+            key = which.tobytes()  # cached, because the sampler visits most sets several times
             if key not in known:
                 use = np.append(np.arange(SIZE), SIZE + np.flatnonzero(which))
                 lower = np.linalg.cholesky(self._normal[np.ix_(use, use)])
@@ -375,7 +385,9 @@ class _Linearised:
         return mean, second / counted - np.outer(mean, mean), often / counted
 
     def scatter(self) -> float:
-        """Return the variance from the swings' scatter relative to that from noise, averaged over `MOVING`."""
+        """Return the ratio of the variance from the scatter of the swings to the variance from noise, averaged over
+        `MOVING`.
+        """
         scores = np.stack([score[:SIZE] for _, score in self._blocks])
         scores = scores - scores.mean(axis=0)
         count, moving = len(scores), list(MOVING)
@@ -388,15 +400,17 @@ class _Linearised:
     def surprise(self, mean: Array, often: Array) -> float:
         """Return the mean square of the differences in units of their prior deviations, at least 1.
 
-        If it is above 1, the linearisation is inaccurate.
+        The linearisation is inaccurate if the result exceeds 1.
         """
         own = len(self.names)
         z, often = ((self._value + mean[SIZE:]) * np.sqrt(self._precision[SIZE:]))[:own], often[:own]
-        # the mean over the quantities is weighted by how often each quantity differs
+        # the weights of the quantities are the shares of samples in which they differ
         return max(1.0, float((z**2 / np.maximum(often, 0.1)).sum() / max(often.sum(), 1.0)))
 
     def named(self, mean: Array, often: Array) -> dict[str, tuple[float, float, float]]:
-        """Return for each quantity the probability that it differs, and the difference with its deviation."""
+        """Return for each quantity the probability of a difference, and mean and standard deviation of the
+        difference.
+        """
         deviation = np.sqrt(1.0 / np.diag(self._normal)[SIZE:])
         return {
             name: (float(share), float(value / max(share, 1e-9)), float(spread))
@@ -405,7 +419,7 @@ class _Linearised:
 
 
 def _lasting(left: Array, swing: NDArray[np.int64], square: float) -> float:
-    """Return the number of rows over which residuals stay correlated, the sum of their correlations over the lags."""
+    """Return the correlation length of residuals in rows, which is the sum of their correlations over all lags."""
     rows = 1.0
     for lag in range(1, _LONGEST_LAG):
         one, other = left[:-lag], left[lag:]

@@ -1,13 +1,14 @@
-"""Walls and stiffness from the weak form of the equations of motion.
+"""Estimate of walls and stiffness from the weak form of the equations of motion.
 
-No motion is simulated, so errors of the load do not accumulate. The equations are multiplied by short smooth functions
-psi and integrated by parts, so that no measured pose is differentiated:
+The method simulates no motion, so errors of the load do not accumulate. The equations are multiplied by smooth test
+functions psi and integrated by parts, so that no measured pose is differentiated:
 
     integral psi'' q  =  integral psi (load + contact) / M,
     contact = K sum n p (1 + d p'),   integral psi p p' = -1/2 integral psi' p^2,
 
-with the penetrations p behind four walls. Gauss-Newton steps find the walls, K and K d; the remaining acceleration is
-treated as noise. The result is biased if contacts last only a few samples; `uncertain_load` corrects the bias.
+where p are the penetrations behind the four walls. Gauss-Newton steps determine the positions of the walls, K and K d.
+The remaining acceleration is treated as noise. The result is biased if contacts last only a few samples. The module
+`uncertain_load` corrects this bias.
 
 References: Shinbrot, Trans. ASME 79 (1957) 67 (modulating functions); Messenger and Bortz, J. Comput. Phys. 443 (2021)
 110525 (weak form).
@@ -32,33 +33,35 @@ from plow_twin.solve.compiled_scene import inertias
 
 Array = NDArray[np.float64]
 
-#: Definition: index of each pair's wall in the order right, left, top, bottom.
+#: Index of the wall of each pair in the order right, left, top, bottom, by definition.
 _WALL: Final = np.argmax(np.stack(WALLS), axis=0)
-#: Bound: number of Gauss-Newton steps, size in m below which a step is the last, and longest step in m.
+#: Gauss-Newton steps: upper bound of their number, size in m below which they end, and largest size in m.
 _STEPS, _SMALL, _LONGEST = 8, 2e-5, 3e-3
-#: Guard: shortest interval between rows in s, and smallest number of rows in half of a test function.
+#: Lower bounds of the interval between rows in s, and of the number of rows in half of a test function.
 _SHORTEST, _FEWEST = 5e-3, 3
-#: Derived: unit of the stiffness in N/m; in this unit the column of the stiffness is as large as the other columns.
+#: Unit of the stiffness in N/m, derived so that the column of the stiffness is about as large as the other columns.
 _UNIT = 1e7
-#: Derived: deviate beyond which Huber's function is linear; ratio of standard deviation to median absolute deviation.
+#: Deviate beyond which Huber's function is linear, and ratio of standard deviation to median absolute deviation,
+#: derived for a normal distribution.
 _HUBER, _MAD = 2.0, 1.4826
-#: Bound: starting values of a search: clearances as shares of the range of motion, and penetrations in m.
+#: Starting values of a search within the bounds of the unknowns: clearances as shares of the range of motion, and
+#: penetrations in m.
 _SHARES, _DEPTHS = (0.25, 0.5, 0.75, 0.95), (3e-3, 6e-3, 12e-3, 20e-3)
-#: Guard: penetrations in m of the hardest and of the softest contact that is tried.
+#: Lower and upper bound of the penetration in m under the reference force.
 DEPTHS: Final = (2e-4, 3e-2)
-#: Guard: number that keeps quotients finite for columns without information.
+#: Guard against division by zero for columns without information.
 _SINGULAR = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Walls:
-    """Result of a fit.
+    """Result of a fit of the weak form.
 
-    reach : (4,) distance in m by which the corners move toward the right, left, top and bottom before they touch
+    reach : (4,) distance in m that the corners can move to the right, left, top and bottom before they touch the wall
     ln_depth : logarithm of the penetration in m under the reference force
-    damping : damping of Hunt and Crossley's law in s/m
-    left_over : (3,) logarithm of the remaining scatter relative to the scatter of the acceleration
-    loss : sum of the logarithms of the remaining scatters
+    damping : damping of the Hunt-Crossley law in s/m
+    left_over : (3,) logarithm of the scatter of the residual acceleration relative to the scatter of the acceleration
+    loss : sum of the logarithms of the scatters of the residual acceleration
     """
 
     reach: Array
@@ -74,19 +77,19 @@ class Walls:
 
     @property
     def features(self) -> Array:
-        """Features of the result for a regression, shape (7,), the clearances first."""
+        """Features of the result for a regression, shape (7,), which begin with the clearances."""
         return np.concatenate([self.clearance, [self.ln_depth, np.clip(self.damping, -2.0, 3.0)], self.left_over])
 
 
 class EquationError:
-    """The weak form of a scene's equations under the believed load, for poses at given times.
+    """The weak form of the equations of motion of a scene under the measured load, for poses at given times.
 
     Parameters
     ----------
     unknowns : Unknowns
-        The scene, and the reference force of penetrations.
-    load : Load
-        The believed load.
+        The scene, and the reference force at which penetrations are stated.
+        load : Load
+            The measured load.
     t : ndarray, shape (n,)
         Times of the poses in s.
     """
@@ -98,7 +101,7 @@ class EquationError:
         half = max(_FEWEST, round(0.5 * tuning.MODULATED / step))
         s, span = np.arange(1 - half, half) / half, half * step
         bump = 1.0 - s * s
-        # step times (1 - s^2)^3, and its first two time derivatives
+        # the test function (1 - s^2)^3 and its first two time derivatives, times the step of the integration
         self._value = step * bump**3
         self._slope = -6.0 * step / span * s * bump**2
         self._curve = step / span**2 * (24.0 * s * s * bump - 6.0 * bump**2)
@@ -111,14 +114,19 @@ class EquationError:
         self._load = self._weighed(wrench, self._value) / self._inertia
 
     def search(self, q: Array, span: Array) -> Walls:
-        """Return the best fit to poses (n, 3) from several starts; `span`, shape (2,), is the range of motion in m."""
+        """Return the fit with the smallest loss from several starting points.
+
+        `q` contains the poses, shape (n, 3), and `span` the range of motion in m, shape (2,).
+        """
         found = [
             self.fit(q, np.repeat(0.5 * share * span, 2), math.log(depth)) for depth in _DEPTHS for share in _SHARES
         ]
         return min(found, key=lambda one: one.loss)
 
     def fit(self, q: Array, reach: Array, ln_depth: float) -> Walls:
-        """Return the fit to poses (n, 3), which starts from reaches (4,) in m and the logarithm of a penetration."""
+        """Return the fit to poses `q` (n, 3) that starts from reaches (4,) in m and the logarithm of a penetration in
+        m.
+        """
         poses = np.stack([np.interp(self._grid, self._t, column) for column in q.T], axis=1)
         corners, normals = self._geometry(poses)
         acceleration = self._weighed(poses, self._curve)
@@ -139,14 +147,16 @@ class EquationError:
         return Walls(reach, ln_depth, damping, np.log(scale / all_of_it), float(np.log(scale).sum()))
 
     def touched(self, q: Array, walls: Walls, deeper: float) -> Array:
-        """Return the time in s for which the corners lie `deeper` m behind each wall, shape (4,)."""
+        """Return the time in s during which a corner is more than `deeper` m behind each wall, shape (4,)."""
         poses = np.stack([np.interp(self._grid, self._t, column) for column in q.T], axis=1)
         beyond = self._geometry(poses)[0] - walls.reach[_WALL] > deeper
         step = self._grid[1] - self._grid[0]
         return np.array([step * beyond[:, wall].any(axis=1).sum() for wall in WALLS])
 
     def _geometry(self, q: Array) -> tuple[Array, Array]:
-        """Return reaches (n, 8) in m, and the head's accelerations (n, 3, 8) due to a force of 1 N at each pair."""
+        """Return the reaches of the pairs in m, shape (n, 8), and the accelerations by unit forces of the pairs, (n, 3,
+        8).
+        """
         c, s = np.cos(q[:, 2]), np.sin(q[:, 2])
         body = np.stack([c, s, c * q[:, 0] + s * q[:, 1], -s * q[:, 0] + c * q[:, 1]], axis=1)
         x = c[:, None] * NORMAL_X - s[:, None] * NORMAL_Y
@@ -177,7 +187,7 @@ class EquationError:
         return found, target - columns @ found
 
     def _weighed(self, values: Array, kernel: Array) -> Array:
-        """Return the integrals of `values` (n, ...) times a test function or its derivative, shape (m, ...)."""
+        """Return the integrals of `values` (n, ...) times the test function, or a derivative of it, shape (m, ...)."""
         windows = np.lib.stride_tricks.sliding_window_view(values, len(kernel), axis=0)[:: self._apart]
         out: Array = windows @ kernel
         return out

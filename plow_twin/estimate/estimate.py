@@ -1,4 +1,4 @@
-"""Estimates from the measurements of a whole window."""
+"""Estimate of clearances, contact, load gains and sensor errors from one window of measurements."""
 
 from __future__ import annotations
 
@@ -50,22 +50,23 @@ if TYPE_CHECKING:
     from plow_twin.estimate.contact_forces import ContactForces
 
 Array = NDArray[np.float64]
-#: First guess of a window, taken from the previous window: the shared unknowns, the noise and the differences, 21
-#: numbers in all. An empty tuple means that there is no guess.
+#: First guess for a fit, from the result of the previous window. The 21 numbers are the shared unknowns, the noise and
+#: the differences. An empty tuple means that there is no guess.
 Guess = tuple[float, ...]
 
-#: Bound: a window has at most this many load periods or this many seconds, whichever is longer. Of longer data the
-#: newest part is used.
+#: Upper bounds of the length of a window in load periods and in s, of which the longer one applies. Only the newest
+#: part of longer data is used.
 MOST_PERIODS, MOST_SPAN_S = 20.0, 60.0
-#: Bound: the load's period is searched in data of at most this length in s, the longest window of a node.
+#: Upper bound in s of the length of data in which the period of the load is searched; it is the longest window of a
+#: node.
 _LONGEST_S = 600.0
-#: Derived: normal deviate that a correct model exceeds in one of a hundred cases, to two digits.
+#: Normal deviate that a correct model exceeds in one of a hundred cases, derived from the normal distribution.
 MOST_OTHER_LAW = round(float(ndtri(0.99)), 2)
-#: Derived: 95 % point of a half-normal distribution, in standard deviations of the normal distribution.
+#: 95 % quantile of a half-normal distribution, derived from the normal distribution with unit variance.
 _HALF_NORMAL_P95 = float(ndtri(0.975))
-#: Guard: logarithms of the smallest and the largest penetration of a contact in m.
+#: Bounds of the logarithm of a contact's penetration in m.
 _LN_PENETRATIONS = (math.log(1e-9), math.log(0.12))
-#: Definition: pairs of the left, right, top and bottom walls of the cavity.
+#: Indices of the two pairs at each wall of the cavity, by definition.
 _SIDES = {"left": (1, 7), "right": (3, 5), "top": (0, 2), "bottom": (4, 6)}
 
 
@@ -77,22 +78,23 @@ def estimate(
     gaps: Gaps | None = None,
     forces: ContactForces | None = None,
 ) -> Estimate:
-    """Estimate clearances, contact, load gains and the sensor's bias and delay from one window of measurements.
+    """Return the estimate of clearances, contact, load gains, and the sensor's bias and delay from a window.
 
     Parameters
     ----------
     scene : Scene
-        The nominal scene. Its geometry, masses and gravity are taken as exact, its clearances and contact as priors.
-    load : Load
-        The believed load.
+        The nominal scene. Its geometry, masses and gravity are assumed to be exact. Its clearances and contact are
+        means of the prior.
+        load : Load
+            The measured load.
     poses : Poses
         The measured poses.
     lost : int
-        Number of rows that were already left out.
+        Number of rows that were left out before.
     gaps : Gaps, optional
-        Measured gaps. They give the clearances directly, and the pose if it is not measured.
+        Measured gaps. The clearances follow directly from the gaps, and so does the pose if no poses are measured.
     forces : ContactForces, optional
-        Measured contact forces. They determine the contact better than the motion alone.
+        Measured contact forces, which determine the contact more accurately than the motion alone.
     """
     return estimate_window(scene, load, poses, lost, gaps=gaps, forces=forces)[0]
 
@@ -106,9 +108,10 @@ def estimate_window(
     gaps: Gaps | None = None,
     forces: ContactForces | None = None,
 ) -> tuple[Estimate, Guess]:
-    """Estimate as `estimate` does, from the previous window's result; return also the guess for the next window.
+    """Return the result of `estimate` for a window, and the guess for the next window.
 
-    If the fit that starts from `guess` fails a check, the estimate is repeated with a full search, as without a guess.
+    The fit starts from `guess`, if there is one. If this fit fails a check, the estimate is repeated with a full
+    search.
     """
     if scene.head.carries == "corners":
         span = (float(load.t[0]), float(load.t[-1]))
@@ -121,7 +124,8 @@ def estimate_window(
     found, following = _estimate(units.scene(scene), *its, lost, guess, units.gaps(gaps), units.forces(forces))
     found = units.in_si(found, scene)
     if units.only_time and found.sensor == "ok":
-        # the machine has the paper's size but a faster or slower load, so impacts last as long as in the paper
+        # The estimate scales time with the load's period. A machine of the paper's size has impacts of the same
+        # duration under any load, so the comparison under an uncertain load is repeated without the scaling of time.
         period = _period(load, poses)
         unknowns = Unknowns.stated(scene, load, poses)
         found = under_uncertain_load(found, unknowns, thinned(load, period)[0], poses, period)
@@ -137,7 +141,7 @@ def _estimate(
     gaps: Gaps | None,
     forces: ContactForces | None,
 ) -> tuple[Estimate, Guess]:
-    """Estimate in the units of the arguments."""
+    """Return the result of `estimate_window`, with all numbers in the units of the arguments."""
     known, measured = len(load.t), len(poses.t)
     load = load.longest_stretch()
     lost += known - len(load.t)
@@ -175,19 +179,18 @@ def _estimate(
 
 
 def _known(result: Estimate) -> bool:
-    """Return whether at least one clearance is known."""
     return result.horizontal_state.known or result.vertical_state.known
 
 
 def _unexplained(result: Estimate) -> bool:
-    """Return whether the load does not explain the motion."""
+    """Return whether the load fails to explain the motion."""
     return result.model == "suspect" and not _known(result)
 
 
 def _from_motion(
     scene: Scene, load: Load, poses: Poses, lost: int, guess: Guess, forces: ContactForces | None
 ) -> tuple[Estimate, Guess]:
-    """Estimate from the motion alone."""
+    """Return the estimate from load and poses, without measured gaps."""
     span = float(load.t[0]), float(load.t[-1])
     unknowns = Unknowns.stated(scene, load, poses)
     if len(poses.t) < FEWEST_POSES:
@@ -217,8 +220,7 @@ def _from_motion(
     if guess:
         numbers = np.array(guess)
         shared, noise, differences = np.split(numbers, [SIZE, SIZE + 3])
-        # a guess from a fit is close to the optimum; contacts harder than `FITTED` are not fitted, so their guess is
-        # uncertain
+        # a guess from a fit is close to the optimum, but a contact harder than `FITTED` was not fitted
         certain = unknowns.penetration_of(float(shared[SOFTNESS])) > tuning.FITTED
         near = refine(forward, unknowns, poses, period, unknowns.within(shared), noise, drift, differences, certain)
         verdict = judge(*near, period) if near else None
@@ -240,10 +242,9 @@ def _from_motion(
 def _from_some_components(
     unknowns: Unknowns, load: Load, poses: Poses, lost: int, lacking: tuple[str, ...]
 ) -> Estimate:
-    """Estimate from poses of which one or two components were never measured.
+    """Return the estimate from poses in which one or two components were never measured.
 
-    If no motion under the believed load comes near the measured one, x and y are compared with motions under errors of
-    the load.
+    If the fit gives no clearance, measured x and y are compared with motions under an uncertain load.
     """
     period = _period(load, poses)
     felt, _ = thinned(load, period)
@@ -269,7 +270,7 @@ def _searched(
     lost: int,
     forces: ContactForces | None,
 ) -> tuple[Estimate, Guess]:
-    """Estimate from the motion without a guess."""
+    """Return the estimate from the motion without a guess, by a search or by the comparison of whole motions."""
     narrow = bounces(unknowns, poses)
     bounced = compare(forward, unknowns, poses, period) if narrow else None
     searched = candidate(forward, unknowns, poses, period) if bounced is None else None
@@ -300,8 +301,7 @@ def _searched(
             found, verdict = again, judge(*again, period)
     found, verdict = _with_differences(found, verdict, period)
     if bounced is None and _fails(found[1], verdict) and not verdict.sensor:
-        # a low pass or a change of the machine can look like harmonics, so harmonics are tried only after the
-        # differences
+        # a low pass or a change of the machine can resemble harmonics, so harmonics are tried after the differences
         found, verdict = with_harmonics(*plain, forward.load, period) or (found, verdict)
     result = summarise(*found, verdict, lost, forces if bounced is None else None)
     if bounced is None and _fails(found[1], verdict) and not verdict.broken:
@@ -311,12 +311,12 @@ def _searched(
 
 
 def _period(load: Load, poses: Poses) -> float:
-    """Return the load's period in s, at most the span of the poses."""
+    """Return the period of the load in s, limited to the span of the poses."""
     return min(load.period(), float(poses.t[-1] - poses.t[0]))
 
 
 def _fails(found: Fit, verdict: Verdict) -> bool:
-    """Return whether a fit has not reached an optimum or fails a check."""
+    """Return whether a fit fails a check or has not reached an optimum."""
     return bool(verdict.model or verdict.sensor) or not found.finished
 
 
@@ -328,11 +328,12 @@ def under_uncertain_load(
     period: float,
     fitted: tuple[Problem, Fit] | None = None,
 ) -> Estimate:
-    """Return an estimate with withdrawn clearances replaced by values that allow for load errors or a missing angle.
+    """Return an estimate whose withdrawn clearances are replaced by values that allow for errors of the load.
 
-    `result` is the estimate under the believed load. It is returned unchanged if it has a clearance or if the
-    comparison finds none. `fitted` is a fit that failed and may be in a false optimum. Where the comparison agrees with
-    the fit, the optimum is not false, and both are combined.
+    The values come from a comparison with motions under uncertain loads. `result` is the estimate under the measured
+    load. It is returned without new clearances if it contains a clearance, or if the comparison gives none. `fitted` is
+    a fit that failed a check and may have converged to a false optimum. A clearance of the fit that agrees with the
+    comparison is combined with it.
     """
     if _known(result) or felt.interval() > tuning.COARSEST:
         return result
@@ -370,7 +371,7 @@ def under_uncertain_load(
 
 
 def _from_bounced(unknowns: Unknowns, shared: Array, bounced: Bounced) -> Array:
-    """Return a vector of unknowns with the clearances, softness and damping that a comparison has found."""
+    """Return a vector of unknowns in which clearances, softness and damping are replaced by those of a comparison."""
     start = shared.copy()
     start[[GX, GY]], start[DAMPING] = bounced.clearance, bounced.ln_damping[0]
     penetration = math.exp(bounced.ln_penetration[0])
@@ -379,7 +380,7 @@ def _from_bounced(unknowns: Unknowns, shared: Array, bounced: Bounced) -> Array:
 
 
 def with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
-    """Combine a fit and a comparison of the same motion; their disagreement widens the interval."""
+    """Return an estimate that combines a fit and a comparison of the same motion; disagreement widens the intervals."""
     figures = result.figures | {"distance": bounced.distance, "path": bounced.path}
     figures["work"] += float(spent)
     if bounced.distance >= tuning.MOST_DISTANCE:
@@ -400,7 +401,10 @@ def with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
 
 
 def _with_apparent(result: Estimate, apparent: tuple[Interval, ...]) -> Estimate:
-    """Return an estimate with other apparent clearances, and with the same differences of the frame beside them."""
+    """Return an estimate with new apparent clearances, and clearances that are shifted and widened as before.
+
+    Apparent clearances hold for a frame of exactly the scene's size; the clearances allow for an error of the frame.
+    """
     horizontal, vertical = (
         Interval.normal(
             value.mean + new.mean - old.mean,
@@ -419,9 +423,10 @@ def _with_apparent(result: Estimate, apparent: tuple[Interval, ...]) -> Estimate
 def _with_differences(
     found: tuple[Problem, Fit], verdict: Verdict, period: float
 ) -> tuple[tuple[Problem, Fit], Verdict]:
-    """Repeat a fit with differences of walls and sensor if the fit fails without them or shows them.
+    """Return a fit that includes differences of walls and sensor, if the fit without them fails or gives evidence of
+    them.
 
-    A wall whose pads differ by 1.2 mm, if taken to be straight, makes the clearance 0.2 mm too small.
+    Without the differences, a wall whose two pads differ by 1.2 mm makes the clearance 0.2 mm too small.
     """
     if verdict.sensor and not verdict.by_scale:
         return found, verdict
@@ -436,7 +441,7 @@ def _with_differences(
 
 
 def _moved_back(result: Estimate, bias: Array) -> Estimate:
-    """Return an estimate with the bias added that was removed from the poses."""
+    """Return an estimate for the original poses, to which the removed bias is added again."""
     x, y, theta = (
         None if known is None else Interval(known.mean + by, known.p05 + by, known.p95 + by)
         for known, by in zip((result.bias_x, result.bias_y, result.bias_theta), bias.tolist(), strict=True)
@@ -446,7 +451,7 @@ def _moved_back(result: Estimate, bias: Array) -> Estimate:
 
 
 def with_gaps(result: Estimate, by_gaps: GapsFit) -> Estimate:
-    """Combine the estimates from motion and gap sensors; if they contradict each other, withdraw the values."""
+    """Return an estimate that combines motion and gap sensors; a contradiction withdraws the clearances."""
     found = []
     if by_gaps.contradiction > tuning.OUTLYING:
         found.append(
@@ -489,7 +494,7 @@ def with_gaps(result: Estimate, by_gaps: GapsFit) -> Estimate:
 
 
 def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: int, work: int) -> Estimate:
-    """Turn the comparison of a motion with a hard contact into values, intervals and states."""
+    """Return the estimate, with intervals and states, from the comparison of a motion with a hard contact."""
     sensor = judge_sensor(poses)
     found = (
         ("motion", bounced.distance, tuning.MOST_DISTANCE),
@@ -523,7 +528,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         states.append(_state(bool(sensor), observed, rough))
     exponent = unknowns.scene.contact.exponent
     log = Interval.normal(*bounced.ln_penetration)
-    # the result is clipped, because a regression that extrapolates is not bounded
+    # clipped, because the extrapolation of a regression is not bounded
     log = Interval(*np.clip([log.mean, log.p05, log.p95], *_LN_PENETRATIONS).tolist())
     mean, soft, hard = (unknowns.force / np.exp(value) ** exponent for value in (log.mean, log.p95, log.p05))
     bias = [Interval.normal(*pair) for pair in zip(bounced.bias, bounced.bias_deviation, strict=True)]
@@ -535,7 +540,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         horizontal_state=states[0],
         vertical_state=states[1],
         apparent=(apparent[0], apparent[1]) if all(state.known for state in states) else None,
-        # bounces alone determine the stiffness here, so its interval is open towards harder contacts
+        # the bounces determine a lower limit of the stiffness only, so the interval extends to the hardest contact
         stiffness=Interval(float(mean), float(soft), max(float(hard), unknowns.hardest_believed)),
         damping=_damping(unknowns, Interval.normal(*bounced.ln_damping)),
         bias_x=bias[0],
@@ -557,7 +562,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
 
 
 def _both(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
-    """Return mean and deviation of the combination of two independent measurements."""
+    """Return mean and deviation of the weighted mean of two independent measurements."""
     weights = one[1] ** -2, other[1] ** -2
     return (one[0] * weights[0] + other[0] * weights[1]) / sum(weights), sum(weights) ** -0.5
 
@@ -568,7 +573,7 @@ def _apart(one: tuple[float, float], other: tuple[float, float]) -> float:
 
 
 def _both_of_one(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
-    """Return mean and deviation as `_both`, widened by the disagreement of two estimates from one motion.
+    """Return mean and deviation as `_both` does, but widened if the two estimates, from the same motion, disagree.
 
     Reference: Birge, Phys. Rev. 40 (1932) 207 (the ratio of external to internal consistency).
     """
@@ -584,9 +589,9 @@ def _state(withdrawn: bool, observed: bool, rough: bool = False) -> State:
 
 
 def _unseen(fit: Fit) -> Array:
-    """Return the deviation of the clearances in m due to turns of walls with a pad that is never touched, shape (2,).
+    """Return the deviation of the clearances in m due to rotations of walls with an untouched pad, shape (2,).
 
-    To the linearised fit this pad is a bound at which the turn may end.
+    The motion does not show the position of an untouched pad. The linearised fit does not contain this uncertainty.
     """
     square = np.zeros(2)
     seconds = fit.point.contact.sum(axis=0)
@@ -597,7 +602,6 @@ def _unseen(fit: Fit) -> Array:
 
 
 def _figures(beside: Graded | None) -> dict[str, float]:
-    """Return the sizes of the differences from the model."""
     if beside is None:
         return {}
     named = zip(("fx", "fy", "m"), beside.load.tolist(), strict=True)
@@ -612,9 +616,11 @@ def _figures(beside: Graded | None) -> dict[str, float]:
 def _graded(problem: Problem, fit: Fit, verdict: Verdict) -> Graded | None:
     """Return the result of the fit for a machine that may differ from the model, or None.
 
-    The result is None if the data contradict themselves, or if swings are linked and no check fails. A fit that has not
-    reached an optimum may be near a false one. It therefore also gives None if its swings are linked or if its
-    residuals far exceed the noise.
+    The result is None in these cases:
+
+    - The measurements contradict each other.
+    - Swings are linked, and either no check fails or the fit has not reached an optimum.
+    - The fit has not reached an optimum, and its residuals far exceed the noise, so that the optimum may be false.
     """
     if verdict.broken:
         return None
@@ -628,7 +634,6 @@ def _graded(problem: Problem, fit: Fit, verdict: Verdict) -> Graded | None:
 
 
 def _if_it_differs(problem: Problem, fit: Fit, doubtful: bool = True) -> Graded | None:
-    """Return the result of a fit for a machine that differs from the model; None if it cannot be computed."""
     try:
         return graded(problem, fit, doubtful)
     except np.linalg.LinAlgError:
@@ -640,9 +645,9 @@ def _next_guess(problem: Problem, fit: Fit) -> Guess:
 
 
 def thinned(load: Load, period: float) -> tuple[Load, bool]:
-    """Thin a load to the samples that move the head; return also whether it is broad-band.
+    """Return a load without samples that hardly move the head, and whether the load is broad-band.
 
-    Nearly every sample of a broad-band load moves the head.
+    A load is broad-band if nearly all its samples move the head. Such a load is averaged instead.
     """
     load = load.believable()
     most = tuning.KNOTS[0] * max(1.0, float(load.t[-1] - load.t[0]) / period)
@@ -654,7 +659,7 @@ def thinned(load: Load, period: float) -> tuple[Load, bool]:
         if len(thin.t) <= most:
             break
     broad = len(thin.t) > most
-    # a broad-band load is averaged, because the head follows its mean values
+    # the head follows the mean values of a broad-band load
     felt = load.averaged(tuning.KNOTS[1] * int(most)) if len(thin.t) > tuning.KNOTS[1] * most else thin
     return replace(felt, unknown=load.unknown), broad
 
@@ -679,7 +684,7 @@ def warm_up(scene: Scene) -> None:
 
 
 def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: ContactForces | None = None) -> Estimate:
-    """Turn a fit, and measured contact forces, into values, intervals and states."""
+    """Return the estimate, with intervals and states, from a fit and from measured contact forces, if any."""
     unknowns, poses = problem.unknowns, problem.window.poses
     finished, suspect = fit.finished, bool(verdict.model or verdict.sensor)
     plain = _plain(problem, fit)
@@ -696,7 +701,8 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     if beside is not None:
         published = np.maximum(beside.clearance, LEAST_CLEARANCE)
         spread = np.hypot(beside.clearance_deviation, _between_optima(problem, shared))
-    # a change at an unknown moment moves the mean over the window by a uniformly distributed share of it
+    # A change of a clearance at an unknown time within the window shifts the mean over the window by a uniformly
+    # distributed share of the change.
     moved = verdict.changed / math.sqrt(3.0)
     deviation[[GX, GY]] = np.hypot(deviation[[GX, GY]], moved)
     spread = np.hypot(np.hypot(spread, moved), _unseen(fit))
@@ -704,17 +710,17 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     if not finished and not suspect:
         gain = f"the cost would still fall by {fit.gain_left:.0f}, expected at most {tuning.OUTLYING**2:g}"
         reasons = [f"the fit has not reached an optimum: {gain}"]
-    # depth by which compliant walls can give way, so that the range of motion exceeds the clearance
+    # compliant walls give way by this depth, so the range of motion can exceed the clearance
     given = tuning.GIVEN * float(np.exp(shared[SOFTNESS] + NORMAL_P95 * min(deviation[SOFTNESS], 1.0)))
     least = range_of_motion(unknowns.scene, poses)[0] - given
     share = predicted(fit).sum(axis=0) / np.maximum(np.isfinite(fit.point.residual).sum(axis=0), 1)
-    # through its equations, the motion tests the clearance along a component that was not measured
+    # the equations of motion couple the components, so the measured components also test the other clearance
     share = np.where(poses.measured, share, share[poses.measured].min())
     apparent, clearances, states = [], [], []
     untested: dict[int, Interval] = {}
     for index, sides in ((GX, ("left", "right")), (GY, ("top", "bottom"))):
-        # only instants at which the motion is predicted test a clearance; hard contacts are exempt, because their
-        # bounces cannot be predicted for long
+        # A clearance is tested only at times at which the motion is predicted. Hard contacts are exempt, because their
+        # bounces cannot be predicted for long.
         tested = share[index] > tuning.PREDICTED or unknowns.penetration_of(float(shared[SOFTNESS])) < tuning.HARD
         if not tested and finished and not suspect:
             reasons.append(
@@ -722,7 +728,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
                 f"{COMPONENTS[index]} is predicted, expected {tuning.PREDICTED:.0%} or more"
             )
         touched = min(float(fit.point.contact[:, _SIDES[side]].sum()) for side in sides)
-        # at its bound, a clearance has no result
+        # a clearance at the lower limit of the fit is not observed
         observed = tested and touched > tuning.TOUCHED and shared[index] > LEAST_CLEARANCE
         observed &= deviation[index] < (2.0 * tuning.OBSERVED if rough else tuning.OBSERVED) and (finished or rough)
         apparent.append(Interval.normal(shared[index], deviation[index]))
@@ -771,7 +777,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
 
 
 def _with_forces(result: Estimate, problem: Problem, fit: Fit, forces: ContactForces, widened: float) -> Estimate:
-    """Combine a fit with measured contact forces; if they contradict the fit, withdraw the values."""
+    """Return an estimate that combines a fit with measured contact forces; a contradiction withdraws the clearances."""
     from plow_twin.estimate.force_fit import fit_jointly
 
     if "suspect" in (result.model, result.sensor) or not fit.finished:
@@ -806,7 +812,7 @@ def _with_forces(result: Estimate, problem: Problem, fit: Fit, forces: ContactFo
 
 
 def _numbers(unknowns: Unknowns, normal: list[Interval]) -> dict[str, Any]:
-    """Return the estimates of all quantities but the clearances, by name, from the intervals of the shared unknowns."""
+    """Return the intervals of all quantities except the clearances, by name."""
     values = {quantity.name: value for quantity, value in zip(QUANTITIES, normal, strict=True)}
     del values["horizontal"], values["vertical"]
     contact = {
@@ -817,18 +823,14 @@ def _numbers(unknowns: Unknowns, normal: list[Interval]) -> dict[str, Any]:
 
 
 def _plain(problem: Problem, fit: Fit) -> Array:
-    """Return the covariance due to noise and to the uncertainty of the differences in the fit."""
+    """Return the covariance due to noise and due to the uncertainty of the differences in the fit."""
     return fit.covariance + of_differences(problem, fit) if problem.differences.any() else fit.covariance
 
 
 def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> Array:
-    """Return the covariance of the shared unknowns: `plain`, widened if the swings scatter more than the noise.
+    """Return the covariance of the shared unknowns, which is `plain` widened by the misfit.
 
-    All unknowns that move the head scatter for the same reason, so the mean of their variance ratios widens all of
-    them. The ratio of a single unknown, from some tens of swings, would be too random. The covariance of linked swings
-    already contains the scatter. The scatter is corrected for the unknowns fitted to it. Residuals beyond the noise
-    stay correlated for long, so deviations are multiplied by the ratio of the variances, not by its root. The remaining
-    step of the fit is treated as an unknown error.
+    The factor is `_widened`. The step that the fit has not yet made is added as an error.
     """
     size = len(fit.shared)
     covariance: Array = plain * _widened(problem, fit, verdict) + np.outer(fit.left[:size], fit.left[:size])
@@ -837,7 +839,12 @@ def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> A
 
 
 def _widened(problem: Problem, fit: Fit, verdict: Verdict) -> float:
-    """Return the factor on the noise's variance, from the scatter of the swings and the colour of the residuals."""
+    """Return the factor on the variance of the noise, from the scatter of the swings and the colour of the residuals.
+
+    All unknowns that move the head scatter for the same reason, so the mean ratio of their variances is used. The ratio
+    of a single unknown would be too random. The covariance of linked swings already contains the scatter. Coloured
+    residuals stay correlated for long, so the deviation, and not the variance, is multiplied by the colour.
+    """
     ratio = 1.0 if len(problem.link) else max(1.0, _scatter(problem, fit, np.diag(fit.covariance)))
     colour = max(verdict.figures.get(f"colour_{name}", 1.0) for name in COMPONENTS)
     widened = max(1.0, colour) * (1.0 if fit.converged else tuning.UNFINISHED)
@@ -845,9 +852,9 @@ def _widened(problem: Problem, fit: Fit, verdict: Verdict) -> float:
 
 
 def _between_optima(problem: Problem, shared: Array) -> float:
-    """Return the standard deviation in m between the clearances of optima that explain the motion equally well.
+    """Return the standard deviation of a clearance in m over optima that explain the motion equally well.
 
-    There are several if the contact is hard or nearly hard, or if only one component was measured.
+    Several optima exist if the contact is hard or nearly hard, or if only one component was measured.
     """
     unknowns = problem.unknowns
     if problem.window.poses.measured.sum() == 1:
@@ -873,11 +880,20 @@ def _groups(
     shared: Array,
     added: Array,
 ) -> dict[str, tuple[Interval, State]]:
-    """Return clearance and state of each group of pads; not observable if the motion does not determine the clearance.
+    """Return the clearance between each two opposite pads, and its state, for a frame of exactly the scene's size.
 
-    `untested` holds, by axis, the clearances that no predicted motion tests; they replace the clearances of the groups
-    along that axis. `shared` are the unknowns of a machine that may differ from the model; `added` is their covariance
-    beyond the fit's. The clearances belong to a machine that has exactly the scene's frame.
+    Parameters
+    ----------
+    problem, fit : Problem, Fit
+        The fit.
+    widened : float
+        Factor on the standard deviations of the fit.
+    states : list of State
+        States of the horizontal and the vertical clearance.
+    untested : dict
+        Clearances that no predicted motion tests, by axis. They replace the clearances of the pads along the axis.
+    shared, added : ndarray
+        The unknowns of a machine that may differ from the model, and their covariance minus that of the fit.
     """
     out = {}
     for name, (value, deviation) in by_group(problem, fit, widened).items():
@@ -892,7 +908,7 @@ def _groups(
 
 
 def _correlation(covariance: Array) -> tuple[tuple[float, ...], ...]:
-    """Return the correlation of the unknowns that change the motion."""
+    """Return the correlation matrix of the unknowns that change the motion."""
     moving = covariance[np.ix_(MOVING, MOVING)]
     deviation = np.sqrt(np.diag(moving))
     matrix = moving / np.outer(deviation, deviation)
@@ -900,13 +916,17 @@ def _correlation(covariance: Array) -> tuple[tuple[float, ...], ...]:
 
 
 def _unobserved(unknowns: Unknowns, deviation: Array, index: int, reach: float, noise: Array) -> Interval:
-    """Return the prior's interval, truncated at the range in which the head has moved."""
+    """Return the interval of a clearance that is not observed: the prior above the range in which the head has
+    moved.
+    """
     nominal, spread = unknowns.nominal()[index], max(unknowns.deviations()[index], deviation[index])
     return Interval.normal(nominal, spread).above(reach - 3.0 * float(np.hypot(noise[index], 1e-4)))
 
 
 def _stiffness(unknowns: Unknowns, psi: Interval) -> Interval:
-    """Return the stiffness; if the contact is too hard to be resolved, the interval is open towards harder contacts."""
+    """Return the stiffness from the softness `psi`; an interval that includes unresolved contacts extends to the
+    hardest.
+    """
     soft, hard = unknowns.stiffness_of(psi.p95), unknowns.stiffness_of(psi.p05)
     if unknowns.within(np.full(SIZE, psi.p05))[SOFTNESS] > psi.p05:
         hard = max(hard, unknowns.hardest_believed)
@@ -921,7 +941,7 @@ def _damping(unknowns: Unknowns, value: Interval) -> Interval | None:
 
 
 def priors(scene: Scene, load: Load, poses: Poses) -> dict[str, Interval]:
-    """Return the prior of each quantity, by the names of `QUANTITIES`, in SI."""
+    """Return the prior of each quantity in SI units, by the names of `QUANTITIES`."""
     unknowns = Unknowns.stated(scene, load, poses)
     normal = [Interval.normal(*pair) for pair in zip(unknowns.nominal(), unknowns.deviations(), strict=True)]
     numbers = {name: value for name, value in _numbers(unknowns, normal).items() if value is not None}
@@ -939,7 +959,7 @@ def prior_of(unknowns: Unknowns, span: tuple[float, float], lost: int) -> Estima
 
 
 def _lacking(poses: Poses) -> tuple[str, ...]:
-    """Return the components that were hardly measured; a corner's place follows only from all three."""
+    """Return messages about components that were hardly measured, or about poses that are too rare."""
     useless = tuple(
         f"{name}: stated deviation {deviation:g}, expected at most {most:g}"
         for name, deviation, most in zip(COMPONENTS, poses.deviation, useless_deviation(), strict=True)
@@ -955,7 +975,7 @@ def _lacking(poses: Poses) -> tuple[str, ...]:
     )
     if lacking:
         return lacking
-    # the longest gap counts too, because a flight within it is not seen, however dense the values around it are
+    # the longest gap counts too, because a flight within the gap is not measured
     apart = max(poses.interval(), poses.gap())
     if apart > tuning.SPARSEST:
         lacking = (f"poses: got {1.0 / apart:.1f} a second, expected at least {1.0 / tuning.SPARSEST:.1f}",)
@@ -963,9 +983,9 @@ def _lacking(poses: Poses) -> tuple[str, ...]:
 
 
 def _well_measured(poses: Poses) -> Poses | None:
-    """Return the poses without components that were hardly measured; None if all components or none were measured well.
+    """Return the poses without components that were hardly measured.
 
-    Nor is there a result if the others are so rare that they miss flights.
+    The result is None if all or no components were measured well, or if the remaining poses are too rare.
     """
     counts = np.isfinite(poses.q).sum(axis=0)
     well = (np.array(poses.deviation) <= useless_deviation()) & (counts >= FEWEST_POSES)
@@ -978,7 +998,7 @@ def _well_measured(poses: Poses) -> Poses | None:
 
 
 def _is_dead(load: Load, poses: Poses) -> bool:
-    """Return whether the load is not really measured: it never changes, but the head does not come to rest."""
+    """Return whether the measured load is constant although the head moves, which shows a failed load sensor."""
     late = filled(poses)[len(poses.t) // 2 :, poses.measured]
     return not np.ptp(load.wrench, axis=0).any() and bool(
         (late.std(axis=0) > tuning.OUTLYING * noise_level(late)).any()
@@ -986,20 +1006,20 @@ def _is_dead(load: Load, poses: Poses) -> bool:
 
 
 def _is_idle(scene: Scene, load: Load, poses: Poses) -> bool:
-    """Return whether the machine is idle: its pose is constant up to noise, and the load hardly changes."""
+    """Return whether the machine is idle, with a pose that is constant up to noise and a load that hardly changes."""
     weight = scene.head.mass_kg * Gravity().acceleration_m_s2
     most = tuning.IDLE_LOAD * weight * np.array([1.0, 1.0, geometry.half_diagonal(scene)])
     return bool((load.wrench.std(axis=0) < most).all()) and _rests(poses)
 
 
 def _rests(poses: Poses) -> bool:
-    """Return whether the last three quarters of the poses are only noise."""
+    """Return whether the last three quarters of the poses are constant up to noise."""
     q = filled(poses)[len(poses.t) // 4 :, poses.measured]
     return bool((q.std(axis=0) < tuning.RESTS * noise_level(q)).all())
 
 
 def _not_observable(unknowns: Unknowns, poses: Poses, lost: int, reasons: tuple[str, ...]) -> Estimate:
-    """Return the prior as an estimate from data that cannot show the clearances."""
+    """Return the prior as an estimate from data that do not determine the clearances."""
     nothing, unseen = prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost), State.NOT_OBSERVABLE
     return replace(nothing, horizontal_state=unseen, vertical_state=unseen, reasons=reasons)
 
@@ -1007,7 +1027,7 @@ def _not_observable(unknowns: Unknowns, poses: Poses, lost: int, reasons: tuple[
 def _without_fit(
     unknowns: Unknowns, poses: Poses, lost: int, why: str = "no motion of the model comes near the measured one"
 ) -> Estimate:
-    """Return the estimate without a fit, with the reason."""
+    """Return the prior as an estimate with withdrawn clearances, and the reason."""
     return replace(
         prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost),
         horizontal_state=State.WITHDRAWN,

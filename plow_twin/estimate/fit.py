@@ -1,11 +1,14 @@
 """Least-squares fit of the unknowns, and of the state at the start of each swing, to the measured motion.
 
-The window is cut into swings that begin in flight between the walls, where the state is known best and its errors
-matter least. Each swing is simulated from its own starting state (multiple shooting), so that errors of the load and of
-the last bounces of a hard contact do not grow from swing to swing. Levenberg-Marquardt steps minimise Huber's function
-of the residuals plus the prior. If the load is unknown between its samples, the swings are short, and the covariance of
-the unknown part of the load links each swing to the next (weak constraints). Runs from displaced starting states give
-the variance of the prediction at each moment. It is added to the variance of the measurement.
+The window is divided into *swings*, which are parts of the motion that begin in flight between the walls. In flight the
+state is known best, and its errors have the smallest effect. Each swing is simulated from its own starting state
+(multiple shooting), so that errors of the load and of the bounces at a hard contact do not accumulate from swing to
+swing. Levenberg-Marquardt steps minimise Huber's function of the residuals plus the terms of the prior.
+
+If the load is unknown between its samples, the swings are short, and each swing is *linked* to the next swing: the
+start of the next swing may differ from the end of the swing, with the covariance of the unknown load (weak
+constraints). Simulations from displaced starting states give the variance of the prediction at each time, which is
+added to the variance of the measurement.
 
 References: Bock, Recent advances in parameter identification techniques for ODE (1983); Nocedal and Wright, Numerical
 Optimization, ch. 10; Huber, Robust Statistics, ch. 7; Tremolet, Q. J. R. Meteorol. Soc. 132 (2006) 2483.
@@ -35,49 +38,53 @@ from plow_twin.model.scene import Scene
 
 Array = NDArray[np.float64]
 
-#: Guard: precision of an unknown without a prior.
+#: Guard against a singular matrix: precision of an unknown without a prior.
 NO_PRIOR = 1e-6
-#: Step: for the difference quotients with respect to a starting state, in m, m, rad, m/s, m/s, rad/s.
+#: Steps of the difference quotients with respect to a starting state, in m, m, rad, m/s, m/s, rad/s.
 _DISPLACED = np.array([2e-4, 2e-4, 1e-3, 5e-3, 5e-3, 3e-2])
-#: Guard: smallest spectral density of an unknown acceleration. It gives a rate of 0.1 mm/s or 0.1 mrad/s after a
-#: second; neither solver nor sensor resolves less.
+#: Lower bound of the spectral density of an unknown acceleration in m2/s3 and rad2/s3. After a second it causes a rate
+#: of 0.1 mm/s or 0.1 mrad/s, which neither solver nor sensor can resolve.
 _LEAST_DRIFT = 1e-8
-#: Definition: the two pads of each wall: left and right with the top pad first, top and bottom with the left pad first.
+#: The two pads of each wall, by definition: left and right with the top pad first, top and bottom with the left pad
+#: first.
 WALLS: Final = ((1, 7), (3, 5), (0, 2), (6, 4))
-#: Definition: differences of machine and sensor from the model, which a fit uses beside the shared unknowns. They are
-#: the distances in m by which the first pad of each wall in `WALLS` lies farther out than the second, the sensor's
-#: lever arm in m along x and y, and the squared time constant of the sensor's low pass in s2.
+#: Layout of the *differences*, by definition. These are unknowns by which machine and sensor differ from the model:
+#:
+#: - `turn_<wall>`: rotation of a wall, the distance in m by which the first pad in `WALLS` lies farther out than the
+#: second pad
+#: - `lever_<axis>`: lever arm of the sensor in m
+#: - `filter`: squared time constant of the sensor's low pass in s2
 TURNS, LEVER, LAG = slice(0, 4), slice(4, 6), 6
 DIFFERENCES: Final = ("turn_left", "turn_right", "turn_top", "turn_bottom", "lever_x", "lever_y", "filter")
-#: Step: for the difference quotients with respect to these differences.
+#: Steps of the difference quotients with respect to the differences.
 DIFFERENCE_STEPS: Final = np.array([2e-4, 2e-4, 2e-4, 2e-4, 1e-3, 1e-3, 4e-6])
-#: Step: for the difference quotients with respect to the amplitude of a harmonic, in units of half the load's range.
+#: Step of the difference quotients with respect to the amplitude of a harmonic, in units of half the load's range.
 _HARMONIC_STEP = 5e-3
-#: Step: factor on the steps above and on those of `QUANTITIES` for derivatives that must be accurate. The steps
-#: themselves average over the motion's kinks, which a search needs, but their curvature looks like information about
-#: changes without effect (mass, inertia, stiffness and load larger by the same share).
+#: Factor on the steps of all difference quotients for derivatives that must be accurate. A search needs large steps,
+#: which average over the kinks of the motion. With large steps, however, the curvature would seem to determine changes
+#: that have no effect on the motion, such as a common factor on mass, inertia, stiffness and load.
 _FINE = 1.0 / 300.0
-#: Derived: smallest number of rows of a swing; two rows of three numbers would just determine the six numbers of the
-#: swing's start.
+#: Smallest number of poses of a swing, derived from its six unknowns, which two poses of three numbers would just
+#: determine.
 FEWEST_OF_SWING = 4
 
 
 def huber_loss(z: Array) -> Array:
-    """Return Huber's function of absolute normalised residuals: their square, linear beyond `tuning.HUBER`."""
+    """Return Huber's function of absolute normalised residuals, a square that becomes linear beyond `tuning.HUBER`."""
     return np.where(z <= tuning.HUBER, z * z, tuning.HUBER * (2.0 * z - tuning.HUBER))
 
 
 def huber_weight(z: Array) -> Array:
-    """Return the weights of squared residuals that give Huber's function."""
+    """Return the weights of iteratively reweighted least squares for Huber's function."""
     return np.minimum(1.0, tuning.HUBER / np.maximum(z, 1e-12))
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Poses cut into swings.
+    """Poses divided into swings.
 
     starts : (s + 1,) model times in s at which the swings begin, and the end of the last swing
-    states : (s, 6) guesses of x, y, theta and their rates at these starts
+    states : (s, 6) first guesses of x, y, theta and their rates at the beginning of each swing
     """
 
     poses: Poses
@@ -92,15 +99,15 @@ class Window:
 
 @dataclass(eq=False)
 class Point:
-    """A set of unknowns with the motion that it predicts.
+    """Values of all unknowns, and the motion that follows from them.
 
-    shared, states : (SIZE,), (s, 6) unknowns
-    swing : (n,) swing of each pose, -1 outside of all swings
-    predicted : (n, 3) predicted measurements without the bias; NaN outside all swings
-    residual : (n, 3) measured minus predicted; NaN where not measured
+    shared, states : (SIZE,), (s, 6) unknowns of the whole window, and starting states of the swings
+    swing : (n,) index of the swing of each pose, -1 outside all swings
+    predicted : (n, 3) predicted measurements without the bias, NaN outside all swings
+    residual : (n, 3) measured minus predicted values, NaN without a measurement
     rate : (n, 3) rates of the predicted measurements
-    contact : (s, 8) time in contact of each pair in s
-    defect : (s - 1, 6) start of each swing minus end of the previous swing; (0, 6) if swings are not linked
+    contact : (s, 8) time in s during which each pair is in contact
+    defect : (s - 1, 6) start of each swing minus end of the swing before; (0, 6) if swings are not linked
     """
 
     shared: Array
@@ -116,10 +123,10 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """Jacobians with respect to the shared unknowns and to the starting state of the row's swing.
+    """Jacobians with respect to the shared unknowns and to the starting state of one swing.
 
-    rows : (n, 3, SIZE + 6) of the predicted measurements
-    ends : (s - 1, 6, SIZE + 6) of the ends of linked swings
+    rows : (n, 3, SIZE + 6) Jacobian of the predicted measurements, with the starting state of the swing of each row
+    ends : (s - 1, 6, SIZE + 6) Jacobian of the ends of linked swings
     """
 
     rows: Array
@@ -128,10 +135,11 @@ class Linear:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A part of the normal equations, for the shared unknowns and the consecutive swings that begin with `swing`.
+    """A part of the normal equations, for the shared unknowns and for one or two consecutive swings.
 
-    rows, weighted : (m, SIZE + 6) or (m, SIZE + 12)
-    residual : (m,)
+    swing : index of the first swing
+    rows, weighted : (m, SIZE + 6) or (m, SIZE + 12) Jacobian, and Jacobian times the weights
+    residual : (m,) residuals
     """
 
     swing: int
@@ -141,23 +149,24 @@ class Piece:
 
     @property
     def own(self) -> slice:
-        """Slice of these swings' unknowns in the vector of all unknowns."""
+        """Slice of the unknowns of these swings in the vector of all unknowns."""
         first = SIZE + OWN * self.swing
         return slice(first, first + self.rows.shape[1] - SIZE)
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The best point, its covariance and the residuals.
+    """Result of a fit.
 
-    covariance : (SIZE, SIZE) of the shared unknowns
+    point : unknowns and motion at the end of the fit
+    covariance : (SIZE, SIZE) covariance of the shared unknowns
     factor : the factorised normal equations of all unknowns
     noise : (3,) standard deviation of the measurements
     variance : (n, 3) variance with which each measurement is weighted
     jitter : (n, 3) variance of the unpredictable part of the motion
-    linear : Jacobians at the point
-    left : (SIZE + 6 s,) remaining step of the linearised problem, zero at an optimum
-    gain_left : reduction of the cost by that step
+    linear : Jacobians at `point`
+    left : (SIZE + 6 s,) next step of the linearised problem, zero at an optimum
+    gain_left : predicted reduction of the cost by the step `left`
     """
 
     point: Point
@@ -174,12 +183,12 @@ class Fit:
 
     @property
     def finished(self) -> bool:
-        """Whether the fit has reached an optimum, so that its residuals can be used to judge the model."""
+        """Whether the fit has reached an optimum, so that its residuals show how well the model fits."""
         return self.gain_left < tuning.OUTLYING**2
 
     @property
     def loss(self) -> float:
-        """Twice the negative log likelihood, by which fits to the same measurements are compared."""
+        """Twice the negative log likelihood, for the comparison of fits to the same measurements."""
         variance = self.noise**2 + tuning.JITTER_WEIGHT[1] * self.jitter
         there = np.isfinite(self.point.residual)
         z = np.abs(self.point.residual[there]) / np.sqrt(variance[there])
@@ -199,12 +208,14 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """The rows of the swings for stamps that are `shift` s late.
+    """Assignment of poses to swings, for stamps that are `shift` s late.
 
-    swing, inside, times : (n,) swing of each pose, -1 outside of all swings; (k,) rows in swings, and their times in s
-    inner : (s + 1,) index of the first row of each swing among the rows in swings
-    asked, edges : times of a run, including the ends of linked swings, and index of the first time of each swing
-    ends : places of these ends in `asked`
+    swing : (n,) index of the swing of each pose, -1 outside all swings
+    inside, times : (k,) rows of the poses in swings, and their model times in s
+    inner : (s + 1,) index in `inside` of the first row of each swing
+    asked : times of a simulation in s, which include the ends of linked swings
+    ends : indices in `asked` of the ends of linked swings
+    edges : (s + 1,) index in `asked` of the first time of each swing
     """
 
     shift: float
@@ -218,7 +229,9 @@ class _Rows:
 
 
 def depth_of(turns: Array) -> Array | None:
-    """Return the outward displacement of each pad, shape (8,), in m; None if no wall is turned."""
+    """Return the outward displacement of each pad in m, shape (8,), from the rotations of the walls; None if all are
+    0.
+    """
     if not turns.any():
         return None
     depth = np.zeros(PAIR_COUNT)
@@ -228,11 +241,26 @@ def depth_of(turns: Array) -> Array | None:
 
 
 class Problem:
-    """A window of measurements, the prior and the forward model together.
+    """A least-squares problem: a window of measurements, a prior and a forward model.
 
-    `horizon` is the longest simulated part of a swing in s; `differences`, shape (7,), are in the order of
-    `DIFFERENCES`. `drift`, shape (3,), is the spectral density of an unknown acceleration in m2/s3 and rad2/s3; it
-    links the swings. `harmonics` are those that were added to the measured load.
+    Parameters
+    ----------
+    forward : Forward
+        The forward model.
+    unknowns : Unknowns
+        The scene and the definition of the unknowns.
+    window : Window
+        The measurements.
+    prior : tuple of ndarray, shape (SIZE,), optional
+        Means and standard deviations of the shared unknowns; by default those of `unknowns`.
+    horizon : float
+        Longest simulated part of a swing in s.
+    differences : ndarray, shape (7,), optional
+        Values in the order of `DIFFERENCES`; zero by default.
+    drift : ndarray, shape (3,), optional
+        Spectral density of an unknown acceleration in m2/s3 and rad2/s3, which links the swings.
+    harmonics : Harmonics, optional
+        Harmonics that were added to the measured load.
     """
 
     def __init__(
@@ -246,7 +274,7 @@ class Problem:
         self.drift, self.harmonics = drift, harmonics
         #: factor on the steps of the difference quotients
         self.steps = 1.0
-        #: prior deviation (6,) of the starting states; assumed components say nothing about their true values
+        #: prior deviation of a starting state, shape (6,); it is larger for a component that was never measured
         self.start_spread = tuning.START_SPREAD * np.tile(np.where(window.poses.measured, 1.0, tuning.ASSUMED), 2)
         self.link = np.zeros((0, 6, 6)) if drift is None else link_weights(np.diff(window.starts)[:-1], drift)
         self._memory: Memory | None = None
@@ -256,7 +284,7 @@ class Problem:
         self._at: _Rows | None = None
 
     def with_fine_steps(self) -> Problem:
-        """Return the same problem with accurate derivatives."""
+        """Return a copy of the problem with small steps, and thus accurate derivatives."""
         fine = copy(self)
         fine.steps, fine._columns, fine._waves = _FINE, (None, np.zeros(0)), (None, np.zeros(0))
         return fine
@@ -265,20 +293,20 @@ class Problem:
         self, shared: Array, states: Array, differences: Array | None = None, push: Array | None = None,
         share: Array | None = None, change: Callable[[Scene], Scene] | None = None, load: Load | None = None,
     ) -> Point | None:  # fmt: skip
-        """Run the model; None where it leaves the model's range.
+        """Return the motion for given unknowns; None if the motion leaves the range of the model.
 
         Parameters
         ----------
         shared, states : ndarray, shape (SIZE,), (s, 6)
             The unknowns.
         differences : ndarray, shape (7,), optional
-            Differences to use instead of the problem's.
+            Values that replace the differences of the problem.
         push, share : ndarray, optional
             As in `Forward.run`.
         change : callable, optional
-            Function that returns a changed scene, perhaps with other compiled terms.
+            Function that returns a changed scene, which may need other compiled terms.
         load : Load, optional
-            Load to use instead of the forward model's.
+            Load that replaces the load of the forward model.
         """
         found = self._evaluate(shared, states[None], differences, push, share, change, load)
         return None if found is None else found[0]
@@ -287,7 +315,10 @@ class Problem:
         self, shared: Array, several: Array, differences: Array | None = None, push: Array | None = None,
         share: Array | None = None, change: Callable[[Scene], Scene] | None = None, load: Load | None = None,
     ) -> list[Point] | None:  # fmt: skip
-        """Run the model in one call from `several` sets of starting states, shape (k, s, 6); None as in `evaluate`."""
+        """Return the motions for k sets of starting states `several`, shape (k, s, 6), computed in one call.
+
+        The result is None as in `evaluate`.
+        """
         window, differences = self.window, self.differences if differences is None else differences
         rows = self._rows_at(float(shared[DELAY]) - float(np.sqrt(differences[LAG])))
         scene, forward = self._scene_of(shared), self.forward
@@ -308,7 +339,7 @@ class Problem:
         return [self._point(shared, several[k], rows, q[k], v[k], contact[k], differences) for k in range(count)]
 
     def _rows_at(self, shift: float) -> _Rows:
-        """Return the rows of the swings if the stamps are `shift` s late; cached, as successive vectors share it."""
+        """Return the assignment of poses to swings for stamps that are `shift` s late, cached for successive calls."""
         if self._at is None or self._at.shift != shift:
             window = self.window
             times = window.poses.t - shift
@@ -316,10 +347,10 @@ class Problem:
             swing[swing >= window.swings] = -1
             swing[times - window.starts[np.maximum(swing, 0)] > self.horizon] = -1
             inside = np.flatnonzero(swing >= 0)
-            # times rise, so the rows of a swing are consecutive
+            # the times rise, so the rows of a swing are consecutive
             inner = np.searchsorted(swing[inside], np.arange(window.swings + 1)).astype(np.int64)
             asked, ends, edges = times[inside], np.zeros(0, np.int64), inner
-            if len(self.link):  # each swing but the last is computed up to the start of the next swing
+            if len(self.link):  # each swing except the last is simulated up to the start of the next swing
                 ends = edges[1:-1] + np.arange(len(self.link))
                 asked = np.insert(asked, edges[1:-1], window.starts[1:-1])
                 edges = edges + np.minimum(np.arange(window.swings + 1), len(self.link))
@@ -329,7 +360,9 @@ class Problem:
     def _point(
         self, shared: Array, states: Array, rows: _Rows, q: Array, v: Array, contact: Array, differences: Array
     ) -> Point:
-        """Return a point from the poses and rates of its motion at the asked times, as the sensor measures them."""
+        """Return a point from poses and rates at the times `rows.asked`, with the lever arm and low pass of the
+        sensor.
+        """
         window, lag = self.window, float(np.sqrt(differences[LAG]))
         at_ends = np.hstack((q[rows.ends], v[rows.ends]))
         if len(rows.ends):
@@ -351,9 +384,9 @@ class Problem:
         return Point(shared, states, rows.swing, predicted, residual, rate, contact, defect)
 
     def cost(self, point: Point, variance: Array) -> float:
-        """Return twice the negative logarithm of the posterior: Huber's function of the residuals and the prior.
+        """Return twice the negative logarithm of the posterior, with Huber's function of the residuals.
 
-        A measurement outside of all swings costs 1, the expected cost of a measurement that fits.
+        A measurement outside all swings contributes 1, which is the expected contribution of a measurement.
         """
         z = np.abs(point.residual) / np.sqrt(variance)
         loss = huber_loss(z)
@@ -364,9 +397,9 @@ class Problem:
         return float(np.nansum(loss) + lacking.sum() + shift @ shift + (moved * moved).sum() + linked)
 
     def linearise(self, point: Point) -> Linear:
-        """Return the Jacobians of the prediction and of the ends of the swings."""
+        """Return the Jacobians of the predicted measurements and of the ends of the swings."""
         rows, ends = np.zeros((len(point.residual), 3, SIZE + OWN)), np.zeros((len(point.defect), 6, SIZE + OWN))
-        # the derivatives with respect to states and gains come first, because they need the scene of the point itself
+        # derivatives that need the unchanged scene (states, gains) come first, because only the latest scene is cached
         displaced = self.steps * _DISPLACED
         together = self._evaluate(point.shared, point.states + np.diag(displaced)[:, None])
         for j in range(6):
@@ -383,7 +416,9 @@ class Problem:
         return Linear(rows, ends)
 
     def _scene_of(self, shared: Array) -> Scene:
-        """Return the scene of a vector, cached because many successive vectors have the same scene."""
+        """Return the scene of a vector of shared unknowns, cached because successive vectors often have the same
+        scene.
+        """
         key = shared[OF_SCENE].tobytes()
         if self._scene[0] != key:
             self._scene = key, self.unknowns.scene_of(shared)
@@ -392,7 +427,7 @@ class Problem:
     def by_differences(self, point: Point) -> Array:
         """Return the derivatives of the prediction with respect to the differences, shape (n, 3, 7).
 
-        They are zero if the model cannot be run.
+        A derivative is zero if the motion cannot be simulated.
         """
         if self._columns[0] is not point:
             out = np.zeros((*point.residual.shape, len(DIFFERENCES)))
@@ -407,9 +442,9 @@ class Problem:
         return self._columns[1]
 
     def by_harmonics(self, point: Point, harmonics: Harmonics) -> Array:
-        """Return the derivatives of the prediction with respect to the amplitudes of harmonics, shape (n, 3, 3 k).
+        """Return the derivatives of the prediction with respect to the amplitudes of k harmonics, shape (n, 3, 3 k).
 
-        They are zero if the model cannot be run.
+        A derivative is zero if the motion cannot be simulated.
         """
         if self._waves[0] is not point:
             load, size = harmonics.moved(-harmonics.amplitude).added(self.forward.load), harmonics.amplitude.size
@@ -435,7 +470,8 @@ class Problem:
             change = moved[index] - point.shared[index]
             other = self.evaluate(moved, point.states) if abs(change) > 0.5 * step else None
             if other is not None:
-                # a residual decreases as the prediction increases, so this difference is the change of the prediction
+                # a residual is measured minus predicted, so this difference of residuals is the change of the
+                # prediction
                 return np.nan_to_num((point.residual - other.residual) / change), (point.defect - other.defect) / change
         return np.zeros_like(point.residual), np.zeros_like(point.defect)
 
@@ -450,17 +486,17 @@ class Problem:
 
 
 def _by_state(point: Point, other: Point, index: int, moved: float) -> tuple[Array, Array]:
-    """Return the derivatives of predictions and ends with respect to a component of the starting states.
+    """Return the derivatives of predictions and ends with respect to the component `index` of the starting states.
 
-    In `other` this component is larger by `moved`.
+    In the point `other`, the component is larger by `moved`.
     """
     ends = point.defect - other.defect
-    ends[:, index] += moved  # in `other` the start of the next swing has moved too, which is no change of the end
+    ends[:, index] += moved  # removes the change of the next swing's start, which is also displaced in `other`
     return np.nan_to_num((point.residual - other.residual) / moved), ends / moved
 
 
 def link_weights(spans: Array, drift: Array) -> Array:
-    """Return the inverse covariance of pose and rate after each span of white acceleration noise, shape (s, 6, 6)."""
+    """Return the inverse covariance, shape (s, 6, 6), of pose and rate after s spans of white acceleration noise."""
     drift = np.maximum(drift, _LEAST_DRIFT)
     weights = np.zeros((len(spans), 6, 6))
     place = np.arange(3)
@@ -473,10 +509,22 @@ def link_weights(spans: Array, drift: Array) -> Array:
 def fit(
     problem: Problem, shared: Array, states: Array, noise: Array, iterations: int, enough: float = 0.3, seed: int = 0
 ) -> Fit | None:
-    """Fit from a starting point; None where the model cannot be run there.
+    """Return the fit that begins at given unknowns; None if the motion cannot be simulated there.
 
-    `noise`, shape (3,), is the first guess of the noise. The first step that reduces the cost by less than `enough` is
-    the last. `seed` is the seed of the displacements that probe predictability.
+    Parameters
+    ----------
+    problem : Problem
+        The least-squares problem.
+    shared, states : ndarray, shape (SIZE,), (s, 6)
+        Starting values of the unknowns.
+    noise : ndarray, shape (3,)
+        First guess of the standard deviation of the measurements.
+    iterations : int
+        Largest number of iterations.
+    enough : float
+        Reduction of the cost below which the fit ends as converged.
+    seed : int
+        Seed of the random displacements that probe the predictability of the motion.
     """
     point = problem.evaluate(problem.unknowns.within(shared), states)
     if point is None:
@@ -512,11 +560,13 @@ def fit(
 
 
 def pieces(problem: Problem, point: Point, linear: Linear, variance: Array) -> Iterator[list[Piece]]:
-    """Yield for each swing the terms of the normal equations from its measurements and its link to the next."""
+    """Yield for each swing the parts of the normal equations from its measurements and from its link to the next
+    swing.
+    """
     z = np.abs(point.residual) / np.sqrt(variance)
     weight = np.nan_to_num(huber_weight(z) / variance) * np.isfinite(point.residual)
     weighted, residual = linear.rows * weight[:, :, None], np.nan_to_num(point.residual)
-    # times rise, so the rows of a swing are consecutive
+    # the times rise, so the rows of a swing are consecutive
     used = np.flatnonzero(point.swing >= 0)
     edges = np.searchsorted(point.swing[used], np.arange(problem.window.swings + 1))
     for index, (low, high) in enumerate(pairwise(edges.tolist())):
@@ -530,7 +580,7 @@ def pieces(problem: Problem, point: Point, linear: Linear, variance: Array) -> I
 
 
 def normal_equations(problem: Problem, point: Point, linear: Linear, variance: Array) -> tuple[Arrow, Array]:
-    """Return the matrix and the right-hand side of the normal equations, prior included."""
+    """Return the matrix and the right-hand side of the normal equations, including the prior."""
     swings = problem.window.swings
     normal, gradient = Arrow.empty(SIZE, swings), np.zeros(SIZE + OWN * swings)
     for piece in chain.from_iterable(pieces(problem, point, linear, variance)):
@@ -546,12 +596,12 @@ def normal_equations(problem: Problem, point: Point, linear: Linear, variance: A
 
 
 def freed(swings: int, unknowns: int) -> float:
-    """Return the factor by which fitting reduces the scatter of few swings, at most `tuning.MOST_FREED`."""
+    """Return the correction for the scatter that is lost by fitting `unknowns` to few swings, at most `MOST_FREED`."""
     return swings / max(swings - unknowns, swings / tuning.MOST_FREED)
 
 
 def joint_step(problem: Problem, found: Fit, columns: Array, precision: Array, pull: Array) -> tuple[Array, Array]:
-    """Return the step of `whole_step` without the starting states, and its covariance."""
+    """Return the first two results of `whole_step`: the step and its covariance."""
     step, covariance, _ = whole_step(problem, found, columns, precision, pull)
     return step, covariance
 
@@ -559,11 +609,21 @@ def joint_step(problem: Problem, found: Fit, columns: Array, precision: Array, p
 def whole_step(
     problem: Problem, found: Fit, columns: Array, precision: Array, pull: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the linearised step of the shared and the further unknowns together, its covariance, and the states' step.
+    """Return the linearised step of shared and further unknowns, its covariance, and the step of the starting states.
 
-    `columns`, shape (n, 3, k), are the derivatives of the prediction with respect to the further unknowns. `precision`
-    and `pull`, shape (k,), are the prior's terms in their normal equations. The starting state of each swing is
-    eliminated; its step, shape (s, 6), is 0 in swings with few poses.
+    Parameters
+    ----------
+    problem, found : Problem, Fit
+        The fit at which the problem is linearised.
+    columns : ndarray, shape (n, 3, k)
+        Derivatives of the prediction with respect to the k further unknowns.
+    precision, pull : ndarray, shape (k,)
+        Terms of the prior of the further unknowns in the matrix and in the right-hand side of the normal equations.
+
+    Returns
+    -------
+    tuple of ndarray, shapes (SIZE + k,), (SIZE + k, SIZE + k), (s, 6)
+        The starting states are eliminated from the equations. Their step is 0 in swings with few poses.
     """
     size = SIZE + len(precision)
     normal = np.diag(np.concatenate([1.0 / problem.deviation**2, precision]))
@@ -595,7 +655,10 @@ def whole_step(
 def _descend(
     problem: Problem, point: Point, variance: Array, normal: Arrow, gradient: Array, damping: float
 ) -> tuple[Point | None, float]:
-    """Return the next point, or None if no step reduces the cost, and the damping for the next step."""
+    """Return the point after a Levenberg-Marquardt step, and the damping for the next step.
+
+    The point is None if no step reduces the cost.
+    """
     scale = normal.diagonal()
     deviations = np.concatenate([problem.deviation, np.tile(problem.start_spread, problem.window.swings)])
     for _ in range(6):
@@ -613,10 +676,11 @@ def _descend(
 
 
 def unpredicted(problem: Problem, point: Point, jacobian: Array, seed: int, probes: int = 3) -> Array:
-    """Return the variance of the motion about its linearisation under small displacements, shape (n, 3).
+    """Return the variance of the motion that the linearisation does not predict, shape (n, 3).
 
-    Points with random displacements are run and compared with the prediction of the Jacobian. A smooth motion differs
-    little. After the last bounces of a hard contact the difference is as large as the motion.
+    Motions with small random displacements of the unknowns are simulated and compared with the prediction of the
+    Jacobian. The difference is small for a smooth motion. After several bounces at a hard contact, it is as large as
+    the motion.
     """
     rng = np.random.default_rng(seed)
     total, count = np.zeros_like(point.residual), np.zeros_like(point.residual)
@@ -638,7 +702,7 @@ def unpredicted(problem: Problem, point: Point, jacobian: Array, seed: int, prob
 
 
 def _spread(variance: Array, reach: int = 2) -> Array:
-    """Return running means of the variance, because a few probes give it only roughly."""
+    """Return running means of a variance, to reduce its scatter."""
     padded = np.pad(variance, ((reach, reach), (0, 0)), mode="edge")
     total = np.zeros_like(variance)
     for shift in range(2 * reach + 1):
@@ -647,7 +711,7 @@ def _spread(variance: Array, reach: int = 2) -> Array:
 
 
 def noise_of(residual: Array, before: Array, jitter: Array) -> Array:
-    """Return the standard deviation of each component's residuals from their median, shape (3,)."""
+    """Return the standard deviation of each component, shape (3,), from the median of the absolute residuals."""
     out = before.copy()
     for i, column in enumerate(residual.T):
         there = np.isfinite(column)
