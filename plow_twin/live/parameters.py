@@ -265,16 +265,16 @@ class Settings:
     )
     limit_force: float = _limit("N", "force component; 0: ten times the scene's loads and weight")
     limit_moment: float = _limit("N m", "moment; 0: derived from the scene's loads and weight")
-    limit_force_rate: float = _limit("N/s", "rate of a force; 0: limit_force in a millisecond")
-    limit_moment_rate: float = _limit("N m/s", "rate of the moment; 0: limit_moment in a millisecond")
+    limit_force_rate: float = _limit("N/s", "rate of change of a force; 0: a change by limit_force within 1 ms")
+    limit_moment_rate: float = _limit("N m/s", "rate of change of the moment; 0: a change by limit_moment within 1 ms")
     limit_travel: float = _limit("m/s", "speed along the face", 10.0, 1000.0)
-    limit_travel_rate: float = _limit("m/s^2", "rate of this speed; 0: limit_travel in a millisecond")
+    limit_travel_rate: float = _limit("m/s^2", "acceleration along the face; 0: a change by limit_travel within 1 ms")
     limit_pose: float = _limit(
         "m", "measured displacement; 0: half the larger side of the frame or clearance", high=1000.0
     )
-    limit_pose_rate: float = _limit("m/s", "rate of a displacement; 0: limit_pose in a millisecond")
+    limit_pose_rate: float = _limit("m/s", "rate of change of a displacement; 0: a change by limit_pose within 1 ms")
     limit_gap: float = _limit("m", "measured gap; 0: as limit_pose", high=1000.0)
-    limit_gap_rate: float = _limit("m/s", "rate of a gap; 0: limit_gap in a millisecond")
+    limit_gap_rate: float = _limit("m/s", "rate of change of a gap; 0: a change by limit_gap within 1 ms")
     set_wear: tuple[float, ...] = _number(
         (0.0,) * 8,
         "m",
