@@ -1,4 +1,4 @@
-"""Methods that lay out a step: free flight, rest, implicit steps, Taylor series.
+"""Methods that compute a step: free flight, rest, implicit steps and Taylor series.
 
-Each method is a module that keeps the contract in `method.protocol`; the other modules help one or more methods.
+Each method is a module with the functions of `method.protocol`. The other modules contain helpers of these methods.
 """

@@ -1,4 +1,4 @@
-"""The equilibrium of a head that is held by its contacts: modes of its pairs, stiffness, and distance to it."""
+"""Equilibrium of a head that is held by its contacts: conditions on the pairs, stiffness, and distance."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from plow_twin.solve.state import OFF, ON
 
 @kernel()
 def held(p, state, y, least) -> bool:
-    """Return whether every pair is ON or OFF and its penetration or gap is larger than `least`."""
+    """Return whether every pair is ON or OFF with a penetration or gap larger than `least`."""
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
             penetration = penetration_of(p, state, pair, y)
@@ -25,11 +25,10 @@ def held(p, state, y, least) -> bool:
 
 @kernel()
 def stiffness_at(p, acts, state, w, gyration) -> None:
-    """Write the accelerations at the state `w.rest[0]` to `w.rest[1]`, and the stiffness to `w.hessian`.
+    """Write the accelerations at the state `w.rest[0]` to `w.rest[1]`, and the stiffness, shape (3, 3), to `w.hessian`.
 
-    The stiffness is minus the derivatives of these accelerations with respect to place.
-
-    The matrix has shape (3, 3). The angle is multiplied by the radius of gyration, which makes the matrix symmetric.
+    The stiffness is minus the derivative of these accelerations with respect to the coordinates. The third coordinate
+    is the angle times the radius of gyration, which makes the matrix symmetric.
     """
     z, rate, moved, t = w.rest[0], w.rest[1], w.rest[2], state.step_start
     accelerate(p, acts, True, state, t, z, w.rest[3, :3], rate)
@@ -49,11 +48,11 @@ def stiffness_at(p, acts, state, w, gyration) -> None:
 
 @kernel()
 def stiffer_than(h, least) -> bool:
-    """Return whether the eigenvalues of the symmetric matrix h exceed `least`, by signs of leading minors."""
+    """Return whether all eigenvalues of the symmetric matrix h exceed `least`, by the signs of leading minors."""
     a, b, c = h[0, 0] - least, h[1, 1] - least, h[2, 2] - least
     if not a > 0.0:
         return False
-    # Cholesky decomposition without roots; a locked degree of freedom is infinitely stiff
+    # Cholesky decomposition without square roots; a locked degree of freedom is infinitely stiff
     b -= h[1, 0] * h[0, 1] / a
     if not b > 0.0:
         return False
@@ -64,7 +63,7 @@ def stiffer_than(h, least) -> bool:
 
 @kernel()
 def to_equilibrium(h, rate, z, gyration) -> float:
-    """Move z by one Newton step x to the point where the accelerations vanish; return x h x, twice the energy."""
+    """Move z by one Newton step x towards the point without acceleration. Return x h x, which is twice the energy."""
     a, b, c = rate[3], rate[4], rate[5] * gyration
     low10, low20 = h[1, 0] / h[0, 0], h[2, 0] / h[0, 0]
     d1 = h[1, 1] - low10 * h[0, 1]

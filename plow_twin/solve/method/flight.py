@@ -1,8 +1,8 @@
-"""Free flight in closed form: a step can have any size as long as the head cannot reach a wall.
+"""Free flight in closed form. A step can have any size, as long as the head cannot reach a wall.
 
-If no pair touches, the place of the centre of mass and the angle are double integrals of the load, which are elementary
-functions for constants, linear pieces and harmonics. An upper bound of the distance that the head can move within a
-time limits the step (conservative advancement). Near a wall steps are Taylor series, which locate the touch.
+Without contact, position and angle of the head are double integrals of the load. These integrals are elementary
+functions for constant, piecewise linear and harmonic loads. An upper bound of the distance that the head moves within a
+time limits the step (conservative advancement). Near a wall, Taylor series are used, with event detection.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.kinematics import penetration_of, to_body, to_world
 
-#: A flight must cover at least this phase [rad] of the fastest harmonic; a step of a series covers about 2 rad.
+#: Smallest phase [rad] of the fastest harmonic load in a flight. A step of a Taylor series covers about 2 rad.
 _LEAST_PHASE = 8.0
-#: Largest distance that the head may move in a flight, as a share of the smallest gap.
+#: Largest distance that the head may move in a flight, divided by the smallest gap.
 _SAFE = 0.9
 
 
 @kernel(inline="code")
 def amplitudes(p, one, j):
-    """Return the sine and cosine amplitudes of a harmonic's acceleration along x, y or theta (j = 0, 1, 2)."""
+    """Return the sine and cosine amplitudes of a harmonic load's acceleration along x, y or theta (j = 0, 1, 2)."""
     if j == 2:
         return one.moment[0], one.moment[1]
     sine = p.direction[0, j] * one.first[0] + p.direction[1, j] * one.second[0]
@@ -32,7 +32,7 @@ def amplitudes(p, one, j):
 
 @kernel()
 def _smallest_gap(p, state) -> float:
-    """Return the smallest gap in m of any pair: the distance from touching."""
+    """Return the smallest gap of all pairs in m."""
     y, nearest = state.y, np.inf
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
@@ -45,8 +45,8 @@ def _smallest_gap(p, state) -> float:
 def _bounds(p, harmonics, t, z, w) -> None:
     """Write upper bounds of the motion along x, y and theta to `w.flight[1:]`, shape (4, 3).
 
-    The rows are the present speed, the speed without the harmonics' swing, the harmonics' largest acceleration, and the
-    amplitude of their swing.
+    The rows are the current speed, the speed without the oscillation due to the harmonic loads, the largest
+    acceleration by the harmonic loads, and the amplitude of the oscillation.
     """
     for j in range(3):
         drift, push, swing = z[3 + j], 0.0, 0.0
@@ -75,13 +75,13 @@ def _reach(p, w, time, leverage) -> float:
 
 @kernel(inline="source")
 def own(parts):
-    """Return 1 if flights of the scene have a closed form, otherwise None."""
+    """Return 1 if flights of the scene have a closed form, and None otherwise."""
     return parts.terms.flight
 
 
 @kernel(inline="source")
 def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
-    """Lay out a step of free flight if it is longer than a step of a series."""
+    """Compute a step of free flight, if it is longer than a step of a Taylor series."""
     return _lay_out(p, parts.harmonics, own, state, w, span, penetrating)
 
 
@@ -98,7 +98,7 @@ def _lay_out(p, harmonics, flight, state, w, span, penetrating) -> bool:
 
 @kernel()
 def safe_time(p, harmonics, state, w, span) -> float:
-    """Return a time of at most `span` within which no wall can be reached, or 0 if a series can step as far."""
+    """Return a time, at most `span`, within which the head cannot reach a wall, or 0 if a series can step as far."""
     least = _LEAST_PHASE / p.fastest
     if span < least:
         return 0.0
@@ -106,8 +106,7 @@ def safe_time(p, harmonics, state, w, span) -> float:
     z = w.flight[0]
     to_world(p, state.y, z)
     _bounds(p, harmonics, state.step_start, z, w)
-    # the walls turn with the head about its centre of mass, so the distance of this centre from the origin adds to the
-    # leverage
+    # the walls rotate about the head's centre of mass, so the distance of this centre from the origin is added
     leverage = p.leverage + math.hypot(z[0], z[1]) + max(gap, 0.0)
     time = span
     while time >= least:
@@ -119,7 +118,7 @@ def safe_time(p, harmonics, state, w, span) -> float:
 
 @kernel()
 def fly(p, harmonics, flight, state, w, time, y) -> None:
-    """Write the body coordinates `time` after the start of a flight to y."""
+    """Write the body coordinates at `time` after the start of a flight to y."""
     if flight is not None:
         start, z = w.flight[0], w.flight[5]
         for j in range(3):
@@ -133,7 +132,7 @@ def fly(p, harmonics, flight, state, w, time, y) -> None:
 
 @kernel()
 def _swing(p, harmonics, j, t, time):
-    """Return rate and distance that the harmonics add along x, y or theta from t to t + `time`."""
+    """Return the rate and the distance that the harmonic loads add along x, y or theta from t to t + `time`."""
     rate = way = 0.0
     for i in range(harmonics.size):
         one = harmonics[i]

@@ -1,9 +1,9 @@
-"""Implicit steps for overdamped contact: collocation at Radau points with the contact modes frozen.
+"""Implicit steps for overdamped contact: collocation at Radau points with fixed contact modes.
 
-If damping stops a pair long before its spring moves it, stability limits the steps of an explicit series to a few decay
-times, however smooth the motion is. Radau IIA collocation (Hairer and Wanner, Solving ODEs II, sec. IV.5) is stable for
-longer steps. Its solution is a polynomial in time too, and is written as a series, so that events, output and totals
-are computed as for an explicit step.
+In overdamped contact, the damper stops a pair much faster than the spring moves it. Stability then limits the steps of
+an explicit series to a few decay times, even if the motion is smooth. Radau IIA collocation (Hairer and Wanner, Solving
+ODEs II, sec. IV.5) is stable for longer steps. Its solution is a polynomial in time. The polynomial is written as a
+series, so that events, outputs and totals are computed as for an explicit step.
 """
 
 from __future__ import annotations
@@ -48,28 +48,28 @@ from plow_twin.solve.support import (
     to_world_both,
 )
 
-#: Number s of stages, the degree of the polynomials; the method's order is 2 s - 1.
+#: Number s of stages, which is the degree of the polynomials. The order of the method is 2 s - 1.
 STAGES = 9
-#: A contact is overdamped if the decay rate of its dampers is more than this many times the angular frequency of its
-#: springs. The same ratio decides, when the scene is compiled, whether the scene can need implicit steps.
+#: Ratio of the decay rate of a contact's dampers to the angular frequency of its springs, above which the contact is
+#: overdamped. The same ratio determines at compilation whether a scene may need implicit steps.
 OVERDAMPED_RATIO = 20.0
-#: Cost of an implicit step, as a number of explicit steps; an implicit step must be longer than this number of stable
-#: explicit steps.
+#: Cost of an implicit step, divided by the cost of an explicit step. An implicit step must be longer than this number
+#: of stable explicit steps.
 _WORTH = 30.0
-#: An implicit step may have this many times the error of an explicit step, because it replaces many explicit steps.
+#: Admissible error of an implicit step, divided by that of an explicit step, because it replaces many explicit steps.
 _GAIN = 100.0
-#: Rounding error of a velocity, as a share of the largest velocity; smaller errors are always admissible.
+#: Rounding error of a velocity, divided by the largest velocity. Smaller errors are always admissible.
 _NOISE = 1e-12
-#: Rounding error of a guard of the corners' grip, as a share of its largest term.
+#: Rounding error of a guard function of stick and slip, divided by its largest term.
 _GUARD_NOISE = 1e-6
-#: Number of failed attempts at an implicit step up to which each attempt doubles the wait for the next attempt.
+#: Number of failed attempts at an implicit step, up to which each failure doubles the time until the next attempt.
 _MOST_REFUSED = 12
 
 
 def _coefficients(nodes: NDArray[np.longdouble]) -> NDArray[np.longdouble]:
-    """Return the matrix that gives a polynomial's coefficients from its values at the nodes, shape (n, n).
+    """Return the matrix that converts the values of a polynomial at the nodes to its coefficients, shape (n, n).
 
-    It is the inverse of a Vandermonde matrix, computed in extended precision because the inversion loses half of the
+    It is the inverse of a Vandermonde matrix. Extended precision is used because the inversion loses half of the
     digits.
     """
     n = len(nodes)
@@ -89,7 +89,7 @@ def _coefficients(nodes: NDArray[np.longdouble]) -> NDArray[np.longdouble]:
 @cache
 def _rule() -> tuple[NDArray[np.float64], ...]:
     """Return the nodes, the weights, and the matrices `from_values` and `from_stages` of `_implicit_type`."""
-    # imported here, because the import is slow and only stiff scenes need it
+    # the import is slow, and only stiff scenes need it
     from scipy.special import roots_jacobi
 
     inner = 0.5 * (roots_jacobi(STAGES - 1, 1.0, 0.0)[0] + 1.0)
@@ -103,25 +103,25 @@ def _rule() -> tuple[NDArray[np.float64], ...]:
 
 @cache
 def _implicit_type(size: int) -> np.dtype[np.void]:
-    """Return the record type of an implicit step (nodes, weights, scratch space) with `size` degrees of freedom."""
+    """Return the record type of an implicit step (nodes, weights, scratch space) for `size` degrees of freedom."""
     shape = (STAGES + 1, STATE_SIZE)
     return np.dtype(
         [
             ("nodes", "f8", (STAGES,)),
             ("weights", "f8", (STAGES, STAGES)),
-            ("from_values", "f8", (STAGES + 1, STAGES + 1)),  # coefficients from values at the start and at the nodes
-            ("from_stages", "f8", (STAGES, STAGES)),  # coefficients from values at the nodes alone
+            ("from_values", "f8", (STAGES + 1, STAGES + 1)),  # values at the start and at the nodes to coefficients
+            ("from_stages", "f8", (STAGES, STAGES)),  # values at the nodes to coefficients
             ("z", "f8", (STAGES + 1, 2 * size)),  # state at the start and at the nodes
-            ("rate", "f8", (2, 2 * size)),  # rates at a state and at a displaced state, for a difference quotient
+            ("rate", "f8", (2, 2 * size)),  # rates at a state and at a displaced state, for finite differences
             ("accelerations", "f8", (STAGES, size)),
-            # derivatives of the accelerations with respect to place and to velocity
+            # derivatives of the accelerations with respect to position and with respect to velocity
             ("jacobians", "f8", (STAGES, 2, size, size)),
             ("matrix", "f8", (size * STAGES, size * STAGES)),
             ("residual", "f8", (size * STAGES,)),
             ("body", "f8", shape),  # body coordinates
             ("seen", "f8", shape),  # body coordinates relative to a frame on springs
-            ("frame", "f8", shape),  # this frame's state, in the lanes of `w.frame`
-            # at the nodes: force, force that the law gives (also for CLIPPED pairs), rate of penetration
+            ("frame", "f8", shape),  # state of this frame, in the order of `w.frame`
+            # values at the nodes: acting force, force by the law (also for CLIPPED pairs), rate of penetration
             ("pairs", "f8", (3, STAGES, PAIR_COUNT)),
             ("wearing", "f8", (STAGES, PAIR_COUNT)),  # rate of wear at the nodes
             ("wear_depth", "f8", shape),  # wear depth at the start and at the nodes
@@ -131,7 +131,7 @@ def _implicit_type(size: int) -> np.dtype[np.void]:
 
 
 def new_implicit(support: bool) -> Implicit:
-    """Return nodes, weights and scratch space of implicit steps; `support` if the frame is on springs."""
+    """Return nodes, weights and scratch space of implicit steps. `support` is true if the frame is on springs."""
     implicit = new_record(_implicit_type(6 if support else 3))
     for name, table in zip(("nodes", "weights", "from_values", "from_stages"), _rule(), strict=True):
         implicit[name] = table
@@ -140,9 +140,9 @@ def new_implicit(support: bool) -> Implicit:
 
 @kernel()
 def decay_rate(p, state, slip, stick, support) -> float:
-    """Return the sum of the rates in 1/s at which the pairs' dampers stop the head, or 0 if no contact is overdamped.
+    """Return the sum of the decay rates in 1/s due to all dampers, or 0 if the motion is not overdamped.
 
-    Regularised friction acts as a damper too, with its slope at the present slip; so does the damper of a sticking
+    The dampers include regularised friction, with its slope at the current slip rate, and the damper of a sticking
     corner.
     """
     y, decay, spring = state.y, 0.0, 0.0
@@ -180,21 +180,21 @@ def decay_rate(p, state, slip, stick, support) -> float:
 
 @kernel(inline="source")
 def _admissible(p):
-    """Return the admissible error of an implicit step's velocity in m/s."""
+    """Return the admissible error of the velocity in an implicit step in m/s."""
     return max(_GAIN * p.threshold[p.order], _NOISE * p.threshold[0])
 
 
 @kernel(inline="source")
 def stable_decay(order):
-    """Return the number of decay times over which a series of this order is stable, with a margin."""
+    """Return the number of decay times over which a series of this order is stable, with a safety margin."""
     return 0.3 * order
 
 
 @kernel(inline="source")
 def has_decayed(p, state) -> bool:
-    """Return whether enough decay times have passed since a contact changed for fast motion to vanish.
+    """Return whether fast motion has decayed since the last change of contact.
 
-    Each failed attempt of an implicit step doubles the wait.
+    Each failed attempt at an implicit step doubles the number of decay times that is required.
     """
     wait = 5.0 - math.log(p.velocity_tolerance / p.threshold[0])
     return bool(state.decay_times >= wait * 2.0**state.refused)
@@ -202,7 +202,7 @@ def has_decayed(p, state) -> bool:
 
 @kernel(inline="source")
 def note_decay(state, decay, step_size) -> None:
-    """Add a step to the count of decay times, or reset the count if nothing is overdamped."""
+    """Add a step to the number of decay times, or reset the number if the motion is not overdamped."""
     if decay > 0.0:
         state.decay_times += decay * step_size
     else:
@@ -211,14 +211,14 @@ def note_decay(state, decay, step_size) -> None:
 
 @kernel()
 def _jacobian(p, acts, state, t, z, implicit, base, out) -> None:
-    """Write the accelerations at z to `base` (n,).
+    """Write the accelerations at z to `base`, shape (n,), and their derivatives to `out`, shape (2, n, n).
 
-    Their derivatives with respect to place and velocity are written to `out` (2, n, n).
+    The derivatives are taken with respect to position and with respect to velocity.
     """
     rate, moved, n = implicit.rate[0], implicit.rate[1], base.size
     accelerate(p, acts, True, state, t, z, implicit.load, rate)
     for j in range(2 * n):
-        # the law is nearly linear over this difference, which is large compared with rounding
+        # over this difference the law is nearly linear, and rounding is negligible
         delta = 1e-8 / (p.radius if j % 3 == 2 else 1.0)
         saved = z[j]
         z[j] = saved + delta
@@ -232,7 +232,7 @@ def _jacobian(p, acts, state, t, z, implicit, base, out) -> None:
 
 @kernel()
 def _newton_matrix(implicit, h) -> None:
-    """Write the residual's derivatives by the nodes' velocities v; places are x_i = x_0 + h sum a_ij v_j."""
+    """Write the derivatives of the residual by the node velocities v. Positions are x_i = x_0 + h sum a_ij v_j."""
     a, jacobians, matrix, s = implicit.weights, implicit.jacobians, implicit.matrix, implicit.nodes.size
     n = implicit.accelerations.shape[1]
     for i in range(s):
@@ -248,7 +248,7 @@ def _newton_matrix(implicit, h) -> None:
 
 @kernel()
 def _eliminate(matrix, right) -> bool:
-    """Solve matrix x = right in place by Gaussian elimination; return False if the matrix is singular."""
+    """Solve matrix x = right in place by Gaussian elimination. Return False if the matrix is singular."""
     n = right.size
     for j in range(n):
         pivot = j
@@ -276,7 +276,7 @@ def _eliminate(matrix, right) -> bool:
 
 @kernel()
 def _places(implicit, h) -> None:
-    """Compute the places at the nodes from the velocities at the nodes."""
+    """Compute the positions at the nodes from the velocities at the nodes."""
     z, a, s, n = implicit.z, implicit.weights, implicit.nodes.size, implicit.accelerations.shape[1]
     for i in range(s):
         for c in range(n):
@@ -288,7 +288,7 @@ def _places(implicit, h) -> None:
 
 @kernel()
 def _bodies(p, support, state, implicit, i) -> None:
-    """Write the body coordinates at the start (i = 0) or at a node, also relative to a frame on springs."""
+    """Write the body coordinates at the start (i = 0) or at a node, and those relative to a frame on springs."""
     z, y = implicit.z[i], implicit.body[i]
     if support is not None:
         seen, frame = implicit.seen[i], implicit.frame[i]
@@ -303,7 +303,7 @@ def _bodies(p, support, state, implicit, i) -> None:
 
 @kernel()
 def _seen(support, implicit):
-    """Return the body coordinates relative to the frame at start and nodes; penetrations depend on them."""
+    """Return the body coordinates relative to the frame at the start and at the nodes, for penetrations."""
     if support is not None:
         return implicit.seen
     return implicit.body
@@ -311,7 +311,7 @@ def _seen(support, implicit):
 
 @kernel()
 def _measure(p, support, state, implicit) -> None:
-    """Write each pair's force, force by its law (which may pull) and rate of penetration at the nodes."""
+    """Write the acting force, the force by the law, and the penetration rate of each pair at the nodes."""
     pairs, seen = implicit.pairs, _seen(support, implicit)
     for i in range(implicit.nodes.size):
         _bodies(p, support, state, implicit, i + 1)
@@ -328,7 +328,7 @@ def _measure(p, support, state, implicit) -> None:
 
 @kernel()
 def _wear_at_nodes(p, support, state, h, implicit, sliding, running_in) -> float:
-    """Compute the rate and depth of each pad's wear at the nodes; return the largest change of a depth in m."""
+    """Compute the wear rate and wear depth of each pad at the nodes. Return the largest change of a depth in m."""
     worn, rates, a, s, change = implicit.wear_depth, implicit.wearing, implicit.weights, implicit.nodes.size, 0.0
     seen = _seen(support, implicit)
     _measure(p, support, state, implicit)
@@ -348,11 +348,11 @@ def _wear_at_nodes(p, support, state, h, implicit, sliding, running_in) -> float
 
 @kernel()
 def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -> bool:
-    """Find the velocities at the nodes by Newton's method; return whether it converged.
+    """Compute the velocities at the nodes by Newton's method. Return whether it has converged.
 
-    The derivatives are computed at every node, since the damped direction turns with the head. The iteration goes on
-    down to rounding errors, since a strong damper turns a small error of a velocity into a large error of its force.
-    Wear is slow and is taken from the previous iterate.
+    The derivatives are computed at every node, because the damped direction rotates with the head. The iteration
+    continues until only rounding errors remain, because a strong damper converts a small error of a velocity to a large
+    error of its force. Wear is slow, so the wear depths of the previous iterate are used.
     """
     z, s, a, residual = implicit.z, implicit.nodes.size, implicit.weights, implicit.residual
     n = implicit.accelerations.shape[1]
@@ -392,8 +392,7 @@ def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -
                 * p.velocity_tolerance
                 / p.position_tolerance
             )
-        # convergence is quadratic, so the iteration ends with the first iterate whose change is not much smaller than
-        # the change before
+        # convergence is quadratic, so the iteration ends when a change is not much smaller than the previous change
         if change < 1e-14 * p.threshold[0] or (change < 0.1 * p.velocity_tolerance and change > 0.1 * before):
             _places(implicit, h)
             return True
@@ -405,8 +404,8 @@ def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -
 def _interpolate(values, coefficients, h, out) -> None:
     """Write the series of eight polynomials, given by their values at the nodes of a step of size h.
 
-    The differences from the last value are interpolated. Otherwise the large coefficients would have to cancel the part
-    that is common to all values, which leaves rounding errors.
+    The differences from the last value are interpolated. Otherwise the large coefficients would have to cancel the
+    constant part of all values, which would leave rounding errors.
     """
     scale, n = 1.0, len(coefficients)
     last = row(values, n - 1)
@@ -421,7 +420,7 @@ def _interpolate(values, coefficients, h, out) -> None:
 
 @kernel()
 def _series_seen(support, h, w, implicit):
-    """Return the series of the body coordinates relative to the frame; write the series of a frame on springs."""
+    """Return the series of the body coordinates relative to the frame, and write the series of a frame on springs."""
     if support is not None:
         frame, s, seen = implicit.frame, implicit.nodes.size, w.seen
         _interpolate(implicit.seen, implicit.from_values, h, seen)
@@ -437,7 +436,7 @@ def _series_seen(support, h, w, implicit):
 
 @kernel()
 def _frame_terms(p, support, w, implicit, scale):
-    """Return, for the frame, the velocity that the series leave out at the start, and the last term's size."""
+    """Return the frame's initial velocity that the series omit, and the size of the last term of its series."""
     off = size = 0.0
     if support is not None:
         s = implicit.nodes.size
@@ -451,11 +450,11 @@ def _frame_terms(p, support, w, implicit, scale):
 
 @kernel()
 def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float:
-    """Write the collocation polynomials of state, penetration, rate and force as series; return the last terms' size.
+    """Write the series of state, penetration, rate and force from the collocation polynomials. Return the error.
 
-    The polynomials of velocities and forces pass through the values at the nodes alone: a velocity at the start that a
-    damper stops at once would bend them between the nodes. If this velocity is too large to leave out, the returned
-    size is infinite.
+    The error is the size of the last terms. The polynomials of velocities and forces use only the values at the nodes,
+    because an initial velocity that a damper stops at once would distort them. If this velocity is too large to omit,
+    the error is infinite.
     """
     s, body, pairs, scratch = implicit.nodes.size, implicit.body, implicit.pairs, w.left
     _bodies(p, support, state, implicit, 0)
@@ -518,9 +517,10 @@ def _write_grip(p, state, h, w, implicit, seen, series) -> None:
 
 @kernel()
 def _last_of_guards(p, state, w, h) -> float:
-    """Return the largest ratio of the last term to the largest term in a guard of a corner's grip.
+    """Return the largest ratio of the last term to the largest term in any guard function of stick and slip.
 
-    The term is compared with terms of its own guard, since even a small force decides whether a corner slips.
+    The last term is compared with terms of its own guard function, because even a small force can determine whether a
+    corner slips.
     """
     guard, share = w.column[0], 0.0
     for pair in range(PAIR_COUNT):
@@ -539,10 +539,10 @@ def _last_of_guards(p, state, w, h) -> float:
 
 @kernel()
 def _write_ramp(p, h, w, implicit) -> float:
-    """Write the law's force as K times an elastic part plus C times a remainder, and return the last term's size.
+    """Write the force of a ramped law as K times an elastic part plus C times a remainder. Return the last term's size.
 
-    The elastic part is d for the exponent 1, otherwise 0. The size is a velocity per h^(STAGES - 1). The series of a
-    CLIPPED pair does not act on the head, but gives the time at which the pair pushes again.
+    The elastic part is d for the exponent 1, and 0 otherwise. The size is a velocity per h^(STAGES - 1). The force of a
+    CLIPPED pair does not act on the head, but determines the time at which the pair pushes again.
     """
     s, largest = implicit.nodes.size, 0.0
     _interpolate(implicit.pairs[1], implicit.from_stages, h, w.damped)
@@ -561,7 +561,7 @@ def _write_ramp(p, h, w, implicit) -> float:
 
 @kernel(inline="source")
 def own(parts):
-    """Return nodes and scratch space of implicit steps, and the terms for which they are compiled."""
+    """Return nodes and scratch space of implicit steps, and the terms for which the method is compiled."""
     terms = parts.terms
     rubbing = terms.wear, terms.sliding, terms.running_in
     return parts.implicit, terms.ramp, rubbing, terms.slip, terms.stick, terms.support
@@ -569,7 +569,7 @@ def own(parts):
 
 @kernel(inline="source")
 def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
-    """Lay out an implicit step if damping limits explicit steps; `w.decay[0]` gets the decay rate."""
+    """Compute an implicit step if damping limits explicit steps. The decay rate is written to `w.decay[0]`."""
     return _lay_out(p, parts, *own, state, w, span, penetrating)
 
 
@@ -579,7 +579,7 @@ def _lay_out(p, parts, implicit, ramp, rubbing, slip, stick, support, state, w, 
         return False
     state.implicit_size_before, state.decay_times_before = state.implicit_size, state.decay_times
     state.refused_before = state.refused
-    # the dampers of a support act without contact too
+    # the dampers of a support act without contact, too
     damped = penetrating or support is not None
     w.decay[0] = decay_rate(p, state, slip, stick, support) if damped else 0.0
     if w.decay[0] <= 0.0 or state.touching != 0 or not has_decayed(p, state):
@@ -600,18 +600,18 @@ def at_most_stable(p, implicit, state, w, sigma):
 
 @kernel()
 def note_step(implicit, state, w, step_size, has_event) -> None:
-    """Record for the next implicit step: the decay times in the step laid out, and a limit of the size."""
+    """Store data for the next implicit step: the decay times of the current step, and a limit of the size."""
     if implicit is not None:
         note_decay(state, w.decay[0], step_size)
         if has_event:
-            # if a pair only comes close to its wall, the polynomial of a long step can show a false event; the next
-            # step is therefore at most four times as long as this step
+            # if a pair only approaches its wall, the polynomial of a long step can show a false event, so the next step
+            # is at most four times as long as this step
             state.implicit_size = min(state.implicit_size, 4.0 * step_size)
 
 
 @kernel()
 def _start(p, support, state, implicit) -> None:
-    """Write the state at the step's start to `implicit.z[0]`."""
+    """Write the state at the start of the step to `implicit.z[0]`."""
     if support is not None:
         to_world_both(p, state.y, state.frame, implicit.z[0])
     else:
@@ -620,7 +620,7 @@ def _start(p, support, state, implicit) -> None:
 
 @kernel()
 def _collocate(p, parts, support, state, w, span, decay, implicit, ramp, wear, sliding, running_in, stick) -> float:
-    """Lay out an implicit step as series of order `STAGES`; return its size in s, or 0 if explicit steps are better.
+    """Compute an implicit step as series of order `STAGES`. Return its size in s, or 0 if explicit steps are better.
 
     `decay` is the result of `decay_rate` in 1/s.
     """
@@ -637,7 +637,7 @@ def _collocate(p, parts, support, state, w, span, decay, implicit, ramp, wear, s
             size = _write_series(p, support, state, h, w, implicit, ramp, wear, stick)
             better = 0.9 * (admissible / max(size, 1e-6 * admissible)) ** (1.0 / (STAGES - 1))
             if size <= admissible:
-                # a sample may have cut the step short; the previous size is then still a good guess
+                # a sample may have shortened the step; the previous size is then still a good estimate
                 longer = h * min(better, 4.0)
                 state.implicit_size = max(longer, state.implicit_size) if h == span else longer
                 state.implicit_steps += 1

@@ -1,27 +1,31 @@
-"""The contract of a method: a module that can lay out a step of the motion.
+"""Interface of a method. A method is a module with a function `lay_out`, which computes a step of the motion.
 
-`solve.step` calls the methods in the order of its `METHODS` until a method lays out the step. Rules for `lay_out`:
+`solve.step` calls the methods in the order of its `METHODS`, until a method has computed the step. Rules for `lay_out`:
 
-1. Its input is the state at `state.step_start` with `state.alpha, state.beta = 1, 0`; in `w.wrench` the value and slope
-   of the linear load at this time; in `w.per_pair` the pairs' factors in the series; in `penetrating` whether any pair
-   is inside its wall; in `span` the longest step wanted, in s.
-2. It returns True if it has laid out the step, and False to leave the step to the next method. The last method, the
-   Taylor series, returns False only if the motion is not finite.
-3. If it returns True, it has written
-   - up to `state.order` the series of state and penetration to `w.series`, `w.penetration`, and, while `penetrating`,
-     those of rate and force to `w.rate`, `w.force`; a method without series writes the numbers that
-     `dense_output.evaluate` needs;
-   - the map of the series' variable sigma to time to `state.alpha`, `state.beta`;
-   - to `state.sigma_end` the sigma up to which all these series meet the tolerance;
-   - to `state.ends_at_stop` 1 if the step covers the whole of `span`, otherwise 0;
-   - the method's flag, if it has one (`in_flight`, `at_rest`).
-4. If it returns False, it has changed only these fields, fields of the method itself and scratch space.
-5. It does not change the motion's place, time, modes or totals, because an event may end the step sooner, and
-   `loop.lay_out_again` repeats the step after a restore. Only rest moves the head, by a distance that is proved to be
-   below a thousandth of the tolerance.
+1. Its inputs are:
+   - the state at `state.step_start` with `state.alpha, state.beta = 1, 0`;
+   - the value and slope of the linear load at this time, in `w.wrench`;
+   - the factors of the pairs in the series, in `w.per_pair`;
+   - `penetrating`, which states whether any pair penetrates;
+   - `span`, the longest admissible step in s.
+2. It returns True if it has computed the step. It returns False to leave the step to the next method. The last method,
+   the Taylor series, returns False only if the motion is not finite.
+3. Before it returns True, it writes:
+   - the series of state and penetration up to `state.order`, to `w.series` and `w.penetration`;
+   - the series of rate and force, to `w.rate` and `w.force`, if `penetrating` is true;
+   - the coefficients of the time as a function of the series variable sigma, to `state.alpha` and `state.beta`;
+   - the sigma up to which all these series meet the tolerance, to `state.sigma_end`;
+   - 1 to `state.ends_at_stop` if the step covers the whole of `span`, and 0 otherwise;
+   - the flag of the method (`in_flight`, `at_rest`), if it has a flag.
+   A method without series writes the data that `dense_output.evaluate` needs instead.
+4. Before it returns False, it may change only these fields, fields of the method itself, and scratch space.
+5. It does not change the head's position, time, modes or totals, because an event may shorten the step, and because
+   `loop.lay_out_again` repeats the step after a snapshot is restored. The method for rest is an exception: it moves the
+   head by a distance that is less than a thousandth of the tolerance.
 6. It adds its evaluations of the equations of motion to `state.evaluations`.
-7. Code that a scene does not need is not compiled: `own` returns None, or a tuple with items that are None, and numba
-   leaves out a branch on an argument that is None.
+7. Code that a scene does not need is not compiled. To this end, `own` returns None, or a tuple that contains None,
+because
+   numba omits branches on an argument that is None.
 """
 
 from __future__ import annotations
@@ -32,10 +36,10 @@ from plow_twin.solve.state import Params, Parts, State, Work
 
 
 class Method(Protocol):
-    """A method is a module with two compiled functions; this module's docstring has the rules of `lay_out`."""
+    """A module with two compiled functions. The docstring of this module contains the rules for `lay_out`."""
 
     def own(self, parts: Parts) -> Any:
-        """Return the parts of a scene for which the method is compiled, with None for each part that it lacks."""
+        """Return the parts of a scene for which the method is compiled, with None for each missing part."""
 
     def lay_out(self, p: Params, parts: Parts, own: Any, state: State, w: Work, span: float, penetrating: bool) -> bool:
-        """Lay out the next step, at most `span` s long; return False to leave it to the next method."""
+        """Compute the next step, at most `span` s long. Return False to leave the step to the next method."""

@@ -1,9 +1,9 @@
-"""Rest: the dying vibration of a head that is held by its contacts need not be computed.
+"""Rest: the decaying vibration of a head that is held by its contacts is omitted once it is small.
 
-With constant loads and no other drive, the sum of kinetic and potential energy cannot grow. If the stiffness is
-positive definite, this sum bounds the head's distance from its equilibrium for all time. Once the bound is far below
-the tolerance, the head is set to its equilibrium, and steps are as long as possible. Harmonics may act if they move the
-head no farther (`small_harmonics`).
+Under constant loads, the sum of kinetic and potential energy cannot increase. If the stiffness is positive definite,
+this sum is an upper bound of the head's distance from its equilibrium for all time. When the bound is far below the
+tolerance, the head is set to its equilibrium, and the steps become as long as possible. Harmonic loads are admissible
+if they do not move the head beyond the bound (`small_harmonics`).
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from plow_twin.solve.method.equilibrium import held, stiffer_than, stiffness_at,
 from plow_twin.solve.method.small_harmonics import EVALUATIONS, stays_at_rest, without_harmonics
 from plow_twin.solve.state import OMEGA, ON, VX, VY
 
-#: Largest motion that a step of rest may omit, as a share of the tolerances.
+#: Largest motion that is omitted at rest, divided by the tolerance.
 _SHARE = 1e-3
-#: Least penetration or gap of every pair, as a multiple of the largest omitted motion.
+#: Smallest penetration or gap of every pair, divided by the largest omitted motion.
 _MARGIN = 10.0
-#: Least penetration or gap in m of every pair, so that difference quotients for the stiffness can be computed.
+#: Smallest penetration or gap of every pair in m, so that finite differences can be used for the stiffness.
 _DEEP = 1e-7
 #: Largest number of evaluations of the equations of motion in a check for rest.
 AT_REST = 5 + EVALUATIONS
@@ -48,9 +48,9 @@ def slow_enough(p, y) -> bool:
 
 @kernel()
 def _still(p, acts, harmonics, state, w) -> bool:
-    """Return whether the motion omitted at rest would stay within its share of the tolerances forever.
+    """Return whether the motion that is omitted at rest stays within its share of the tolerances for all time.
 
-    If so, the head is set to its equilibrium.
+    If so, `w.rest[0]` contains the equilibrium of the head.
     """
     y, z, rate = state.y, w.rest[0], w.rest[1]
     gyration, speed = _gyration(p), _speed(p, y)
@@ -63,7 +63,7 @@ def _still(p, acts, harmonics, state, w) -> bool:
     without_harmonics(p, harmonics, state.step_start, rate, w.rest[3, 3:])
     if not stiffer_than(w.hessian, 0.0):
         return False
-    # the energy bounds the speed; together with the least stiffness it also bounds the distance from equilibrium
+    # the energy bounds the speed; with the smallest stiffness, it also bounds the distance from the equilibrium
     energy = speed * speed + to_equilibrium(w.hessian, rate, z, gyration)
     if not (2.0 * energy < fast * fast and stiffer_than(w.hessian, 2.0 * energy / (way * way))):
         return False
@@ -74,7 +74,7 @@ def _still(p, acts, harmonics, state, w) -> bool:
 
 @kernel()
 def _still_as_before(p, acts, harmonics, state, w) -> bool:
-    """Return whether place and load are unchanged since the head was found at rest."""
+    """Return whether position and load have not changed since the head was found at rest."""
     z, rate = w.rest[0], w.rest[1]
     to_world(p, state.y, z)
     accelerate(p, acts, True, state, state.step_start, z, w.rest[3, :3], rate)
@@ -86,13 +86,13 @@ def _still_as_before(p, acts, harmonics, state, w) -> bool:
 
 @kernel(inline="source")
 def own(parts):
-    """Return 1 if rest can be recognised in the scene, otherwise None."""
+    """Return 1 if rest can be detected in the scene, and None otherwise."""
     return parts.terms.rest
 
 
 @kernel(inline="source")
 def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
-    """Lay out a step of rest if the head is at rest and its load is constant."""
+    """Compute a step of rest if the head is at rest and its load is constant."""
     return _lay_out(p, acting(parts), parts.harmonics, own, state, w, span, penetrating)
 
 
@@ -111,7 +111,7 @@ def _lay_out(p, acts, harmonics, rest, state, w, span, penetrating) -> bool:
 
 @kernel()
 def _settle(p, acts, harmonics, state, w) -> bool:
-    """Check whether the head is at rest, and if so set it to its equilibrium; return whether it is at rest."""
+    """Return whether the head is at rest. If it is, set it to its equilibrium."""
     if not (state.at_rest == 1 and _still_as_before(p, acts, harmonics, state, w)):
         if not _still(p, acts, harmonics, state, w):
             return False

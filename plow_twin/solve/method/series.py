@@ -1,15 +1,16 @@
-"""Taylor series of the motion with the contact modes frozen.
+"""Taylor series of the motion with fixed contact modes.
 
-With the state in body coordinates (`model.geometry`) the equations of motion (paper, eq. 5) are polynomial:
+With the state in body coordinates (`model.geometry`) the equations of motion (paper, eq. 5) are polynomials:
 
     X'  = VX + omega Y            VX' =  omega VY + c (Fx/m) + s (Fy/m) + sum n_x F/m
     Y'  = VY - omega X            VY' = -omega VX - s (Fx/m) + c (Fy/m) + sum n_y F/m
     c'  = -omega s    s' = omega c    theta' = omega    omega' = M/I + sum arm F/I
 
 so each order of the series follows from the lower orders by Cauchy products (Jorba and Zou, Exp. Math. 14 (2005) 99).
-The series are in sigma, with the time t = alpha sigma + beta sigma^2 / 2 since the step's start. With (alpha, beta) =
-(1, 0) sigma is time; with (0, 2) it is the square root of time, in which a contact force with exponent 1.5 is analytic
-at its touch.
+
+The series variable is sigma. The time since the start of the step is t = alpha sigma + beta sigma^2 / 2. For (alpha,
+beta) = (1, 0), sigma is the time. For (0, 2), sigma is the square root of the time, in which a contact force with the
+exponent 1.5 is analytic at its touch.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ from plow_twin.solve.support import (
     start_frame,
 )
 
-#: A term of a series counts as vanished if it is below this share of the admissible size of the last order's term.
+#: Size of a term that is treated as zero, divided by the admissible size of the term of the last order.
 _VANISHED = 0.4
-#: Permutations of the state's components (lanes of a SIMD vector) for its rates. `_turned` gives the components that
-#: are multiplied by omega (in lanes 4 and 7 by the harmonic load S1 instead), `_rates_of` the components that are rates
-#: of other components.
+#: Permutations of the components of the state, which are the lanes of a vector. `_turned` contains the components that
+#: are multiplied by omega. In lanes 4 and 7, the factor is the harmonic load S1 instead of omega. `_rates_of` contains
+#: the components that are rates of other components.
 _turned = permutation(Y, X, VY, VX, COS, SIN, COS, SIN)
 _rates_of = permutation(VX, VY, VX, VY, OMEGA, COS, SIN, OMEGA)
 
@@ -50,8 +51,8 @@ _rates_of = permutation(VX, VY, VX, VY, OMEGA, COS, SIN, OMEGA)
 def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:
     """Write the series of the harmonic loads (S1 and S2 along two directions, moment M) to `w.load`.
 
-    The series of sine and cosine in sigma follow from each other: (k+1) sin_{k+1} = omega (alpha cos_k + beta
-    cos_{k-1}).
+    The coefficients of sine and cosine follow from (k+1) sin_{k+1} = omega (alpha cos_k + beta cos_{k-1}), and from the
+    corresponding equation for the cosine.
     """
     load = w.load
     for k in range(order + 1):
@@ -76,9 +77,9 @@ def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:
 
 @kernel(fast=True)
 def _multiply_older(a, b, k):
-    """Return order k of the products of a's and b's columns, without the terms with row k of a or b.
+    """Return order k of the products of the columns of a and b, without the terms that contain row k of a or b.
 
-    The newest rows are added last, so that most of the sum need not wait until they are computed.
+    The rows with the highest orders are added last, so the processor can start the sum before they are available.
     """
     low, high = splat(0.0), splat(0.0)
     half = k // 2
@@ -93,9 +94,9 @@ def _multiply_older(a, b, k):
 
 @kernel(fast=True)
 def _join(a, b, k, a_k, b_k):
-    """Return order k of the products of a's and b's columns; a_k and b_k are their rows k.
+    """Return order k of the products of the columns of a and b, whose rows k are a_k and b_k.
 
-    The newest rows are passed as values, because reading them from memory would wait until they are stored.
+    The rows k are passed as values, because reading them from memory would wait until they are stored.
     """
     if k == 0:
         return a_k * b_k
@@ -104,7 +105,7 @@ def _join(a, b, k, a_k, b_k):
 
 @kernel(fast=True)
 def _multiply(a, b, k):
-    """Return order k of the products of a's and b's columns."""
+    """Return order k of the products of the columns of a and b."""
     return _join(a, b, k, row(a, k), row(b, k))
 
 
@@ -112,11 +113,11 @@ def _multiply(a, b, k):
 def _raise(w, k, penetration, touching, exponent):
     """Write order k of penetration^exponent of the acting pairs to `w.power[0]`, and return it.
 
-    Row BASE of `w.per_pair` is 1 / d of the acting pairs, or half of the square root of 1 / d for the exponent 1.5; it
-    is zero for the other pairs.
+    For acting pairs, row BASE of `w.per_pair` is 1 / d, or half the square root of 1 / d for the exponent 1.5. For
+    other pairs it is zero.
     """
     if exponent == 1.5:
-        # d^1.5 is computed as d times its root, which is less work than the general recurrence
+        # d^1.5 is computed as d times its square root, which is faster than the general recurrence
         if k == 0:
             for pair in range(PAIR_COUNT):
                 w.power[1, 0, pair] = math.sqrt(w.penetration[0, pair]) if w.per_pair[BASE, pair] != 0.0 else 0.0
@@ -142,7 +143,7 @@ def _raise(w, k, penetration, touching, exponent):
 
 @kernel(fast=True, inline="code")
 def _damp(p, elastic, w, k, elastic_k, rate, viscous, hysteretic, ramp):
-    """Return order k of K d^n (1 + lambda d') or of K d^n + C psi d', where psi is the acting share of C."""
+    """Return order k of K d^n (1 + lambda d') or of K d^n + C psi d', where psi is the active share of C."""
     force = row(w.per_pair, ACTS) * elastic_k
     if ramp is not None:
         _ramp(p, w, k)
@@ -155,7 +156,7 @@ def _damp(p, elastic, w, k, elastic_k, rate, viscous, hysteretic, ramp):
 
 @kernel(fast=True, inline="code")
 def _ramp(p, w, k) -> None:
-    """Write order k of the share of C that acts (the ramp) to `w.ramp[2]`; beyond the ramp it is constant."""
+    """Write order k of the active share of C to `w.ramp[2]`. The share is constant beyond the ramp."""
     set_row(w.ramp[0], k, _multiply(w.penetration, w.penetration, k))
     set_row(w.ramp[1], k, _multiply(w.ramp[0], w.penetration, k))
     within = row(w.per_pair, RAMPS)
@@ -169,7 +170,8 @@ def _ramp(p, w, k) -> None:
 def _push(p, state, w, k, penetration, rate, viscous, hysteretic, integer, fraction, ramp):
     """Return order k of the eight contact forces (`model.contact`), zero for pairs that do not act.
 
-    Row ACTS of `w.per_pair` is K for pairs that act, row DAMPS is C or K lambda; both are zero for the others.
+    For acting pairs, row ACTS of `w.per_pair` is K, and row DAMPS is C or K lambda. For other pairs, both rows are
+    zero.
     """
     if integer is not None:
         set_row(w.power[0], k, _multiply(w.penetration, w.penetration, k))
@@ -186,7 +188,7 @@ def _push(p, state, w, k, penetration, rate, viscous, hysteretic, integer, fract
 
 @kernel(fast=True)
 def _hold(p, w, k, fx, fy):
-    """Return order k of the force per mass in head axes, less its component along a locked world axis."""
+    """Return order k of the force per mass in head axes, without its component along a locked world axis."""
     if fixed_axes(p) is not None:
         return p.free[0] * fx, p.free[1] * fy
     w.world[0, k], w.world[1, k] = fx, fy
@@ -205,9 +207,10 @@ def _hold(p, w, k, fx, fy):
 
 @kernel(fast=True)
 def _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, second, segments):
-    """Return order k of the load per mass in head axes and of its moment per inertia.
+    """Return order k of the load per mass in head axes, and of its moment per inertia.
 
-    c and s are order k of cosine and sine, c1 and s1 order k - 1, c2 and s2 order k - 2; `product` has S1 c and S1 s.
+    c and s are order k of cosine and sine, c1 and s1 order k - 1, c2 and s2 order k - 2. `product` contains order k of
+    S1 c and S1 s.
     """
     if fixed_axes(p) is not None:
         return _loads_along_world(p, w, k, alpha, beta, harmonics, second, segments)
@@ -215,7 +218,7 @@ def _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, secon
     fx, fy = start[0] * c + start[1] * s, start[1] * c - start[0] * s
     moment = start[2] if k == 0 else 0.0
     if segments is not None:
-        # the series of start + slope t(sigma) has the terms alpha slope and beta slope / 2
+        # the series of start + slope t(sigma) has the coefficients alpha slope and beta slope / 2
         fx += alpha * (slope[0] * c1 + slope[1] * s1) + 0.5 * beta * (slope[0] * c2 + slope[1] * s2)
         fy += alpha * (slope[1] * c1 - slope[0] * s1) + 0.5 * beta * (slope[1] * c2 - slope[0] * s2)
         if k == 1:
@@ -239,11 +242,11 @@ def _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, secon
 
 @kernel(fast=True)
 def _loads_along_world(p, w, k, alpha, beta, harmonics, second, segments):
-    """Return order k of the load per mass in world axes and of its moment per inertia."""
+    """Return order k of the load per mass in world axes, and of its moment per inertia."""
     load, start, slope = w.load, w.wrench[0], w.wrench[1]
     held, rising = 1.0 if k == 0 else 0.0, 0.0
     if segments is not None:
-        # the series of t(sigma) has the terms alpha and beta / 2
+        # the series of t(sigma) has the coefficients alpha and beta / 2
         rising = alpha if k == 1 else 0.5 * beta if k == 2 else 0.0
     fx, fy = held * start[0] + rising * slope[0], held * start[1] + rising * slope[1]
     moment = held * start[2] + rising * slope[2]
@@ -259,17 +262,17 @@ def _loads_along_world(p, w, k, alpha, beta, harmonics, second, segments):
 
 @kernel(fast=True, inline="source")
 def _applied(p, along_x, along_y, torque):
-    """Return the accelerations by the pairs' forces (in head axes) and moments, in the lanes of the state's rates."""
+    """Return the accelerations by forces (in head axes) and moments of the pairs, in the lanes of the state's rates."""
     mass, inertia = p.inverse_mass, p.inverse_inertia
     return three_totals(along_x, along_y, torque) * pack(0.0, 0.0, mass, mass, inertia, 0.0, 0.0, 0.0)
 
 
 @kernel(fast=True)
 def _drag(p, w, k, c, s, x, y, om, dc, ds, dx, dy):
-    """Return order k of the accelerations by friction (`_applied`, `model.friction`).
+    """Return order k of the accelerations by regularised friction (`_applied`, `model.friction`).
 
-    With the slip rate s', the regularisation speed v_s, r = s' / v_s and tau = tanh(r): k tau_k = sum_j j r_j (1 -
-    tau^2)_{k-j}.
+    Let s' be the slip rate, v_s the regularisation speed, r = s' / v_s and tau = tanh(r). Then k tau_k = sum_j j r_j (1
+    - tau^2)_{k-j}.
     """
     weighted, tau, rest, drag, arm = w.slip[1], w.slip[2], w.slip[3], w.slip[4], w.slip[5]
     rate = rolled(p, row_values(p.slip_rows, dc, ds, dx, dy), om) * (1.0 / p.slip_speed)
@@ -287,7 +290,7 @@ def _drag(p, w, k, c, s, x, y, om, dc, ds, dx, dy):
         set_row(rest, k, _multiply(tau, tau, k) * -1.0)
     force = _multiply(w.force, tau, k) * p.friction
     set_row(drag, k, force)
-    # the tangent is the wall's normal turned by +90 degrees; the penetration's rows for X and Y are minus the normal
+    # the tangent is the wall's normal, rotated by +90 degrees; rows 2 and 3 of the penetration are minus the normal
     return _applied(
         p, row(p.penetration_rows, 3) * force, row(p.penetration_rows, 2) * force * -1.0, _multiply(arm, drag, k)
     )
@@ -309,9 +312,10 @@ def _hold_on(p, state, w, k, c, s, x, y, theta, om, dc, ds, dx, dy):
 
 @kernel(fast=True)
 def _slide(p, w, k, om, dc, ds, dx, dy) -> None:
-    """Write order k of the force times the sliding distance of a corner per travel to `w.rub[2]`.
+    """Write order k of force times sliding distance per travel to `w.rub[2]`.
 
-    The distance is the root r of q = 1 + (s' / v)^2, with 2 r_0 r_k = q_k - sum_{j=1}^{k-1} r_j r_{k-j}.
+    The sliding distance of a corner per travel is the root r of q = 1 + (s' / v)^2, with 2 r_0 r_k = q_k -
+    sum_{j=1}^{k-1} r_j r_{k-j}.
     """
     sliding, way = w.rub[0], w.rub[1]
     rate = rolled(p, row_values(p.slip_rows, dc, ds, dx, dy), om)
@@ -330,9 +334,9 @@ def _slide(p, w, k, om, dc, ds, dx, dy) -> None:
 
 @kernel(fast=True)
 def _run_in(p, state, w, rubbed, k) -> None:
-    """Write order k of `rubbed` times the factor of running-in, 1 + a e, to `w.rub[5]`.
+    """Write order k of the product of `rubbed` and the factor of running-in, 1 + a e, to `w.rub[5]`.
 
-    With the wear depth h and e = exp(-h / h0): k e_k = -(1 / h0) sum_j j h_j e_{k-j}.
+    With the wear depth h, e = exp(-h / h0) satisfies k e_k = -(1 / h0) sum_j j h_j e_{k-j}.
     """
     growth, left = w.rub[3], w.rub[4]
     if k == 0:
@@ -347,9 +351,9 @@ def _run_in(p, state, w, rubbed, k) -> None:
 
 @kernel(fast=True)
 def _grow(p, w, rubbed, k, alpha, beta) -> None:
-    """Write order k + 1 of the growth of each pad's penetration:  dh/dt = k_s F v / A (Archard).
+    """Write order k + 1 of the increase of each pad's wear depth, dh/dt = k_s F v / A (Archard).
 
-    `rubbed` is the series of F, or of F times the factors of sliding and running-in.
+    `rubbed` is the series of F, or the series of F times the factors of sliding and running-in.
     """
     growth = row(rubbed, k) * alpha
     if k > 0:
@@ -359,7 +363,7 @@ def _grow(p, w, rubbed, k, alpha, beta) -> None:
 
 @kernel(fast=True, inline="code")
 def _wear(p, state, w, k, alpha, beta, om, dc, ds, dx, dy, sliding, running_in) -> None:
-    """Write order k + 1 of the growth of the pads' penetrations from force, sliding and running-in."""
+    """Write order k + 1 of the increase of each pad's wear depth, from force, sliding and running-in."""
     if sliding is not None:
         _slide(p, w, k, om, dc, ds, dx, dy)
         if running_in is not None:
@@ -376,7 +380,7 @@ def _wear(p, state, w, k, alpha, beta, om, dc, ds, dx, dy, sliding, running_in) 
 
 @kernel(fast=True, inline="code")
 def _slide_size(p, w, k, sliding, running_in):
-    """Return the size of order k - 1 of the sliding speed of the pads that carry force; order k is not yet known."""
+    """Return the size of order k - 1 of the sliding speed of the pads that carry force. Order k is still unknown."""
     size = 0.0
     if sliding is not None:
         for pair in range(PAIR_COUNT):
@@ -387,7 +391,7 @@ def _slide_size(p, w, k, sliding, running_in):
 
 @kernel(inline="source")
 def one_by_one(terms):
-    """Return the terms as plain tuples, for callers to unpack with a star: of the load, of the law, and the others."""
+    """Return the terms as plain tuples for unpacking with a star: terms of the load, of the law, and other terms."""
     load = terms.harmonics, terms.second, terms.segments
     rub = terms.sliding, terms.running_in
     return load, law_terms(terms), terms.wear, rub, terms.offset, terms.free, terms.slip, terms.stick, terms.support
@@ -395,7 +399,7 @@ def one_by_one(terms):
 
 @kernel(fast=True)
 def _turn_frame(w, k, there, c, s):
-    """Return order k of the frame's displacement and velocity, converted to head axes, in four lanes."""
+    """Return order k of the frame's displacement and velocity in head axes, in four lanes."""
     u, v, wx, wy = lane(there, FRAME_X), lane(there, FRAME_Y), lane(there, FRAME_VX), lane(there, FRAME_VY)
     left, right = pack(c, s, c, s, c, s, c, s), pack(u, v, v, -u, wx, wy, wy, -wx)
     set_row(w.frame_left[0], k, left)
@@ -407,11 +411,11 @@ def _turn_frame(w, k, there, c, s):
 
 @kernel(fast=True)
 def _seen_rates(w, k, there, turned, om, turning):
-    """Return order k of the rates of the head's cosine, sine and place relative to the frame.
+    """Return order k of the rates of the head's cosine, sine and position relative to the frame.
 
-    `turned` is the result of `_turn_frame`: R^T u and R^T w, the frame's displacement u and velocity w in head axes (R
-    rotates from head to world axes). The rate of R^T u is R^T w plus omega times R^T u turned by -90 degrees. `turning`
-    has the rates of the head's place relative to the ground.
+    `turned` is the result of `_turn_frame`: R^T u and R^T w, with the frame's displacement u and velocity w, where R
+    rotates from head axes to world axes. The rate of R^T u is R^T w plus omega times R^T u, rotated by -90 degrees.
+    `turning` contains the rates of the head's position relative to the ground.
     """
     relative = om - lane(there, SPIN)
     left = pack(om, om, relative, relative, 0.0, 0.0, 0.0, 0.0)
@@ -426,10 +430,11 @@ def _seen_rates(w, k, there, turned, om, turning):
 
 @kernel(fast=True)
 def _push_frame(p, w, k, there, c, s, x, y, dc, ds, pushed):
-    """Return order k of the frame's rates under its springs, its dampers and the contacts' reaction.
+    """Return order k of the frame's rates under its springs, its dampers and the reactions of the contacts.
 
-    `pushed` has the head's accelerations by the pairs (`_applied`). The pairs' moment about the frame's centre is their
-    moment about the head's centre of mass plus the cross product of the head's place (x, y) and their force.
+    `pushed` contains the head's accelerations by the pairs (`_applied`). The moment of the pairs' forces about the
+    frame's centre is their moment about the head's centre of mass, plus the cross product of (x, y) and the forces.
+    Here (x, y) is the head's position.
     """
     fx, fy = lane(pushed, VX) / p.inverse_mass, lane(pushed, VY) / p.inverse_mass
     left, right = pack(c, s, s, c, x, y, 0.0, 0.0), pack(fx, fy, fx, fy, fy, fx, 0.0, 0.0)
@@ -454,7 +459,7 @@ def _push_frame(p, w, k, there, c, s, x, y, dc, ds, pushed):
 
 @kernel(fast=True, inline="source")
 def _turn_of_axes(p):
-    """Return the factors of the products with omega in the state's rates; 0 for place and velocity in fixed axes."""
+    """Return the factors of products with omega in the state's rates. In fixed axes, four factors are 0."""
     if fixed_axes(p) is not None:
         return pack(0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0)
     return pack(1.0, -1.0, 1.0, -1.0, 0.0, -1.0, 1.0, 0.0)
@@ -462,7 +467,7 @@ def _turn_of_axes(p):
 
 @kernel(fast=True, inline="code")
 def _size(p, w, k, penetrating, sigma_limit, wear, support, sliding, running_in):
-    """Return the size of the terms of order k > 0 as a velocity."""
+    """Return the size of the terms of order k > 0, converted to a velocity."""
     here = w.series[k]
     size = abs(here[VX]) + abs(here[VY]) + p.radius * abs(here[OMEGA]) + p.weight * (abs(here[COS]) + abs(here[SIN]))
     if support is not None:
@@ -493,10 +498,11 @@ def expand(
     stick,
     support,
 ):
-    """Write the series of state, penetration, rate and force up to order `limit` to `w`; return the order used.
+    """Write the series of state, penetration, rate and force up to order `limit` to `w`. Return the order of the
+    series.
 
-    If not `penetrating`, no pair is inside its wall, and the contacts are not computed. The series ends early if its
-    terms vanish at `sigma_limit`, the longest sigma of interest.
+    If `penetrating` is false, no pair penetrates, and the contacts are omitted. The series ends early if its terms are
+    negligible at `sigma_limit`, the largest sigma of interest.
     """
     alpha, beta = state.alpha, state.beta
     left, right, load, inverse = w.left, w.right, w.load, w.inverse
@@ -510,7 +516,7 @@ def expand(
     for k in range(limit + 1):
         set_row(w.series, k, here)
         x, yy, om, c, s = lane(here, X), lane(here, Y), lane(here, OMEGA), lane(here, COS), lane(here, SIN)
-        # the pairs depend on the state relative to the frame
+        # the contact forces depend on the state relative to the frame
         seen_c, seen_s, seen_x, seen_y = c, s, x, yy
         if support is not None:
             set_row(w.frame, k, there)
@@ -530,8 +536,8 @@ def expand(
                 penetration = penetration - row(w.wear, k)
         set_row(w.penetration, k, penetration)
         if k > 0 and load_terms[2] is not None:
-            # under samples most series end early; it is faster to wait for the size of an order than to compute the
-            # next order in vain
+            # under sampled loads most series end early, so waiting for the size of an order is faster than computing
+            # an unnecessary order
             reach *= sigma_limit
             size = _size(p, w, k, penetrating, sigma_limit, wear, support, *rub_terms)
             w.term_size[k] = size
@@ -549,7 +555,7 @@ def expand(
         turning = turning + _rates_of(here) * pack(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
         fx, fy, moment = _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, *load_terms)
         if offset is not None:
-            # the loads' moment is about the cavity's centre; gravity acts at the centre of mass and has no moment
+            # the moment of the loads is about the cavity's centre; gravity acts at the centre of mass
             across = p.offset[0] * (fy + p.gravity * c) - p.offset[1] * (fx + p.gravity * s)
             moment -= across * p.inverse_inertia / p.inverse_mass
         applied = pack(0.0, 0.0, fx, fy, moment, 0.0, 0.0, 0.0)
@@ -565,7 +571,7 @@ def expand(
             set_row(w.arm, k, arm)
             force = _push(p, state, w, k, penetration, rate, *law_terms)
             set_row(w.force, k, force)
-            # the penetration's rows for X and Y are minus the walls' inward normals
+            # rows 2 and 3 of the penetration are minus the inward normals of the walls
             torque = _join(w.arm, w.force, k, arm, force)
             pushed = _applied(
                 p, row(p.penetration_rows, 2) * force * -1.0, row(p.penetration_rows, 3) * force * -1.0, torque
@@ -580,7 +586,7 @@ def expand(
                 applied, pushed = applied + dragged, pushed + dragged
             if wear is not None:
                 _wear(p, state, w, k, alpha, beta, om, dc, ds, dx, dy, *rub_terms)
-            # the penetration of the next order depends on this order's rates alone, so it need not wait for forces
+            # the next order of the penetration depends only on the rates of this order, so it does not wait for forces
             penetration = rate * steady + closing * bent
             closing = rate
         if support is not None:

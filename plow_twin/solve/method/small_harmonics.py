@@ -1,14 +1,16 @@
-"""Rest under harmonics: a check that the motion of a head held by its contacts stays below the tolerance for all time.
+"""Rest under small harmonic loads: proof that the motion of a head that is held by its contacts stays below the
+tolerance.
 
-About its equilibrium such a head obeys e'' + C e' + K e = r. Here e is its distance from the linear response to the
-harmonics, with the angle times the radius of gyration as third place, and r is the remainder of the linearisation. The
-response is known in closed form, resonance included. Let s and c be the least eigenvalues of K and C, and S the largest
-eigenvalue of C. With eps at most c / 2, s / (10 S) and sqrt(s) / 10, the Lyapunov function V and the squared size W of
-the motion obey
+Near its equilibrium, the head satisfies e'' + C e' + K e = r. Here e is its distance from the linear response to the
+harmonic loads, with the angle times the radius of gyration as third coordinate, and r is the remainder of the
+linearisation. The linear response is known in closed form, including resonance.
+
+Let s and c be the smallest eigenvalues of K and C, and S the largest eigenvalue of C. Choose eps at most c / 2,
+s / (10 S) and sqrt(s) / 10. The Lyapunov function V and the squared size W of the motion then satisfy
 
     V = (e'e' + e K e) / 2 + eps (e e' + e C e / 2),  V' <= -eps W + r (1 + eps / sqrt(s)) sqrt(W),  W = e'e' + e K e
 
-and V lies between 0.45 W and 0.55 W. So for all time sqrt(W) stays below the larger of 1.2 times its present value and
+and V is between 0.45 W and 0.55 W. Therefore sqrt(W) always stays below the larger of 1.2 times its current value and
 1.4 r / eps, and e stays below sqrt(W / s). Without damping (c = 0) there is no such bound.
 """
 
@@ -28,15 +30,15 @@ from plow_twin.solve.method.equilibrium import stiffer_than
 from plow_twin.solve.method.flight import amplitudes
 from plow_twin.solve.state import ON, X, Y
 
-#: Number of halvings after which an eigenvalue is taken as zero.
+#: Number of halvings after which an eigenvalue is treated as zero.
 _HALVINGS = 40
-#: Number of evaluations of the equations of motion in this check.
+#: Number of evaluations of the equations of motion in this proof.
 EVALUATIONS = 4
 
 
 @kernel()
 def without_harmonics(p, harmonics, t, rate, spare) -> None:
-    """Subtract the harmonics at t from the accelerations rate[3:]; `spare`, shape (3,), is scratch space."""
+    """Subtract the harmonic loads at time t from the accelerations rate[3:]. `spare`, shape (3,), is scratch space."""
     if harmonics is not None:
         spare[0] = spare[1] = spare[2] = 0.0
         add_harmonics(p, harmonics, t, spare)
@@ -50,7 +52,7 @@ def _damping_at(p, acts, state, w, gyration) -> None:
     z, rate, moved = w.rest[0], w.rest[1], w.rest[2]
     accelerate(p, acts, True, state, state.step_start, z, w.rest[3, :3], rate)
     for j in range(3):
-        # a unit rate gives the exact derivative, because the laws are linear in the rate
+        # a difference quotient with unit rate is the exact derivative, because the laws are linear in the rate
         unit = gyration if j == 2 else 1.0
         z[3 + j] = 1.0 / unit
         accelerate(p, acts, True, state, state.step_start, z, w.rest[3, :3], moved)
@@ -64,7 +66,7 @@ def _damping_at(p, acts, state, w, gyration) -> None:
 
 @kernel()
 def _least_eigenvalue(h) -> float:
-    """Return a lower bound of the least eigenvalue, at least about half of it; 0 if the eigenvalue is not positive."""
+    """Return a lower bound of the smallest eigenvalue, at least about half of it, or 0 if it is not positive."""
     least = 0.99 * min(h[0, 0], h[1, 1], h[2, 2])
     for _ in range(_HALVINGS):
         if stiffer_than(h, least):
@@ -84,7 +86,7 @@ def _trace(p, h) -> float:
 
 @kernel(inline="code")
 def _dynamic_stiffness(p, w, omega, i, j):
-    """Return entry (i, j) of K - omega^2 + i omega C, with the unit matrix's row and column for a locked place."""
+    """Return element (i, j) of K - omega^2 + i omega C. Locked coordinates have rows and columns of the unit matrix."""
     if p.free[i] == 0.0 or p.free[j] == 0.0:
         return complex(1.0 if i == j else 0.0, 0.0)
     return complex(w.hessian[i, j] - (omega * omega if i == j else 0.0), omega * w.damping[i, j])
@@ -92,7 +94,7 @@ def _dynamic_stiffness(p, w, omega, i, j):
 
 @kernel()
 def _answer(p, one, w, gyration):
-    """Return the amplitudes of |x| in m and of sqrt(x K x), where x is the linear response to a harmonic."""
+    """Return the amplitudes of |x| in m and of sqrt(x K x), where x is the linear response to a harmonic load."""
     om = one.omega
     a, b, c = _dynamic_stiffness(p, w, om, 0, 0), _dynamic_stiffness(p, w, om, 0, 1), _dynamic_stiffness(p, w, om, 0, 2)
     d, e, f = _dynamic_stiffness(p, w, om, 1, 0), _dynamic_stiffness(p, w, om, 1, 1), _dynamic_stiffness(p, w, om, 1, 2)
@@ -101,23 +103,23 @@ def _answer(p, one, w, gyration):
     sy, cy = amplitudes(p, one, 1)
     st, ct = amplitudes(p, one, 2)
     x, y, t = p.free[0] * complex(cx, -sx), p.free[1] * complex(cy, -sy), p.free[2] * gyration * complex(ct, -st)
-    # the inverse is computed from the adjugate
+    # the inverse matrix is computed from the adjugate matrix
     first, second, third = e * k - f * h, f * g - d * k, d * h - e * g
     along_x = first * x + (c * h - b * k) * y + (b * f - c * e) * t
     along_y = second * x + (a * k - c * g) * y + (c * d - a * f) * t
     along_t = third * x + (b * g - a * h) * y + (a * e - b * d) * t
     size = math.sqrt(abs(along_x) ** 2 + abs(along_y) ** 2 + abs(along_t) ** 2)
     size /= abs(a * first + b * second + c * third)
-    # the elastic energy x K x is at most |x| times the sum of two amplitudes, of the harmonic and of the inertia force
+    # x K x is at most |x| times the sum of two amplitudes: those of the harmonic load and of the inertia force
     load = math.sqrt(abs(x) ** 2 + abs(y) ** 2 + abs(t) ** 2)
     return size, math.sqrt(load * size) + om * size
 
 
 @kernel()
 def _left_out(p, state, w, reach, rate, gyration) -> float:
-    """Bound r, the remainder in the module's docstring, for distances up to `reach`, rates up to `rate`.
+    """Return an upper bound of r in the module's docstring, for distances up to `reach` and rates up to `rate`.
 
-    The remainder r is due to the curvature of the pairs' forces and to their turning with the head.
+    The remainder r is due to the nonlinearity of the pairs' forces, and to the rotation of these forces with the head.
     """
     y, left_out = state.y, 0.0
     arm = (p.leverage + math.hypot(y[X], y[Y])) / gyration
@@ -136,10 +138,10 @@ def _left_out(p, state, w, reach, rate, gyration) -> float:
 
 @kernel()
 def stays_at_rest(p, acts, harmonics, state, w, distance, way, fast, gyration) -> bool:
-    """Return whether the head stays within `way` [m] of its equilibrium and slower than `fast` [m/s] for all time.
+    """Return whether the head always stays within `way` [m] of its equilibrium and slower than `fast` [m/s].
 
-    `distance` is the present sqrt(W) of the module's docstring without the response to the harmonics, which is added
-    here; `w.hessian` has the stiffness.
+    `distance` is the current sqrt(W) of the module's docstring without the response to the harmonic loads. This
+    function adds the response. `w.hessian` contains the stiffness.
     """
     least = _least_eigenvalue(w.hessian)
     _damping_at(p, acts, state, w, gyration)

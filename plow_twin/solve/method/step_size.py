@@ -1,4 +1,4 @@
-"""The length of a step: as long as its series is accurate, and shorter if the series cannot show its own error."""
+"""Size of a step: the interval over which its series is accurate, with bounds where the series hides its error."""
 
 from __future__ import annotations
 
@@ -14,27 +14,28 @@ from plow_twin.solve.method.series import expand, expand_harmonics, one_by_one
 from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import CLIPPED, ON
 
-#: `PARTING_REACH`: how far ahead a pair's parting from its wall is searched, as a number of steps of the last size.
-#: `PARTING_ORDER`: order of the series that is used for this search.
+#: `PARTING_REACH`: length of time in which the separation of a pair is searched, divided by the last step size.
+#: `PARTING_ORDER`: order of the series for this search.
 PARTING_REACH, PARTING_ORDER = 1.3, 6
-#: Value of `PARTING_REACH` under friction with stick, whose guards make steps shorter.
+#: Value of `PARTING_REACH` with friction with stick, where guard functions make steps shorter.
 _PARTING_REACH_STICK = 8.0
-#: Largest number of Newton steps to the parting, and the relative change at which they end. The next step corrects the
-#: remaining error.
+#: Largest number of Newton iterations for the separation, and relative change at which they end. The next step corrects
+#: the remaining error.
 _NEWTON_STEPS, _ROOT_FOUND = 6, 1e-9
-#: Largest usable term; products of larger terms would not be finite.
+#: Largest usable term of a series. Products of larger terms would not be finite.
 _FINITE = 1e300
-#: Shortening a step also reduces its largest term, so shortening is repeated: at most `_SHORTER` times, and
-#: only while the new step is below the share `_SHORT_ENOUGH` of the previous step.
+#: A shorter step also has a smaller largest term, so a step is shortened repeatedly. `_SHORTER`: largest number of
+#: repetitions. `_SHORT_ENOUGH`: ratio of successive sizes above which the repetition ends.
 _SHORTER, _SHORT_ENOUGH = 20, 0.9
 
 
 @kernel()
 def accurate_step(p, w, order, sigma_limit):
-    """Return the sigma over which the series meets its share of the tolerance; NaN if a term is not finite.
+    """Return the sigma up to which the series meets the admissible error of a step, or NaN if a term is not finite.
 
-    Term k may be as large as `threshold[k]`, which falls geometrically with k to the admissible error at the last order
-    (the root test of Jorba and Zou, sec. 3.2). Single orders can vanish, so the last `lacuna` orders are all checked.
+    The admissible size of term k is `threshold[k]`. It decreases geometrically with k to the admissible error at the
+    last order (root test of Jorba and Zou, sec. 3.2). Single terms can be zero, so the last `lacuna` terms are all
+    checked.
     """
     least = np.inf
     for k in range(order, order - max(p.lacuna, 2), -1):
@@ -44,8 +45,8 @@ def accurate_step(p, w, order, sigma_limit):
         if size > 0.0:
             least = min(least, math.log(p.threshold[k] / size) / k)
     sigma = min(sigma_limit, math.exp(least))
-    # over a long step an admissible error of velocity becomes too large an error of position; the step is then
-    # shortened
+    # over a long step, an admissible error of the velocity results in an error of the position that is too large; the
+    # step is then shortened
     stretch = sigma * p.velocity_tolerance / (p.position_tolerance * (order + 1))
     if stretch > 1.0 and sigma < sigma_limit:
         sigma *= math.exp(-math.log(stretch) / order)
@@ -56,9 +57,9 @@ def accurate_step(p, w, order, sigma_limit):
 def before_sticking(p, state, w, order, sigma) -> float:
     """Return `sigma`, or the smaller value up to which the series of tanh r converges well enough.
 
-    Here r is the slip rate divided by the regularisation speed. Far from sticking tanh r is constant to the last bit,
-    so its coefficients do not show its poles at r = +-i pi/2. If |r - r_0| is at most theta times the distance of r_0
-    from the poles, the remainder of the series is below theta^order.
+    r is the slip rate divided by the regularisation speed. During fast slip, tanh r is constant up to rounding, so its
+    coefficients do not show its poles at r = +-i pi/2. If |r - r_0| is at most theta times the distance of r_0 from the
+    poles, the remainder of the series is less than theta^order.
     """
     theta = (p.threshold[p.order] / p.threshold[0]) ** (1.0 / order)
     within = sigma
@@ -70,19 +71,19 @@ def before_sticking(p, state, w, order, sigma) -> float:
             change = (change + abs(w.slip[0, k, pair])) * within
         limit = theta * math.hypot(w.slip[0, 0, pair], 0.5 * math.pi)
         if change > limit:
-            # the change is convex in sigma, so it falls at least in proportion to sigma
+            # the change is convex in sigma, so it decreases at least in proportion to sigma
             within *= limit / change
     return within
 
 
 @kernel()
 def before_pushing_again(p, state, w, order, sigma, integer, fraction) -> float:
-    """Return `sigma`, or the smaller value up to which the series of CLIPPED pairs' ramped force is accurate.
+    """Return `sigma`, or the smaller value up to which the ramped force of CLIPPED pairs has an accurate series.
 
-    This force does not act yet, and only a guard depends on it, so no other check limits its error. The motion's root
-    test is applied to the velocity that the force would give. This is needed because the acting share of C is a cubic,
-    whose series is longer than the penetration's, and because d^n has a branch point where the pair parts. If the
-    motion's series has ended early, the test uses the orders that exist.
+    This force does not act yet and appears only in a guard function, so no other test limits its error. The root test
+    of the motion is applied to the velocity that the force would cause. The test is necessary for two reasons: the
+    active share of C is a cubic, whose series is longer than that of the penetration, and d^n has a branch point where
+    the pair separates. If the series of the motion has ended early, the test uses the available orders.
     """
     least, share = np.inf, math.log(p.threshold[p.order] / p.threshold[0]) / order
     for pair in range(PAIR_COUNT):
@@ -98,10 +99,10 @@ def before_pushing_again(p, state, w, order, sigma, integer, fraction) -> float:
 
 @kernel()
 def before_gripping(p, state, w, order, sigma) -> float:
-    """Return `sigma`, or the smaller value up to which the guards of stick and slip are accurate.
+    """Return `sigma`, or the smaller value up to which the guard functions of stick and slip are accurate.
 
-    Even a force too small to move the head decides whether its corner sticks. So the root test is made relative to the
-    largest term of the guard.
+    A force that is too small to move the head can still determine whether its corner sticks. The root test is therefore
+    relative to the largest term of the guard function.
     """
     guard = w.column[0]
     share = math.log(p.threshold[p.order] / p.threshold[0]) / order
@@ -114,10 +115,10 @@ def before_gripping(p, state, w, order, sigma) -> float:
 
 @kernel()
 def _relatively_accurate(g, order, lacuna, share, sigma) -> float:
-    """Return `sigma`, or the smaller value up to which g's last terms are small relative to its largest term.
+    """Return `sigma`, or the smaller value up to which the last terms of g are small relative to its largest term.
 
-    Term k may be exp(share k) times the largest term. Only the upper half of the terms is tested, because the lower
-    terms may be large near a root.
+    The admissible size of term k is exp(share k) times the largest term. Only the upper half of the terms is tested,
+    because the lower terms may be large near a root.
     """
     for _ in range(_SHORTER):
         largest, power = 0.0, 1.0
@@ -137,9 +138,9 @@ def _relatively_accurate(g, order, lacuna, share, sigma) -> float:
 
 @kernel()
 def time_to_separation(p, parts, state, w, span, harmonics, stick):
-    """Return the time in s until the first pair parts if the parting is near enough to shorten steps, otherwise 0.
+    """Return the time in s until the first pair separates, or 0 if the separation is too far away to shorten steps.
 
-    The root of a short series is accurate enough, because the next step corrects its error.
+    A series of low order is sufficient, because the next step corrects its error.
     """
     near, reach = False, PARTING_REACH
     if stick is not None:
@@ -167,7 +168,7 @@ def time_to_separation(p, parts, state, w, span, harmonics, stick):
 
 @kernel()
 def parting_of(penetration, order, reach) -> float:
-    """Return, by Newton's method, where a penetration's series first vanishes; infinity if not before `reach`."""
+    """Return the first root of a penetration's series by Newton's method, or inf without a root before `reach`."""
     if penetration[1] >= 0.0:
         return np.inf
     t = -penetration[0] / penetration[1]

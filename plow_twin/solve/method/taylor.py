@@ -1,4 +1,4 @@
-"""A step by Taylor series: choice of the series' variable, the series, and the length over which it is accurate."""
+"""A step by Taylor series: choice of the series variable, the series, and the interval over which it is accurate."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from plow_twin.solve.method.step_size import (
     time_to_separation,
 )
 
-#: After a touch the square root of the time since the touch is the series' variable for this many steps of the last
-#: size.
+#: Length of time after a touch in which the series variable is the square root of the time since the touch, divided by
+#: the last step size.
 TOUCH_REACH = 2.5
-#: Longest step in the square root of the time since the touch, as a multiple of this root at the step's start. The
-#: series of the force has a rounding error like that of 1 / sqrt(t): it grows by this factor with each order, and at
-#: order 30 reaches 1e18 times its size. The motion is free of this error, because the factor dt / d sigma cancels it.
+#: Longest step in the square root of the time since the touch, divided by its value at the start of the step. The
+#: series of the force has the rounding error of 1 / sqrt(t), which grows by this factor with each order, to 1e18 at
+#: order 30. The motion does not have this error, because the factor dt / dsigma cancels it.
 FURTHEST = 4.0
 
 
@@ -33,7 +33,7 @@ def own(parts):
 
 @kernel(inline="source")
 def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
-    """Lay out a step by Taylor series; return False if the series is not finite."""
+    """Compute a step by Taylor series. Return False if the series is not finite."""
     return _lay_out(p, parts, *own, state, w, span, penetrating)
 
 
@@ -64,24 +64,24 @@ def _lay_out(p, parts, slip, ramp, fraction, stick, implicit, state, w, span, pe
 
 @kernel()
 def _choose_map(p, parts, fraction, stick, state, w, span, penetrating):
-    """Choose the series' variable sigma; return its value after `span`, and whether a step may be that long."""
+    """Choose the series variable sigma. Return its value after `span`, and whether a step may have this size."""
     if fraction is None:
         return span, True
     if state.touching != 0:
-        # from a touch on, a force like d^1.5 is analytic in the square root of the time since the touch
+        # after a touch, a force like d^1.5 is analytic in the square root of the time since the touch
         state.alpha, state.beta = 0.0, 2.0
         return math.sqrt(span), True
     if not penetrating or p.exponent != 1.5:
         return span, True
     parting = time_to_separation(p, parts, state, w, span, parts.harmonics, stick)
     if parting > 0.0:
-        # up to the parting, a force like d^1.5 is analytic in the square root of the time left
+        # before a separation, a force like d^1.5 is analytic in the square root of the remaining time
         root = math.sqrt(parting)
         state.alpha, state.beta = 2.0 * root, -2.0
         return (root if parting <= span else root - math.sqrt(parting - span)), parting > span
     since = state.step_start - state.touch_time
     if 0.0 < since < TOUCH_REACH * state.last_step_size:
-        # for some steps after a touch the square root of the time since the touch is a better variable than time
+        # for some steps after a touch, the square root of the time since the touch is a better variable than time
         root = math.sqrt(since)
         state.alpha, state.beta = 2.0 * root, 2.0
         return math.sqrt(since + span) - root, True
