@@ -1,8 +1,8 @@
 """Joint fit of poses and contact forces by Gauss-Newton steps, starting from the fit of the poses.
 
-The unknowns are the shared unknowns, the delay of the forces and the logarithm of each cell's gain. The state at the
-start of each swing is eliminated. Moments that are hard to predict have less weight, Huber's function limits the
-influence of each moment, and the scatter of the swings' scores widens the intervals (White 1982).
+The unknowns are the shared unknowns, the delay of the forces, and the logarithm of the gain of each load cell. The
+starting state of each swing is eliminated. Forces at times that are hard to predict have less weight, and Huber's
+function limits the influence of each force. The scatter of the scores of the swings widens the intervals (White 1982).
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from plow_twin.model.pairs import PAIR_NAMES
 
 Array = NDArray[np.float64]
 
-#: Bound: largest number of rows, about 200 a second for a window of ten load periods.
+#: Upper bound of the number of rows, which is about 200 per second in a window of ten load periods.
 _MOST_ROWS = 6000
-#: Bound: a fit takes at most `_ROUNDS` steps. In the first `_DRAWN_ROUNDS` steps predictability is probed with
-#: `_PROBES` draws. The steps end when the cost falls by less than `_ENOUGH`, which is within noise.
+#: Upper bound of the number of steps; number of initial steps in which the predictability is probed; number of random
+#: probes in each of these steps; reduction of the cost, within noise, below which the steps end.
 _ROUNDS, _DRAWN_ROUNDS, _PROBES, _ENOUGH = 8, 3, 3, 0.5
-#: Step: for the two-sided difference quotients with respect to the delay in s and to a starting state. With the longer
-#: one-sided steps of the fit of the poses, clearances were wrong by 4 of their deviations.
+#: Steps of the two-sided difference quotients with respect to the delay in s and to a starting state. The larger
+#: one-sided steps of the fit of the poses made clearances wrong by 4 standard deviations.
 _DELAY_STEP = 2e-5
 _STATE_STEPS = np.array([1e-5, 1e-5, 5e-5, 2e-4, 2e-4, 1.4e-3])
 
@@ -37,7 +37,8 @@ _STATE_STEPS = np.array([1e-5, 1e-5, 5e-5, 2e-4, 2e-4, 1.4e-3])
 class JointFit:
     """Result of the joint fit of poses and contact forces.
 
-    shared, covariance : (SIZE,), (SIZE, SIZE); None if the forces were not used
+    used : how the forces were used
+    shared, covariance : (SIZE,), (SIZE, SIZE) shared unknowns and their covariance; None if the forces were not used
     model, sensor : reasons against the model and against the sensor
     """
 
@@ -50,7 +51,7 @@ class JointFit:
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """A set of unknowns: shared (SIZE,), states (s, 6), delay of the forces in s, logarithms of the gains (k,)."""
+    """Values of the unknowns: shared (SIZE,), states (s, 6), delay of the forces in s, logarithms of the gains (k,)."""
 
     shared: Array
     states: Array
@@ -60,7 +61,7 @@ class _Place:
 
 @dataclass(frozen=True, eq=False)
 class _At:
-    """A place with the motion that it predicts; `force`, shape (m,), are the expected readings of the cells."""
+    """Values of the unknowns, with the predicted motion and the predicted readings of the cells `force`, shape (m,)."""
 
     place: _Place
     point: Point
@@ -69,12 +70,12 @@ class _At:
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """Normal equations of a swing with its starting state eliminated.
+    """Normal equations of a swing, from which its starting state has been eliminated.
 
-    normal, score : (b, b), (b,) for the other unknowns
-    state : (6,) step of the starting state if the other unknowns stay
-    answer : (6, b) derivative of this step with respect to the steps of the other unknowns
-    root : (6, 6) Cholesky factor of the starting state's covariance, for random draws
+    normal, score : (b, b), (b,) matrix and right-hand side for the other unknowns, which form the border
+    state : (6,) step of the starting state if the other unknowns do not change
+    answer : (6, b) derivative of the step of the starting state with respect to the steps of the other unknowns
+    root : (6, 6) Cholesky factor of the covariance of the starting state
     """
 
     normal: Array
@@ -98,12 +99,15 @@ class _Block:
 
 
 def not_used(why: str) -> JointFit:
-    """Return a result without forces, with the reason `why`."""
+    """Return the result if the forces are not used, for the reason `why`."""
     return JointFit(ForcesUsed(unused=why))
 
 
 def fit_jointly(problem: Problem, found: Fit, forces: ContactForces, widened: float) -> JointFit:
-    """Fit poses and forces together, from a fit of the poses; `widened` multiplies the variance of its noise."""
+    """Return the joint fit of poses and forces, which starts from a fit of the poses.
+
+    `widened` is a factor on the variance of the noise of the poses.
+    """
     if problem.unknowns.scene.contact.restitution is not None:
         return not_used("the law's damping follows from the speed of each touch")
     if len(problem.link):
@@ -121,7 +125,7 @@ def fit_jointly(problem: Problem, found: Fit, forces: ContactForces, widened: fl
 
 
 class _Joint:
-    """The fit of the poses, extended by the entries (row, cell) of measured forces."""
+    """The fit of the poses, extended by measured forces; an *entry* is the force of one cell in one row."""
 
     def __init__(self, problem: Problem, found: Fit, feeling: Feeling, cells: Cells, widened: float) -> None:
         self._problem, self._found, self._feeling, self._cells = problem, found, feeling, cells
@@ -136,10 +140,9 @@ class _Joint:
         )
 
     def solve(self) -> JointFit:
-        """Return the joint fit, starting from the fit of the poses."""
         found, cells = self._found, self._cells
         felt = self._feeling.at(found.shared, found.point.states, cells.delay)
-        assert felt is not None  # the model can be run with these unknowns, because `cells_of` has already run it
+        assert felt is not None  # `cells_of` has already simulated this motion
         near = np.isfinite(cells.force) & (felt.penetration > -2.0 * tuning.HEAD_ROOM)
         near[:, np.setdiff1d(np.arange(near.shape[1]), cells.pairs)] = False
         self._row, self._pair = np.nonzero(near)
@@ -151,7 +154,8 @@ class _Joint:
             return not_used("the model cannot be run")
         linear, jacobian = self._linearised(at)
         for index in range(_ROUNDS):
-            # in the first round only the poses limit the draws; the forces limit them from the second round on
+            # the random probes are drawn from the uncertainty of the poses, and from the second step on of the forces
+            # too
             if index < _DRAWN_ROUNDS:
                 self._weigh(at.force)
                 known = self._blocks(at, linear, jacobian if index else 0.0 * jacobian)
@@ -171,7 +175,7 @@ class _Joint:
         return self._summary(at, covariance)
 
     def _weigh(self, force: Array) -> None:
-        """Set the variance of each entry from the force of the motion."""
+        """Set the variance of each entry from the predicted force."""
         noise = self._cells.noise[self._pair]
         self._spread = (
             noise**2 + (tuning.LAW_ERROR * np.nan_to_num(force)) ** 2 + tuning.JITTER_WEIGHT[2] * self._jitter
@@ -186,7 +190,7 @@ class _Joint:
         return None if point is None or force is None else _At(place, point, force)
 
     def _away(self, place: _Place) -> Array:
-        """Return the expected values of the border's unknowns minus their present values."""
+        """Return the prior means of the border's unknowns minus their present values."""
         late = self._cells.delay - place.delay
         return np.concatenate([self._problem.mean - place.shared, [late], -place.gain])
 
@@ -200,7 +204,8 @@ class _Joint:
     def _linearised(self, at: _At) -> tuple[Linear, Array]:
         """Return the Jacobians of the poses and of the forces.
 
-        The Jacobian of the forces, (m, b + 6), is with respect to the border and the swing's starting state.
+        The Jacobian of the forces, shape (m, b + 6), contains the derivatives with respect to the border and to the
+        starting state of the swing.
         """
         place, border = at.place, self._border
         out = np.zeros((len(self._row), border + 6))
@@ -222,7 +227,7 @@ class _Joint:
         return self._problem.linearise(at.point), out
 
     def _quotient(self, below: _Place, above: _Place, step: float) -> Array:
-        """Return the derivative of the forces between two places, each a step away; 0 where a place cannot be run."""
+        """Return the central difference quotient of the forces; 0 if a motion cannot be simulated."""
         one, other = self._force(below), self._force(above)
         if one is None or other is None:
             return np.zeros(len(self._row))
@@ -251,7 +256,7 @@ class _Joint:
         return out
 
     def _step(self, at: _At, blocks: list[_Block]) -> tuple[Array, Array]:
-        """Return the step of the border, (b,), and its covariance."""
+        """Return the step of the border, shape (b,), and its covariance."""
         normal = np.sum([block.normal for block in blocks], axis=0) + np.diag(self._precision)
         covariance: Array = np.linalg.inv(normal)
         pull = self._precision * self._away(at.place)
@@ -259,7 +264,7 @@ class _Joint:
         return covariance @ score, covariance
 
     def _descended(self, at: _At, blocks: list[_Block]) -> _At | None:
-        """Return the next place, or None if no step reduces the cost."""
+        """Return the values after a step, or None if no step reduces the cost."""
         before, place = self._cost(at), at.place
         step, _ = self._step(at, blocks)
         states = np.stack([block.state + block.answer @ step for block in blocks])
@@ -278,7 +283,7 @@ class _Joint:
         return None
 
     def _unpredicted(self, at: _At, jacobian: Array, blocks: list[_Block]) -> Array:
-        """Return the variance of the forces about their linearisation within the uncertainty of the poses, (m,)."""
+        """Return the variance of the forces that the linearisation does not predict, shape (m,), from random probes."""
         rng, place, total = np.random.default_rng(0), at.place, np.zeros(len(at.force))
         root = np.linalg.cholesky(self._step(at, blocks)[1][:SIZE, :SIZE])
         for _ in range(_PROBES):
@@ -293,7 +298,9 @@ class _Joint:
         return total / _PROBES
 
     def _scatter(self, blocks: list[_Block], covariance: Array) -> float:
-        """Return the variance from the swings' scatter relative to that from noise, averaged over `MOVING`."""
+        """Return the ratio of the variance from the scatter of the swings to the variance from noise, averaged over
+        `MOVING`.
+        """
         scores = np.stack([block.score for block in blocks])
         scores = scores - scores.mean(axis=0)
         count, unknown, moving = len(blocks), self._border - (SIZE - len(MOVING)), list(MOVING)
@@ -330,14 +337,16 @@ class _Joint:
         return JointFit(used, place.shared, covariance[:SIZE, :SIZE])
 
     def _unfitted(self, at: _At) -> int:
-        """Return the number of swings whose forces do not fit, because their starting states are in a false optimum."""
+        """Return the number of swings whose forces do not fit, which indicates a false optimum of the starting
+        states.
+        """
         z = (self._measured - at.force) ** 2 / self._spread
         z, swing = z[np.isfinite(z)], self._swing[np.isfinite(z)]
         count, total = np.bincount(swing), np.bincount(swing, z)
         return int((total > tuning.MOST_MISFIT * np.maximum(count, 1)).sum())
 
     def _left_over(self, at: _At) -> list[list[float]]:
-        """Return for each cell and swing the share of the force that remains unexplained beyond noise."""
+        """Return for each cell, and for each swing, the share of the force that remains unexplained beyond noise."""
         out: list[list[float]] = []
         residual, there = self._measured - at.force, np.isfinite(at.force)
         for k, pair in enumerate(self._cells.pairs.tolist()):

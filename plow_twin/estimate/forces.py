@@ -1,8 +1,8 @@
-"""Contact forces with intervals, from twins whose parameters are drawn from an estimate and that run together.
+"""Contact forces with intervals, from an ensemble of twins whose parameters are drawn from an estimate.
 
-Each member has its own clearances, contact parameters and load gains, drawn from the estimate with their correlation.
-The quantiles over the members are the interval. After some load periods the members have forgotten their initial
-states, so their differences show the uncertainty of the estimate alone.
+Clearances, contact parameters and load gains of each twin (member) are drawn from the estimate with their correlation.
+The interval of a force consists of quantiles over the members. After some load periods the initial states have no
+influence, so the differences between members show only the uncertainty of the estimate.
 """
 
 from __future__ import annotations
@@ -25,33 +25,33 @@ from plow_twin.run.batch import TwinBatch
 
 Array = NDArray[np.float64]
 
-#: Derived: default number of members, with which a 5 % point has a standard error of 1.4 %.
+#: Default number of members, derived from a standard error of 1.4 % of the probability below the 5 % quantile.
 MEMBERS: Final = 256
-#: Definition: quantiles at which an interval has its ends and its middle.
+#: Probabilities of the lower end, the middle and the upper end of an interval, by definition.
 POINTS: Final = (0.05, 0.5, 0.95)
-#: Derived: smallest number of members for which one member is 5 % of all; with fewer members there is no 5 % point.
+#: Smallest number of members, derived from the 5 % quantile, below which at least one member must lie.
 FEWEST: Final = 20
-#: Guard: smallest clearance that a member may have, as a share of the estimated clearance.
+#: Lower bound of the clearance of a member, as a share of the estimated clearance.
 _LEAST_SHARE = 0.02
-#: Derived: tolerance of the members, equal to the fit's.
+#: Tolerance of the solver for the members, equal to the tolerance in a fit.
 TOLERANCE: Final = tuning.TOLERANCE
-#: Bound: number of samples advanced in one call, so that the rows of all members stay in the processor's cache.
+#: Upper bound of the number of samples in one call, so that the rows of all members stay in the processor's cache.
 _CALL = 10
 
 
 class ForcesError(PlowTwinError):
-    """No forces can be drawn from the estimate."""
+    """The forces cannot be computed from the estimate."""
 
 
 @dataclass(frozen=True, eq=False)
 class Forces:
     """Quantiles of the forces over the members, in the order of `POINTS`.
 
-    start : time in s at which peaks and impulses begin
-    t : (n,) in s
-    force : (3, n, 8) of each pair at these times in N
-    peak, impulse : (3, 8) largest force in N and impulse in N s from `start` to the end
-    members, left_out : number of twins within the model's range, and of twins that have left it
+    start : time in s at which the span of peaks and impulses begins
+    t : (n,) times in s
+    force : (3, n, 8) force of each pair at the times `t` in N
+    peak, impulse : (3, 8) largest force in N and impulse in N s of each pair from `start` to the end
+    members, left_out : number of members within the range of the model, and number of members that have left this range
     """
 
     start: float
@@ -63,7 +63,7 @@ class Forces:
     left_out: int
 
     def as_dict(self) -> dict[str, Any]:
-        """Return peaks and impulses for JSON."""
+        """Return peaks and impulses as JSON values."""
         pairs = {
             name: {
                 key: dict(zip(("p05", "p50", "p95"), map(float, values[:, index]), strict=True))
@@ -75,29 +75,31 @@ class Forces:
         return {**counts, "t_start": self.start, "t_end": float(self.t[-1]), "pairs": pairs}
 
     def table(self) -> tuple[list[str], Array]:
-        """Return the names of the columns and the rows of the forces over time."""
+        """Return column names and rows of a table of the forces over time."""
         names = [f"force_{name}/{point}" for name in PAIR_NAMES for point in ("p05", "p50", "p95")]
         return ["t", *names], np.column_stack([self.t, self.force.transpose(1, 2, 0).reshape(len(self.t), -1)])
 
 
 class ForceEnsemble:
-    """Twins whose parameters are drawn from an estimate, and which are advanced together, sample by sample.
+    """Ensemble of twins whose parameters are drawn from an estimate, and which are advanced together.
 
     Parameters
     ----------
     scene : Scene
-        The nominal scene, whose geometry, masses and gravity all members have.
+        The nominal scene. All members have its geometry, masses and gravity.
     found : Estimate
-        The estimate that members are drawn from; it must not be withdrawn.
+        The estimate from which members are drawn; it must not be withdrawn.
     members : int
-        At least 20: fewer have no 5 % point.
-    start : float
+        Number of members, at least 20.
+        seed : int
+            Seed of the random numbers.
+        start : float
         Time in s at which all members are in the scene's initial state.
 
     Raises
     ------
     ForcesError
-        If the estimate is withdrawn or there are too few members.
+        If the estimate is withdrawn, or there are too few members.
     """
 
     def __init__(
@@ -117,14 +119,21 @@ class ForceEnsemble:
         return len(self._twins)
 
     def advance(self, t: Array, wrench: Array, *, over_time: bool = True) -> Forces:
-        """Advance all members through samples of the believed load; `t` (n,) in s, `wrench` (n, 3).
+        """Advance all members through samples of the measured load, and return the forces.
 
-        Without `over_time` the forces at each sample are not computed and stay 0; computing them doubles the cost.
+        Parameters
+        ----------
+        t : ndarray, shape (n,)
+            Times of the samples in s.
+        wrench : ndarray, shape (n, 3)
+            Fx, Fy [N] and M [N m].
+        over_time : bool
+            Whether the forces at each sample are computed, which doubles the cost; otherwise they are 0.
 
         Raises
         ------
         ForcesError
-            If fewer than 20 members are within the model's range.
+            If fewer than 20 members are within the range of the model.
         """
         start, force = self._twins.time, np.zeros((len(POINTS), len(t), PAIR_COUNT))
         peak, impulse = np.zeros((len(self), PAIR_COUNT)), np.zeros((len(self), PAIR_COUNT))
@@ -145,10 +154,12 @@ class ForceEnsemble:
 
 
 def quantiles(values: Array) -> Array:
-    """Return the nearest-rank quantiles over the first axis, in the order of `POINTS`; no value is below zero."""
+    """Return the nearest-rank quantiles over the first axis of values that are not negative, in the order of
+    `POINTS`.
+    """
     places = [min(int(share * len(values)), len(values) - 1) for share in POINTS]
     out = np.zeros((len(POINTS), *values.shape[1:]))
-    # most pairs are apart in all members; their quantiles are 0 and need no sorting
+    # in most pairs the forces of all members are 0, so their quantiles are 0 without sorting
     there = values.any(axis=0)
     out[:, there] = np.partition(np.ascontiguousarray(values[:, there].T), places, axis=1)[:, places].T
     return out
@@ -157,7 +168,10 @@ def quantiles(values: Array) -> Array:
 def forces_of(
     scene: Scene, found: Estimate, load: Load, members: int, settle_s: float, *, over_time: bool = True
 ) -> Forces:
-    """Return the forces under a load, beginning `settle_s` after its first sample, when the members have settled."""
+    """Return the forces under a load from the time `settle_s` [s] after its first sample on.
+
+    By then the initial states of the members have no influence.
+    """
     ensemble = ForceEnsemble(scene, found, members, start=float(load.t[0]))
     load = load.with_knot(float(load.t[0]) + settle_s)
     first = int(np.searchsorted(load.t, load.t[0] + settle_s, side="right"))
@@ -169,7 +183,7 @@ def forces_of(
 
 
 def draw_scenes(scene: Scene, found: Estimate, members: int, rng: np.random.Generator) -> tuple[list[Scene], Array]:
-    """Return scenes drawn from an estimate, and the gains of their loads, shape (m, 3)."""
+    """Return m scenes drawn from an estimate, and the drawn gains of their loads, shape (m, 3)."""
     white = rng.standard_normal((members, len(CORRELATED)))
     if found.correlation is not None:
         white = white @ np.linalg.cholesky(np.array(found.correlation) + 1e-9 * np.eye(len(CORRELATED))).T
@@ -198,7 +212,7 @@ def draw_scenes(scene: Scene, found: Estimate, members: int, rng: np.random.Gene
 
 
 def draw_biases(found: Estimate, members: int, rng: np.random.Generator) -> Array:
-    """Return biases of the sensor drawn from an estimate, shape (m, 3), those of the first member without error."""
+    """Return biases of the sensor drawn from an estimate, shape (m, 3); the first member has the mean biases."""
     drawn = np.zeros((members, 3))
     for index, value in enumerate((found.bias_x, found.bias_y, found.bias_theta)):
         if value is not None:
@@ -208,13 +222,18 @@ def draw_biases(found: Estimate, members: int, rng: np.random.Generator) -> Arra
 
 
 def amplitudes_of(found: Estimate, members: int, rng: np.random.Generator) -> Array:
-    """Return amplitudes of the load's harmonics drawn from an estimate, (m, k, 3); the first member's have no error."""
+    """Return amplitudes of the load's harmonics drawn from an estimate, shape (m, k, 3); the first member has the
+    means.
+    """
     harmonics = found.load_harmonics
     return np.zeros((members, 0, 3)) if harmonics is None else harmonics.drawn(members, rng)
 
 
 def loads_of(t: Array, wrench: Array, gain: Array, harmonics: Harmonics | None, amplitude: Array) -> Array:
-    """Return the loads of members, (m, n, 3), from samples (n,), (n, 3), gains (m, 3) and amplitudes (m, k, 3)."""
+    """Return the loads of the members, shape (m, n, 3).
+
+    `t` (n,) and `wrench` (n, 3) are samples; `gain` (m, 3) and `amplitude` (m, k, 3) belong to the members.
+    """
     if harmonics is not None:
         wrench = wrench + harmonics.basis(t) @ amplitude
     found: Array = wrench * gain[:, None, :]
@@ -222,7 +241,7 @@ def loads_of(t: Array, wrench: Array, gain: Array, harmonics: Harmonics | None, 
 
 
 def _normal(value: Interval, white: Array) -> Array:
-    """Return random numbers whose 5 % and 95 % points are those of the interval, from normal numbers `white`."""
+    """Return random numbers with the 5 % and 95 % quantiles of an interval, from standard normal numbers `white`."""
     below, above = (value.mean - value.p05) / NORMAL_P95, (value.p95 - value.mean) / NORMAL_P95
     return value.mean + np.where(white < 0.0, below, above) * white
 

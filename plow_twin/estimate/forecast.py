@@ -1,7 +1,7 @@
-"""Remaining life: the distribution of the time until a clearance reaches its limit.
+"""Forecast of the remaining life, which is the time until a clearance reaches its limit, as a distribution.
 
-Wear coefficient, present clearances and load are drawn at random. Scenarios repeat the forecast with another load or
-wear coefficient and the same draws.
+Wear coefficient, present clearances and size of the load are drawn at random. Scenarios repeat the forecast with
+another load or another wear coefficient, and with the same random numbers.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from plow_twin.model.scene import Clearance, Scene, Table, Wear
 
 Array = NDArray[np.float64]
 
-#: Definition: number of seconds in an hour.
+#: Seconds per hour, by definition.
 HOUR_S = 3600.0
-#: Guard: a randomly drawn clearance is smaller than the estimated present clearance by at most this share of it.
+#: Upper bound of the share by which a drawn clearance may be smaller than the estimated clearance.
 _LEAST_SHARE = 0.9
 
 
@@ -41,7 +41,7 @@ class Scenario:
 
     @staticmethod
     def parse(text: str) -> Scenario:
-        """Return the scenario of a text like `hard coal:load=1.3,coefficient=2`.
+        """Return the scenario that a text like `hard coal:load=1.3,coefficient=2` describes.
 
         Raises
         ------
@@ -79,7 +79,7 @@ class Plan:
     scenarios: tuple[Scenario, ...] = ()
 
     def __post_init__(self) -> None:
-        """Raise LifeError for an impossible plan."""
+        """Raise `LifeError` for an impossible plan."""
         numbers = {
             "limit_horizontal_m": self.limit_horizontal_m,
             "limit_vertical_m": self.limit_vertical_m,
@@ -101,12 +101,14 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """Hours to the limit.
+    """Distribution of the hours until a clearance reaches its limit.
 
-    hours : (draws,) sorted; infinite where the limit is not reached within the horizon
-    path : wear from the present clearances on
+    hours : (draws,) hours to the limit; infinite if the limit is not reached within the horizon
     rate : (draws,) exposure per hour in 1/N
     now : (draws, 2) present clearances in m
+    speed_m_s : travel speed in m/s
+    plan : the plan of this forecast
+    path : wear from the present clearances on
     scenarios : forecast of each scenario of the plan, by name
     """
 
@@ -119,18 +121,18 @@ class Forecast:
     scenarios: dict[str, Forecast] = field(default_factory=dict)
 
     def quantile(self, share: float) -> float | None:
-        """Return the hours after which the limit is reached with probability `share`; None if beyond the horizon."""
+        """Return the hours within which the limit is reached with probability `share`; None beyond the horizon."""
         value = float(np.sort(self.hours)[min(int(share * len(self.hours)), len(self.hours) - 1)])
         return value if math.isfinite(value) else None
 
     def probability_before(self, hours: float) -> float:
-        """Return the probability that the limit is reached before a time."""
+        """Return the probability that the limit is reached within a number of hours."""
         return float(np.mean(self.hours <= hours))
 
     def clearances(self, hours: Array) -> Array:
-        """Return P10, P50 and P90 of both clearances in m after some hours, shape (3, n, 2).
+        """Return the 10 %, 50 % and 90 % quantiles of both clearances in m after n numbers of hours, shape (3, n, 2).
 
-        They are infinite after the end of the path, because a limit has been reached there.
+        A quantile is infinite beyond the end of the path, where a limit has been reached.
         """
         grown = self.path.clearance_growth()
         exposure = np.multiply.outer(self.rate, hours)
@@ -141,7 +143,7 @@ class Forecast:
         return np.quantile(np.stack(each, axis=2), (0.1, 0.5, 0.9), axis=0, method="lower")
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the forecast for JSON; times beyond the horizon are null."""
+        """Return the forecast as JSON values; times beyond the horizon are null."""
         plan = self.plan
         return {
             **self._times(),
@@ -179,24 +181,25 @@ def forecast(
     deviation_m: tuple[float, float] = (0.0, 0.0),
     known: Coefficient | None = None,
 ) -> Forecast:
-    """Forecast when a clearance of `scene` reaches its limit.
+    """Return the forecast of the time at which a clearance of the scene reaches its limit.
 
     Parameters
     ----------
     scene : Scene
-        A scene with wear, with the present clearances and the expected loads. `wear.prior_m2_n` gives the 5 % and 95 %
-        points of the coefficient's log-normal distribution.
-    plan : Plan
+        A scene with wear, the present clearances and the expected loads. `wear.prior_m2_n` contains the 5 % and 95 %
+        quantiles of the log-normal distribution of the wear coefficient.
+        plan : Plan
+            Limits and operation of the machine.
     deviation_m : tuple of float
         Standard deviations of the present clearances in m.
     known : Coefficient or None
-        Posterior of the wear coefficient from a history of clearances. It includes the uncertainty of the load, so only
-        `tuning.PATH_DEVIATION` is drawn in addition. None for the prior.
+        Posterior of the wear coefficient from a history of clearances; None for the prior. The posterior already
+        includes the uncertainty of the load, so only the model error `tuning.PATH_DEVIATION` is drawn in addition.
 
     Raises
     ------
     LifeError
-        If the scene has no wear, does not travel or has no period, or if its coefficient lies outside the prior.
+        If the scene has no wear, no travel or no period, or if its wear coefficient lies outside the prior.
     """
     others = {
         one.name: _forecast(with_load(scene, one.load), plan, deviation_m, known, one.coefficient)
@@ -208,7 +211,7 @@ def forecast(
 def _forecast(
     scene: Scene, plan: Plan, deviation_m: tuple[float, float], known: Coefficient | None, multiple: float = 1.0
 ) -> Forecast:
-    """Forecast for a multiple of the known wear coefficient."""
+    """Return the forecast with the wear coefficient times `multiple`, without scenarios."""
     wear = wear_in_travel(scene)
     if not all(0.0 <= value < math.inf for value in deviation_m):
         raise LifeError(f"deviations: got {deviation_m} m, expected two finite numbers >= 0")
@@ -223,10 +226,10 @@ def _forecast(
         coefficient, load = known.draw(plan.draws, rng), 1.0 + tuning.PATH_DEVIATION * rng.standard_normal(plan.draws)
     coefficient = coefficient * multiple
     size = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
-    # a randomly drawn clearance stays above zero, even if the clearance is hardly known
+    # a drawn clearance must stay above zero, even if the clearance is very uncertain
     now = np.maximum(rng.normal(0.0, 1.0, (plan.draws, 2)) * deviation_m, -_LEAST_SHARE * size)
     most = float(coefficient.max() * load.max()) * travel / wear.pad_area_m2
-    # a smaller present clearance is further from its limit, so the path must be longer
+    # the path must be long enough for the smallest drawn clearance, which is farthest from its limit
     spare = tuple(float(value) for value in -now.min(axis=0))
     limit = (plan.limit_horizontal_m + spare[0], plan.limit_vertical_m + spare[1])
     path = wear_path(scene, limit, most)
@@ -244,7 +247,7 @@ def _forecast(
 
 
 def check_prior(wear: Wear) -> None:
-    """Raise LifeError if the scene's coefficient lies outside its prior, from which forecasts draw coefficients."""
+    """Raise `LifeError` if the wear coefficient of the scene lies outside the prior, from which forecasts are drawn."""
     low, high = wear.prior_m2_n
     if not low <= wear.coefficient_m2_n <= high:
         raise LifeError(
@@ -254,14 +257,14 @@ def check_prior(wear: Wear) -> None:
 
 
 def _exposure_at(exposure: Array, clearance: Array, limit: Array) -> Array:
-    """Return the exposure at which a non-decreasing clearance reaches each limit, infinite if it does not reach it."""
+    """Return the exposure at which a non-decreasing clearance reaches each limit; infinite for a limit not reached."""
     rising = np.maximum.accumulate(clearance) + 1e-15 * np.arange(len(clearance))
     at = np.interp(limit, rising, exposure)
     return np.where(limit > rising[-1], np.inf, np.where(limit <= rising[0], 0.0, at))
 
 
 def with_load(scene: Scene, multiple: float) -> Scene:
-    """Return the scene with all of its loads multiplied; gravity does not change."""
+    """Return the scene with all loads multiplied by `multiple`; gravity does not change."""
 
     def times(values: tuple[float, float]) -> tuple[float, float]:
         return multiple * values[0], multiple * values[1]
@@ -278,11 +281,11 @@ def with_load(scene: Scene, multiple: float) -> Scene:
 
 
 def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth: Array | None = None) -> Scene:
-    """Return the scene with the estimated clearances, which include all wear so far.
+    """Return the scene with estimated clearances, which include all wear so far.
 
-    `depth`, shape (8,) in m, is the wear of the pads, if known; it is subtracted from the clearances to give those of
-    new pads. If it is not known and the scene has running-in, the growth of the clearances gives the wear, because worn
-    pads wear more slowly than new pads.
+    `depth`, shape (8,), contains the wear depths of the pads in m, which are subtracted to obtain the clearances of new
+    pads. If the depths are not given and the scene has running-in, they are computed from the growth of the clearances,
+    because worn pads wear more slowly than new pads.
     """
     wear, new = scene.wear, scene.clearance
     if wear is None:
@@ -290,7 +293,7 @@ def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth:
     if depth is None:
         depth = np.zeros(PAIR_COUNT)
         if wear.running_in_ratio > 1.0:
-            # each of the two walls has half of the growth
+            # each of the two walls is assumed to have half of the growth
             depth += 0.5 * max(horizontal_m - new.horizontal_m, 0.0) * np.abs(NORMAL_X)
             depth += 0.5 * max(vertical_m - new.vertical_m, 0.0) * np.abs(NORMAL_Y)
     grown = 0.5 * depth @ np.abs(NORMAL_X), 0.5 * depth @ np.abs(NORMAL_Y)
@@ -299,14 +302,15 @@ def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth:
 
 
 def with_estimate(scene: Scene, facts: Mapping[str, Any]) -> tuple[Scene, tuple[float, float]]:
-    """Return the scene with the values of an estimate's JSON, and the standard deviations of the clearances in m.
+    """Return the scene with the values of an estimate (JSON), and the standard deviations of the clearances in m.
 
-    If a clearance was estimated, the scene gets the estimated contact too, because a softer contact loads other pads.
+    If a clearance was estimated, the estimated contact is used too, because the stiffness determines which pads are
+    loaded.
 
     Raises
     ------
     LifeError
-        If the estimate is withdrawn, or the JSON is not an estimate's.
+        If the estimate is withdrawn, or `facts` is not an estimate.
     """
     if not isinstance(facts, Mapping):
         raise LifeError(f"estimate: got {type(facts).__name__}, expected the output of `plow-twin estimate --json`")
@@ -319,7 +323,7 @@ def with_estimate(scene: Scene, facts: Mapping[str, Any]) -> tuple[Scene, tuple[
 
 
 def _mean(name: str, facts: Any) -> float:
-    """Return the mean of a number of the contact, from its part of an estimate's JSON."""
+    """Return the mean of a contact parameter from its part of an estimate (JSON)."""
     try:
         mean = float(facts["mean"])
     except (KeyError, TypeError, ValueError):
@@ -330,7 +334,7 @@ def _mean(name: str, facts: Any) -> float:
 
 
 def _estimated(name: str, facts: Any) -> tuple[float, float]:
-    """Return mean and standard deviation of a clearance in m, from its part of an estimate's JSON."""
+    """Return mean and standard deviation of a clearance in m from its part of an estimate (JSON)."""
     try:
         state = State(facts["state"])
         mean, low, high = (float(facts[key]) for key in ("mean_m", "p05_m", "p95_m"))

@@ -1,4 +1,4 @@
-"""The forward model of the estimate: motions of one scene with varied parameters under the believed load."""
+"""The forward model of the estimate, which simulates a scene with varied parameters under the measured load."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from plow_twin.solve.state import EVENT, SEGMENT, TOTALS, Parts, Status, new_rec
 
 Array = NDArray[np.float64]
 
-#: Bound: a run takes at most `_STEPS_PER_SECOND` steps for each second of motion and `_STEPS` more; its log has
-#: `_LOG_SIZE` rows.
+#: Upper bounds of one simulation: number of steps per second of motion, number of steps in addition, and number of rows
+#: in the event log.
 _STEPS_PER_SECOND, _STEPS = 20_000, 2_000
 _LOG_SIZE = 4096
-#: Bound: number of series steps that cost as much as one implicit step.
+#: Cost of an implicit step in steps of the series, which counts towards the bound of the work.
 _IMPLICIT_WORK = 10
 
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """Poses and rates of all rows, shape (n, 3) each, and contact times of each run and pair in s, shape (s, 8)."""
+    """Result of simulations: poses and rates of all rows, shape (n, 3) each, and contact times in s, shape (s, 8)."""
 
     q: Array
     v: Array
@@ -38,14 +38,14 @@ class Motions:
 
 
 class Forward:
-    """Runs one scene with varied parameters; all runs use one compiled kernel, because the terms do not change.
+    """Forward model of one scene; simulations with varied parameters use the same compiled kernel.
 
     Parameters
     ----------
     scene : Scene
         The nominal scene, whose loads and wear are not used.
-    load : Load
-        The believed load.
+        load : Load
+            The measured load.
 
     Raises
     ------
@@ -71,46 +71,46 @@ class Forward:
         self._scene, self.load = scene, load
         self._work, self._log = new_work(), np.zeros(_LOG_SIZE, EVENT)
         self._params: tuple[Scene, tuple[bytes | None, ...], Any] | None = None
-        #: work done so far, in steps of the series
+        #: work of all simulations so far, in steps of the series
         self.work = 0
 
     def renewed(self) -> Forward:
-        """Return a copy whose counter of work is zero."""
+        """Return a copy with the work counter at zero."""
         return Forward(self._scene, self.load)
 
     def of(self, scene: Scene) -> Forward:
-        """Return a model of another nominal scene under the same load; its counter of work is zero."""
+        """Return a model of another nominal scene under the same load, with the work counter at zero."""
         return Forward(scene, self.load)
 
     def under(self, load: Load) -> Forward:
-        """Return a model of the same nominal scene under another load; its counter of work is zero."""
+        """Return a model of the same nominal scene under another load, with the work counter at zero."""
         return Forward(self._scene, load)
 
     def run(
         self, scene: Scene, gain: Array, starts: Array, states: Array, edges: NDArray[np.int64], times: Array,
         depth: Array | None = None, push: Array | None = None, share: Array | None = None,
     ) -> Motions | None:  # fmt: skip
-        """Return the motions of `scene` under the load times `gain`, shape (3,), from several states.
+        """Return the motions of `scene` from several states, under the load times `gain`, shape (3,).
 
         Parameters
         ----------
         starts, states : ndarray, shape (s,), (s, 6)
-            Times in s at which the runs begin, and x, y, theta and their rates at these times.
+            Times in s at which the simulations begin, and x, y, theta and their rates at these times.
         edges : ndarray of int64, shape (s + 1,)
-            Run m fills the rows edges[m]:edges[m + 1].
+            Simulation m fills the rows edges[m]:edges[m + 1].
         times : ndarray, shape (n,)
-            Times of the rows in s, rising within each run and not before its start.
+            Times of the rows in s, which rise within each simulation and are not before its start.
         depth : ndarray, shape (8,), optional
             Outward displacement of each pad in m, in addition to the clearances.
         push : ndarray, shape (3,), optional
-            A constant load added to the believed load, in N, N, N m.
+            A constant load that is added to the measured load, in N, N, N m.
         share : ndarray, shape (8,), optional
             Stiffness of each pair relative to the contact's stiffness.
 
         Returns
         -------
         Motions or None
-            None if the head leaves the model's range.
+            None if the head leaves the range of the model.
         """
         params, segments = self._compiled(scene, gain, depth, push, share)
         records = new_records(state_type(self._terms), len(starts))
@@ -135,14 +135,14 @@ class Forward:
     def _compiled(
         self, scene: Scene, gain: Array, depth: Array | None, push: Array | None, share: Array | None
     ) -> tuple[Any, Any]:
-        """Return the parameters, which are cached because successive runs often share them, and the load's segments."""
+        """Return the parameters of the kernel, which are cached, and the segments of the load."""
         walls = tuple(None if part is None else part.tobytes() for part in (depth, share))
         if self._params is None or self._params[:2] != (scene, walls):
             params = compile_scene(scene, tuning.TOLERANCE, sampled=True).params
             if depth is not None:
                 params["penetration_rows"][4] -= depth
             if share is not None:
-                # in a linear contact, scaling the penetration has the same effect as scaling the stiffness
+                # with a linear law, a factor on the penetration has the same effect as a factor on the stiffness
                 params["penetration_rows"][:] *= share
             self._params = scene, walls, params
         inertia = inertias(scene)

@@ -1,8 +1,9 @@
-"""Clearances from gap sensors, independent of the contact law, and the pose where it is not measured.
+"""Clearances from gap sensors, independent of the contact law, and poses if they are not measured otherwise.
 
-A gap is linear in the head's body coordinates and in the clearances (`model/geometry.py`), so each message with enough
-gaps gives both by least squares. Five pairs are enough; with a measured theta, four pairs are enough, one at each wall.
-The constant errors of the sensors do not average out and limit the accuracy.
+A gap is linear in the clearances and in the head's body coordinates (`model/geometry.py`). Each message with enough
+gaps therefore determines clearances and pose by least squares. Gaps of five pairs are enough. If theta is measured,
+gaps of four pairs are enough, one at each wall. The accuracy is limited by the constant errors of the sensors, which
+averaging does not reduce.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Guard: a number above this is not a gap [m].
+#: Guard against faulty readings: largest distance [m] that is accepted as a gap.
 _LARGEST = 1e3
-#: Bound: number of rounds; in each round the residual of the nonlinear equations corrects the pose.
+#: Upper bound of the iterations, in which the residual of the nonlinear equations corrects the pose.
 _ROUNDS = 4
-#: Guard: singular value of the equations below which the sensors do not determine an unknown.
+#: Lower bound of a singular value of the equations; below this value the sensors do not determine an unknown.
 _SINGULAR = 1e-6
-#: Definition: the two pairs of each clearance between facing pads.
+#: Indices of the two opposite pairs of each clearance between facing pads, by definition.
 GROUPS: Final = {
     "horizontal_top": (1, 3),
     "horizontal_bottom": (7, 5),
@@ -44,9 +45,11 @@ class GapsError(PlowTwinError):
 
 @dataclass(frozen=True, eq=False)
 class Gaps:
-    """Measured gaps: `t` (n,) stamps in s, strictly increasing; `gap` (n, 8) in m, NaN where there is no sensor.
+    """Measured gaps.
 
-    deviation : stated standard deviation of a sensor in m; 0 if not stated
+    t : (n,) strictly increasing stamps in s
+    gap : (n, 8) gap of each pair in m, NaN without a measurement
+    deviation : stated standard deviation of a sensor in m, 0 if not stated
     """
 
     t: Array
@@ -55,9 +58,9 @@ class Gaps:
 
     @staticmethod
     def of(t: ArrayLike, gap: ArrayLike, deviation: float = 0.0) -> tuple[Gaps, int]:
-        """Return rows in order of time, and the number of rows left out.
+        """Return the usable rows in order of time, and the number of rows that are left out.
 
-        Rows are left out if their stamp is not finite or repeated, if they have no gap, or a gap beyond 1e3 m.
+        A row is left out if its stamp is not finite or occurs twice, if it contains no gap, or if a gap exceeds 1e3 m.
 
         Raises
         ------
@@ -68,7 +71,7 @@ class Gaps:
         return Gaps(times, rows, deviation), left_out
 
     def between(self, start: float, end: float) -> Gaps:
-        """Return the rows stamped in [start, end)."""
+        """Return the rows with stamps in [start, end)."""
         inside = (self.t >= start) & (self.t < end)
         return replace(self, t=self.t[inside], gap=self.gap[inside])
 
@@ -77,11 +80,11 @@ class Gaps:
 class GapsFit:
     """Clearances and poses computed from measured gaps.
 
-    poses : poses from the gaps; empty if theta was taken from the measured poses
+    poses : poses computed from the gaps; empty if theta was taken from measured poses
     clearance, deviation : (2,) horizontal and vertical clearance, and their standard deviations, in m
-    groups : clearances between facing pads that both have sensors
-    used : number of messages, all with the same sensors
-    contradiction : largest mean residual of a sensor in units of the constant error; 0 if no sensor is redundant
+    groups : clearance between each two facing pads with sensors
+    used : number of messages that were used
+    contradiction : largest mean residual of a sensor in units of its constant error; 0 if no sensor is redundant
     """
 
     poses: Poses
@@ -93,10 +96,10 @@ class GapsFit:
 
 
 def fit_gaps(scene: Scene, gaps: Gaps, poses: Poses) -> GapsFit | str:
-    """Fit clearances and poses to gaps; theta is taken from `poses` if the gaps do not determine it.
+    """Return the fit of clearances and poses to gaps, or a message why there is no fit.
 
-    Of messages with different sensors, the most frequent set of enough sensors is used. If no such set has 20 messages,
-    the reason why the most frequent set is not used is returned.
+    If the gaps do not determine theta, it is taken from `poses`. Messages may contain different sets of sensors. The
+    most frequent set that determines the unknowns is used; it must occur in at least 20 messages.
     """
     error = gaps.deviation or tuning.CONSTANT_ERROR
     rows = penetration_rows(replace(scene, clearance=Clearance(0.0, 0.0)))
@@ -129,12 +132,12 @@ def _theta_at(t: Array, poses: Poses) -> Array:
 def _fit_one_set(
     rows: Array, t: Array, gap: Array, pairs: NDArray[np.int64], theta: Array, error: float, scene: Scene
 ) -> GapsFit | str:
-    """Fit the messages of one set of sensors; `gap`, shape (n, k), holds the gaps of the pairs `pairs`, shape (k,).
+    """Return the fit to n messages with the same k sensors, or a message why there is no fit.
 
-    If these pairs do not determine the clearances, the reason is returned.
+    `gap`, shape (n, k), contains the gaps of the pairs with the indices `pairs`, shape (k,).
     """
     names = ", ".join(PAIR_NAMES[pair] for pair in pairs)
-    # the gap of a pair is half the clearances minus the reach of the pair's corner
+    # the gap of a pair is half the clearance minus the reach of its corner
     half = 0.5 * np.abs(np.stack([NORMAL_X, NORMAL_Y], axis=1))[pairs]
     fixed = np.concatenate([-rows[2:4, pairs].T, half], axis=1)
     with_turn = np.concatenate([fixed, -rows[1, pairs][:, None]], axis=1)
@@ -153,14 +156,14 @@ def _fit_one_set(
     inverse = np.linalg.pinv(equations)
     left = np.zeros_like(gap)
     for _ in range(_ROUNDS):
-        # theta is small, so the equations at theta = 0 are good enough for all rounds
+        # theta is small, so the iterations converge with the derivatives at theta = 0
         c, s = np.cos(unknown[:, 4]), np.sin(unknown[:, 4])
         reach = c[:, None] * rows[0, pairs] + s[:, None] * rows[1, pairs] + rows[4, pairs]
         left = gap - (unknown[:, :4] @ fixed.T - reach)
         unknown[:, : equations.shape[1]] += left @ inverse.T
     x, y = _displacement(unknown, scene)
     clearance = np.median(unknown[:, 2:4], axis=0)
-    # the error of each sensor is constant, so only the noise becomes smaller by averaging
+    # averaging reduces only the noise, not the constant errors of the sensors
     spread = error * np.sqrt((inverse[2:4] ** 2).sum(axis=1))
     noise = unknown[:, 2:4].std(axis=0) / np.sqrt(len(t))
     q = np.stack([x, y, unknown[:, 4]], axis=1)
@@ -177,14 +180,14 @@ def _fit_one_set(
 
 
 def _displacement(unknown: Array, scene: Scene) -> tuple[Array, Array]:
-    """Return x and y in m, shape (n,) each, from body coordinates."""
+    """Return x and y in m, shape (n,) each, from body coordinates and theta."""
     c, s = np.cos(unknown[:, 4]), np.sin(unknown[:, 4])
     across, up = (unknown[:, :2] - scene.head.com_offset_m).T
     return c * across - s * up, s * across + c * up
 
 
 def _between(rows: Array, t: Array, gap: Array, pairs: NDArray[np.int64], pair: tuple[int, int], theta: Array) -> Array:
-    """Return the clearance between two facing pads from each message, shape (n,), for any pose of the head."""
+    """Return the clearance in m between the two facing pads of `pair` from each message, shape (n,)."""
     first, second = (gap[:, int(np.flatnonzero(pairs == one)[0])] for one in pair)
     both = rows[:, list(pair)].sum(axis=1)
     clearance: Array = first + second + np.cos(theta) * both[0] + np.sin(theta) * both[1] + both[4]

@@ -1,6 +1,6 @@
-"""Harmonics that a measured load lacks: Fourier terms at low multiples of its own frequency.
+"""Harmonics that are missing from a measured load: Fourier terms at low multiples of the frequency of the load.
 
-A working load is periodic, so what its measurement lacks is mostly periodic too, with the same period.
+A working load is periodic, so the missing part is mostly periodic too, with the same period.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from plow_twin.estimate.measurements import Load
 
 Array = NDArray[np.float64]
 
-#: Definition: names of the components of a load.
+#: Names of the components of a load.
 COMPONENTS: Final = ("fx", "fy", "m")
-#: Bound: number of corrections of a load's frequency; convergence is quadratic: a correction leaves about the square of
-#: the error.
+#: Upper bound of the number of corrections of a load's frequency, which converge quadratically.
 _CORRECTIONS = 6
-#: Derived: number of knots in the shortest period of a harmonic; straight lines between the knots are 0.9 % off.
+#: Number of knots in the shortest period of a harmonic, derived from an error of 0.9 % of the linear interpolation.
 _KNOTS = 24
 
 
 @dataclass(frozen=True, eq=False)
 class Harmonics:
-    """Fourier terms of a load, in the order constant, sine and cosine of each multiple.
+    """Fourier terms that are added to a load: a constant, then sine and cosine of each multiple of the frequency.
 
     omega : angular frequency of the load in rad/s
-    multiples : multiples of this frequency
+    multiples : multiples of `omega` that have terms
     size : (3,) unit of the amplitudes in N, N, N m; in a fit half the range of the measured load
-    amplitude, variance : (k, 3) of each term, in units of `size` and of its square
-    begin : time in s from which the phases count
+    amplitude : (k, 3) amplitude of each term in units of `size`
+    variance : (k, 3) variance of each amplitude in units of the square of `size`
+    begin : time in s at which the phases are zero
     """
 
     omega: float
@@ -47,7 +47,9 @@ class Harmonics:
 
     @staticmethod
     def of(load: Load) -> Harmonics | None:
-        """Return harmonics of a load's frequency with zero amplitude; None if the load has fewer than two periods."""
+        """Return harmonics of the frequency of a load, with zero amplitude; None if the load has fewer than two
+        periods.
+        """
         omega = frequency(load)
         if omega is None:
             return None
@@ -56,14 +58,14 @@ class Harmonics:
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> Harmonics:
-        """Return the harmonics from `data`, made by `as_dict`."""
+        """Return the harmonics from `data`, a result of `as_dict`."""
         mean, deviation = np.array(data["mean"]), np.array(data["deviation"])
         return Harmonics(
             data["omega_rad_s"], tuple(data["multiples"]), np.ones(3), mean, deviation**2, data.get("begin_s", 0.0)
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the harmonics for JSON, in N, N, N m."""
+        """Return the harmonics as JSON values, in N, N, N m."""
         return {
             "omega_rad_s": self.omega,
             "multiples": list(self.multiples),
@@ -72,36 +74,36 @@ class Harmonics:
         }
 
     def in_units(self, force: float, length: float, time: float) -> Harmonics:
-        """Return the harmonics converted from these units of force, length and time to SI."""
+        """Return the harmonics converted to SI from given units of force, length and time."""
         size = self.size * [force, force, force * length]
         return replace(self, omega=self.omega / time, size=size, begin=self.begin * time)
 
     def basis(self, t: Array) -> Array:
-        """Return the value of each term at the times `t` for an amplitude of 1, shape (n, k)."""
+        """Return the value of each term with amplitude 1 at n times `t` in s, shape (n, k)."""
         turns = self.omega * np.outer(t - self.begin, self.multiples)
         waves = np.stack([np.sin(turns), np.cos(turns)], axis=2).reshape(len(t), -1)
         return np.concatenate([np.ones((len(t), 1)), waves], axis=1)
 
     def at(self, t: Array) -> Array:
-        """Return the sum of the terms at the times `t`, shape (n, 3), in N, N, N m."""
+        """Return the sum of all terms at n times `t` in s, shape (n, 3), in N, N, N m."""
         found: Array = self.basis(t) @ self.amplitude * self.size
         return found
 
     def added(self, load: Load) -> Load:
-        """Return a load with these harmonics added, and with knots that resolve them."""
+        """Return the sum of a load and the harmonics, with additional knots that resolve the harmonics."""
         step = 2.0 * math.pi / (self.omega * max(self.multiples) * _KNOTS)
         t = np.union1d(load.t, np.arange(load.t[0], load.t[-1], step))
         wrench = np.stack([np.interp(t, load.t, column) for column in load.wrench.T], axis=1)
         return replace(load, t=t, wrench=wrench + self.at(t))
 
     def moved(self, by: Array, variance: Array | None = None) -> Harmonics:
-        """Return harmonics with the amplitudes changed by `by`, and with other variances, (3 k,) each."""
+        """Return harmonics with `by` added to the amplitudes, and with new variances, if given, shape (3 k,) each."""
         shape = self.amplitude.shape
         known = self.variance if variance is None else variance.reshape(shape)
         return replace(self, amplitude=self.amplitude + by.reshape(shape), variance=known)
 
     def drawn(self, members: int, rng: np.random.Generator) -> Array:
-        """Return amplitudes in N, N, N m, shape (members, k, 3), those of the first member without error."""
+        """Return random amplitudes in N, N, N m, shape (members, k, 3); the first member has the means."""
         white = rng.standard_normal((members, *self.amplitude.shape))
         white[0] = 0.0
         found: Array = (self.amplitude + np.sqrt(self.variance) * white) * self.size
@@ -115,9 +117,9 @@ class Harmonics:
 
 
 def frequency(load: Load) -> float | None:
-    """Return the angular frequency in rad/s of the strongest oscillation of a load; None without two periods of it.
+    """Return the angular frequency in rad/s of the strongest oscillation of a load; None with fewer than two periods.
 
-    The frequency is corrected by the difference between the phases in the first and in the second half of the load.
+    The frequency is corrected by the phase difference between the first half and the second half of the load.
     """
     period, span = load.oscillation(), float(load.t[-1] - load.t[0])
     if period is None:
