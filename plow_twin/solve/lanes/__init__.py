@@ -1,1 +1,1 @@
-"""Eight scenes in one SIMD vector; each lane runs a scene with its own steps, times, modes and events (`loop`)."""
+"""Computation of eight scenes in SIMD vectors. Each lane runs one scene with its own steps, times, modes and events."""

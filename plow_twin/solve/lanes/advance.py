@@ -1,7 +1,7 @@
-"""Many live twins in lanes under sampled loads: a twin advances from sample to sample and writes a row at each sample.
+"""Live twins in lanes under sampled loads. A twin advances from sample to sample, and writes a row at each sample.
 
-If a load is sampled frequently, a step ends at the next sample long before its series loses accuracy. A series is
-therefore cut off at the order from which its terms are negligible over this step (`series.expand`).
+If a load is sampled frequently, a step ends at the next sample long before its series becomes inaccurate. A series
+therefore ends at the order from which its terms are negligible over this step (`series.expand`).
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ from plow_twin.solve.method.rest import slow_enough
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, Status, X, Y
 from plow_twin.solve.step import LONGEST_STEP
 
-#: Under a constant load, a lane that has taken this number of steps towards a sample is checked for rest; the check
-#: costs as much as these steps.
+#: Number of steps towards a sample under constant load, after which a lane is checked for rest. The check costs as much
+#: as these steps.
 _MAY_REST: Final = 32
-#: A term of a series counts as vanished if it is below this share of the admissible size of the last order's term
+#: Size of a term that is treated as zero, divided by the admissible size of the term of the last order
 #: (`method.series`).
 _VANISHED: Final = 0.4
 _SHORTEST_SPAN: Final = 1e-100
@@ -67,7 +67,7 @@ _TIMES: Final = 3 * PAIR_COUNT
 
 
 class Load(NamedTuple):
-    """The samples of the load of all twins."""
+    """Samples of the load of all twins."""
 
     #: previous sample, Fx, Fy [N] and M [N m] about the cavity's centre, shape (m, 3), or (1, 3) for all twins
     before: NDArray[np.float64]
@@ -76,25 +76,25 @@ class Load(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """The samples through which twins are advanced, and the progress of each twin."""
+    """Samples through which twins are advanced, and the progress of each twin."""
 
     params: NDArray[np.void]  #: parameters of all twins, shape (m,)
     states: NDArray[np.void]
-    blocks: NDArray[np.void]  #: the twins of a thread, eight in a `BLOCK`; shape (b,)
-    #: for each block, a bit for each twin whose modes are noted in it; -1 for a block that must be loaded from records
+    blocks: NDArray[np.void]  #: twins of a thread, eight in each `BLOCK`; shape (b,)
+    #: for each block, bit mask of the twins whose modes it contains; -1 for a block that must be loaded from records
     noted: NDArray[np.int64]
-    totals: NDArray[np.void]  #: counts of touches since the previous sample, by lane, shape (8,)
+    totals: NDArray[np.void]  #: numbers of touches since the previous sample, by lane, shape (8,)
     times: NDArray[np.float64]  #: times of the samples in s, shape (n,)
     load: Load
     rows: NDArray[np.void]  #: rows of `ADVANCE` to fill, shape (m, n)
     place: NDArray[np.int64]  #: number of samples that each twin has passed, shape (m,)
-    progress: NDArray[np.int64]  #: by `BLOCK_NOW` to `LOADED`
-    other: NDArray[np.int64]  #: indices of the twins that left for another method, shape (m,)
+    progress: NDArray[np.int64]  #: indexed by `BLOCK_NOW` to `END`
+    other: NDArray[np.int64]  #: indices of the twins that another method continues, shape (m,)
 
 
-#: Indices in `Samples.progress`: the present block, the number of twins that left for another method, whether the
-#: present block is in the lanes (`_LOADED`, or `_LEFT` if one of its twins left), and the thread's first twin and the
-#: twin after its last.
+#: Indices in `Samples.progress`: current block, number of twins that another method continues, state of the current
+#: block, first twin of the thread, and the twin after its last twin. The state of the block is 0 if it is not in the
+#: lanes, `_LOADED` if it is, or `_LEFT` if one of its twins has left the lanes.
 BLOCK_NOW, OTHERS, LOADED, FIRST, END = range(5)
 _LOADED, _LEFT = 1, 2
 
@@ -111,7 +111,7 @@ def _unowned_samples(s):
 
 @kernel()
 def _begin_samples(s, lanes, bits) -> None:
-    """Make the loads of some lanes linear up to their next samples, and keep the lanes' present states."""
+    """Set the loads of some lanes to straight lines up to their next samples, and store the current states."""
     samples = s.load.samples
     for j in range(3):
         set_row(lanes.sample, j, choose(bits, exact_row(lanes.next, j), exact_row(lanes.sample, j)))
@@ -150,7 +150,10 @@ def _copy_lanes(there, i, source, at, bits) -> None:
 
 @kernel()
 def _undo(s, lanes, bits) -> None:
-    """Set some lanes back to their states at the previous sample, and clear their sums; `note_modes` must follow."""
+    """Restore the states of some lanes at the previous sample, and reset their sums.
+
+    The caller has to call `note_modes` afterwards.
+    """
     for i in range(PAIR_COUNT):
         _copy_lanes(lanes.y, i, lanes.kept, i, bits)
         _copy_lanes(lanes.factor, i, lanes.kept, PAIR_COUNT + i, bits)
@@ -174,7 +177,7 @@ def _steps_since(lanes, lane) -> int:
 
 @kernel()
 def _next_block(s, hysteretic, power, lanes) -> bool:
-    """Load the next block with a twin that has not passed all samples; return whether there is such a block."""
+    """Load the next block with a twin that has not passed all samples. Return whether there is such a block."""
     progress = s.progress
     if progress[LOADED] != 0:
         _store_block(s, hysteretic, power, lanes)
@@ -193,7 +196,7 @@ def _next_block(s, hysteretic, power, lanes) -> bool:
 
 @kernel()
 def _load_block(s, power, lanes, first, count, live) -> None:
-    """Put `count` twins from `first` on into the lanes, and begin the advances of the twins in `live`."""
+    """Load `count` twins into the lanes, beginning with `first`, and start the advances of the twins in `live`."""
     block = s.progress[BLOCK_NOW]
     if s.noted[block] < 0:
         for lane in range(count):
@@ -222,7 +225,7 @@ def _load_block(s, power, lanes, first, count, live) -> None:
 
 @kernel()
 def _load_record(s, power, lanes, lane, member) -> None:
-    """Put a twin into a lane from its record; `join_lanes` must follow."""
+    """Load a twin into a lane from its record. The caller has to call `join_lanes` afterwards."""
     p = s.params[member]
     load_lane(p, s.states[member], power, lanes, lane, member)
     lanes.small[lane] = _VANISHED * p.threshold[p.order]
@@ -232,7 +235,7 @@ def _load_record(s, power, lanes, lane, member) -> None:
 
 @kernel()
 def _store_block(s, hysteretic, power, lanes) -> None:
-    """Write the lanes to their block; if a twin left for another method, the block must be loaded from records."""
+    """Write the lanes to their block. If a twin has left the lanes, the block must be loaded from records."""
     block = s.progress[BLOCK_NOW]
     if s.progress[LOADED] == _LOADED:
         refresh(lanes, hysteretic, power)
@@ -247,7 +250,7 @@ def _store_block(s, hysteretic, power, lanes) -> None:
 
 @kernel()
 def _clear_sums(s, lanes, bits) -> None:
-    """Clear the sums of the rows of some lanes, and of all lanes whose twins are done."""
+    """Reset the sums of the rows of some lanes, and of all lanes whose twins have passed all samples."""
     zero, bits = exact_splat(0.0), bits | ~lanes.live[0]
     for pair in range(PAIR_COUNT):
         set_row(lanes.peak, pair, choose(bits, zero, exact_row(lanes.peak, pair)))
@@ -262,7 +265,10 @@ def _clear_sums(s, lanes, bits) -> None:
 
 @kernel()
 def _fail(s, lanes, lane, code) -> None:
-    """Undo a failed advance: the twin has its old state at the next sample's time. `note_modes` must follow."""
+    """Undo a failed advance: the twin gets its previous state at the time of the next sample.
+
+    The caller has to call `note_modes` afterwards.
+    """
     member, steps = lanes.member[lane], _steps_since(lanes, lane)
     i = s.place[member]
     _undo(s, lanes, 1 << lane)
@@ -282,9 +288,10 @@ def _fail(s, lanes, lane, code) -> None:
 
 @kernel()
 def _tell(lanes, reached, viscous, hysteretic, power, fraction) -> None:
-    """Write poses and rates of all lanes to `lanes.out`; write penetrations, their rates and forces to `lanes.told`.
+    """Write poses and rates of all lanes to `lanes.out`, and penetrations, their rates and forces to `lanes.told`.
 
-    `reached` has a bit for each lane that is at a sample; there the force at the sample is included in the peak.
+    `reached` is a bit mask of the lanes that have reached a sample. The peaks of these lanes include the force at the
+    sample.
     """
     for i in range(COMPONENTS):
         set_row(lanes.out, i, exact_row(lanes.y, i))
@@ -346,9 +353,9 @@ def _write_rows(s, lanes, reached) -> None:
 
 @kernel()
 def _go_on(s, lanes, passed) -> int:
-    """Begin the advances of lanes to their next samples; a twin that has passed the last sample is done.
+    """Start the advances of lanes to their next samples. Remove twins that have passed the last sample.
 
-    Returns a bit for each lane that can take a step at once, without another check.
+    Returns a bit mask of the lanes that can take a step without another check.
     """
     over = 0
     for lane in range(WIDTH):
@@ -367,11 +374,11 @@ def _go_on(s, lanes, passed) -> int:
 
 @kernel()
 def _limit_steps(lanes) -> int:
-    """Write the longest wanted step of each lane; return a bit for each lane whose sample is still ahead."""
+    """Write the longest admissible step of each lane. Return a bit mask of lanes that have not reached a sample."""
     left, longest = exact_row(lanes.stop, 0) - exact_row(lanes.time, 0), exact_splat(LONGEST_STEP)
     ahead = below(exact_splat(0.0), left)
     whole = choose(below(left, longest), left, longest)
-    # an empty lane keeps its longest step, so that its results stay finite
+    # an empty lane keeps its longest step, so that its results are finite
     set_row(lanes.whole, 0, choose(ahead, whole, exact_row(lanes.whole, 0)))
     return ahead
 
@@ -384,7 +391,7 @@ def _is_steady(lanes, lane) -> bool:
 
 @kernel()
 def _look(s, rest, lanes, lane, budget, in_range, ahead) -> int:
-    """Return `OK` if a lane can take a step, `_AT_SAMPLE` if it has reached a sample, else the code of its failure."""
+    """Return `OK` if a lane can take a step, `_AT_SAMPLE` if it has reached a sample, or the code of its failure."""
     member = lanes.member[lane]
     state = s.states[member]
     if not in_range and not lane_in_range(lanes, s.params[member], state, lane):
@@ -404,7 +411,7 @@ def _look(s, rest, lanes, lane, budget, in_range, ahead) -> int:
 
 @kernel()
 def _get_ready(s, viscous, hysteretic, power, fraction, rest, lanes, budget) -> bool:
-    """Write the rows of passed samples and load blocks; return whether any lane has a step to take."""
+    """Write the rows of samples that were reached, and load blocks. Return whether any lane has a step to take."""
     while True:
         if lanes.live[0] == 0 and not _next_block(s, hysteretic, power, lanes):
             return False
@@ -437,7 +444,10 @@ def _get_ready(s, viscous, hysteretic, power, fraction, rest, lanes, budget) -> 
 
 @kernel()
 def _leave(s, lanes, lane) -> None:
-    """Let another method continue a twin from the previous sample; `note_modes` must follow."""
+    """Remove a twin from its lane, so that another method continues it from the previous sample.
+
+    The caller has to call `note_modes` afterwards.
+    """
     bit = 1 << lane
     s.other[s.progress[OTHERS]] = lanes.member[lane]
     s.progress[OTHERS] += 1
@@ -483,11 +493,11 @@ def _step(s, viscous, hysteretic, power, fraction, order, lanes, w) -> None:
 def advance_lanes(
     s, viscous, hysteretic, power, fraction, rest, order, eight, work, budget, iterations
 ) -> bool:  # fmt: skip
-    """Advance the twins in the blocks through all samples, a block at a time; return False if `iterations` are used up.
+    """Advance the twins of all blocks through all samples. Return False if `iterations` iterations were not sufficient.
 
     `eight` and `work`, shape (1,), are lanes and scratch space. `budget` is the largest number of steps of an advance
     to a sample. If an advance fails, the twin keeps its state, and its time becomes that of the sample. A twin at rest
-    leaves its lane in its state at the previous sample, and another method continues it (`Samples.other`).
+    leaves its lane with its state at the previous sample, and another method continues it (`Samples.other`).
     """
     s, lanes, w = _unowned_samples(s), eight[0], work[0]
     for _ in range(iterations):

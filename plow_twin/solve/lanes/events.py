@@ -1,9 +1,10 @@
-"""The first event of each lane's step.
+"""Detection of the first event of each lane's step.
 
-An event is the instant at which a guard, a function of the motion, turns negative. Few guards can do so within a step:
-each lane lists these guards, and each round searches eight of them, of any lanes. If a CLIPPED or RELEASED pair parts
-from its wall, the step does not end, because no force changes; the rest of the step is then searched for the pair's
-next touch.
+An event is the time at which a guard function becomes negative. Only few guard functions can become negative within a
+step. Each lane lists these guard functions, and each iteration searches eight of them, from any lanes.
+
+If a CLIPPED or RELEASED pair separates from its wall, no force changes, so the step does not end. The rest of the step
+is then searched for the next touch of this pair.
 """
 
 from __future__ import annotations
@@ -28,28 +29,29 @@ from plow_twin.solve.lanes.record import (
 )
 from plow_twin.solve.state import CLIPPED, COS, OFF, ON, RELEASED, SIN, X, Y
 
-#: Two events are simultaneous if the time between them is less than this share of the step that ends with them.
+#: Largest difference of the times of two simultaneous events, divided by the size of the step that ends with them.
 _AT_ONCE = 1e-12
-#: The search for a root ends if the root's relative change is below `_FOUND` and the curvature's part in the change is
-#: below `_STRAIGHT`; the next change would be of the order of this change's cube. It also ends if the relative change
-#: is below `_ROUNDED`, a rounding error.
+#: Conditions for the end of a search for a root. `_FOUND`: relative change of the root; the next change would be of the
+#: order of its cube. `_STRAIGHT`: effect of the curvature on the change. `_ROUNDED`: relative change at rounding level.
 _FOUND, _STRAIGHT, _ROUNDED = 1e-6, 1e-3, 2e-16
 _MOST_CHANGES = 80
-#: If the step has been shortened since the search for a root began, the root certainly lies beyond the step, whatever
-#: the rounding, if it exceeds the step by this factor.
+#: Factor for rounding. If the step has been shortened since the search for a root began, a root that exceeds the step
+#: by this factor is certainly beyond the step.
 _SURELY_LATER = 1.0 + 1e-9
-#: Indices in `lanes.chosen` after the five rows of a penetration: factor of d, factor of d', further constant.
+#: Indices in `lanes.chosen` after the five coefficients of a penetration: factor of d, factor of d', constant.
 _DEPTH, _RATE, _CONSTANT = 5, 6, 7
 
 
 @kernel()
 def _list_guards(lanes, order, hysteretic, power, fraction) -> None:
-    """Write to `lanes.todo` a bit for each guard of a lane that may turn negative.
+    """Write to `lanes.todo` a bit mask of the guard functions of each lane that may become negative.
 
-    The guard of a pair that is OFF is -d, where d is the penetration. A pair that is ON has the guard F / K = d + (C /
-    K) d' or, if the damping is lambda d', the two guards d and 1 + lambda d'. A CLIPPED pair has the guards d and the
-    force with the opposite sign. A RELEASED pair (`modes`) has the guards d and the distance to the release
-    penetration.
+    The guard functions depend on the mode and on the penetration d:
+
+    - OFF: -d.
+    - ON: F / K = d + (C / K) d'. With the damping lambda d', d and 1 + lambda d'.
+    - CLIPPED: d, and the force with the opposite sign.
+    - RELEASED (`modes`): d, and the distance to the release penetration.
     """
     for lane in range(WIDTH):
         lanes.todo[lane] = lanes.watched[lane]
@@ -75,7 +77,7 @@ def _list_guards(lanes, order, hysteretic, power, fraction) -> None:
 
 @kernel()
 def _list_powers(lanes, order, hysteretic, fraction) -> None:
-    """List the guards of pairs that are ON, for exponents other than 1."""
+    """List the guard functions of pairs that are ON, for exponents other than 1."""
     one, none, h = exact_splat(1.0), exact_splat(0.0), exact_row(lanes.step, 0)
     for slot in range(PAIR_COUNT):
         taken = lanes.taken[slot]
@@ -95,10 +97,10 @@ def _list_powers(lanes, order, hysteretic, fraction) -> None:
 
 @kernel()
 def _may_end(series, factor, first, order, h):
-    """Return a bit for each lane whose guard may turn negative.
+    """Return a bit mask of the lanes whose guard function may become negative.
 
-    Term 0 of the guard is `first`, its other terms are those of `series` times `factor`. The test is that of
-    `_write_guard`.
+    Term 0 of the guard function is `first`. Its other terms are those of `series`, multiplied by `factor`. The test is
+    that of `_write_guard`.
     """
     reach = term = exact_splat(0.0)
     for k in range(order, 0, -1):
@@ -117,13 +119,13 @@ def _note(lanes, slot, kind, bits) -> None:
 
 @kernel()
 def _list_off(lanes, order) -> None:
-    """List the guards of pairs that are OFF.
+    """List the guard functions of pairs that are OFF.
 
-    A guard is left out if its first terms, with bounds of the later terms, prove that the pair stays OFF.
+    A guard function is omitted if its first terms, with bounds of the later terms, prove that the pair stays OFF.
     """
     h, series, cosine, sine = exact_row(lanes.step, 0), lanes.series, lanes.series[COS], lanes.series[SIN]
     x, y = series[X], series[Y]
-    # bounds of the terms after the second: the sums of abs(term k) h^k for k > 1
+    # bounds of the terms after the second term: the sums of abs(term k) h^k for k > 1
     later_c = later_s = later_x = later_y = exact_splat(0.0)
     for k in range(order, 1, -1):
         later_c = fused(later_c, h, magnitude(exact_row(cosine, k)))
@@ -154,11 +156,11 @@ def _row_of(array, k, places):
 
 @kernel()
 def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order, h, fraction):
-    """Write to `guard` the series of the guards `of_depth` d + `of_rate` d' + `constant`, with the penetrations d.
+    """Write the guard functions `of_depth` d + `of_rate` d' + `constant` to `guard`, with the penetrations d.
 
-    `places` has the lanes to which the guards belong; None means one guard of each lane in turn. Returns a bit for each
-    guard that may turn negative. A guard g stays positive on [0, h] if g_0 and g_0 + g_1 h - sum over k > 1 of
-    max(-g_k, 0) h^k are positive, because this lower bound is concave in h.
+    `places` contains the lanes of the guard functions. None means one guard function of each lane, in order. Returns a
+    bit mask of the guard functions that may become negative. A guard function g stays positive on [0, h] if g_0 and
+    g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are positive, because this lower bound is concave in h.
     """
     cosine, sine, x, y = lanes.series[COS], lanes.series[SIN], lanes.series[X], lanes.series[Y]
     reach = term = deeper = zero = exact_splat(0.0)
@@ -172,8 +174,8 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
             term = fused(of_rate * (k + 1.0), deeper, of_depth * depth)
             deeper = depth
         else:
-            # the series may be in a root of time instead of time; the rate d' is then not the derivative of this
-            # series, but has a series of its own
+            # the series variable may be a root of time; the rate d' is then not the derivative of the series of d, but
+            # has its own series
             term = of_depth * depth
             if damped != 0 and k < order:
                 deeper = linear_at(
@@ -194,7 +196,7 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
     first = fused(of_rate, deeper, of_depth * depth) + constant
     kept = below(zero, first)
     if fraction is not None:
-        # a pair that parts within the step is inside its wall at the step's start, so its guard keeps its first value
+        # a pair that separates within the step penetrates at its start, so its guard function keeps its first value
         kept |= below(zero, exact_row(lanes.begin, 0))
     first = choose(kept, first, zero)
     set_row(guard, 0, first)
@@ -203,7 +205,7 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
 
 @kernel()
 def _choose_guards(lanes, at, hysteretic, fraction) -> int:
-    """Choose up to eight guards: first the next guard of each lane, then the guards after it; return their number."""
+    """Choose up to eight guard functions, the next one of each lane first. Return their number."""
     count, before = 0, -1
     while before < count < WIDTH:
         before = count
@@ -222,7 +224,7 @@ def _choose_guards(lanes, at, hysteretic, fraction) -> int:
 
 @kernel()
 def _write_choice(lanes, lane, guard, i, hysteretic, fraction) -> None:
-    """Write guard number `i` of a round: factors of d and d', constant, and the interval to search."""
+    """Write the guard function with index `i` of an iteration: factors of d and d', constant, and interval."""
     chosen, pair = lanes.chosen, guard % PAIR_COUNT
     mode, sign, constant, rate = lanes.mode[pair, lane], 1.0, 0.0, lanes.viscous[lane] / lanes.stiffness[lane]
     begin = 0.0
@@ -247,7 +249,7 @@ def _write_choice(lanes, lane, guard, i, hysteretic, fraction) -> None:
 
 @kernel()
 def _allowance(lanes, pair, lane, mode) -> float:
-    """Return the constant that is added to a pair's guard d if the exponent is no integer (`solve.events`)."""
+    """Return the constant term of the guard function d for exponents that are not integers (`solve.events`)."""
     rows, y, let_go = lanes.rows[pair], lanes.y, LET_GO * lanes.release[lane]
     depth = rows[0, lane] * y[COS, lane] + rows[1, lane] * y[SIN, lane] + rows[4, lane]
     depth = max(depth + rows[2, lane] * y[X, lane] + rows[3, lane] * y[Y, lane], 0.0)
@@ -258,7 +260,7 @@ def _allowance(lanes, pair, lane, mode) -> float:
 
 @kernel()
 def _shift(lanes, guard, order, again, fraction) -> None:
-    """Shift the guards of pairs that have parted to begin at the time of parting."""
+    """Shift the guard functions of pairs that have separated, so that they begin at the time of separation."""
     x, zero = exact_row(lanes.begin, 0), exact_splat(0.0)
     for r in range(order):
         after = exact_row(guard, order)
@@ -267,18 +269,18 @@ def _shift(lanes, guard, order, again, fraction) -> None:
             set_row(guard, j, after)
     first = zero
     if fraction is not None:
-        # a pair that was RELEASED may part a little outside its wall (`LET_GO`); its guard -d then begins above 0
+        # a RELEASED pair may separate slightly outside its wall (`LET_GO`); its guard function -d then begins above 0
         first = choose(below(zero, exact_row(guard, 0)), exact_row(guard, 0), zero)
     set_row(guard, 0, choose(again, first, exact_row(guard, 0)))
 
 
 @kernel()
 def isolate(lanes, column, w, order, bits):
-    """Return the bits of lanes whose column has one root in [0, reach), and of lanes that may have several.
+    """Return bit masks of the polynomials with one root in [0, reach), and of those that may have several roots.
 
-    `column` has one polynomial for each lane. The root of the chord between the Bernstein coefficients that change sign
-    is written to `lanes.root`. The number of sign changes of these coefficients is the number of roots, or larger by an
-    even number.
+    `column` contains one polynomial for each lane. The number of sign changes of its Bernstein coefficients is the
+    number of roots, or exceeds this number by an even number. A first estimate of the root is written to `lanes.root`.
+    It is the root of the chord between the coefficients that change sign.
     """
     h, b, zero = exact_row(lanes.reach, 0), lanes.bernstein, exact_splat(0.0)
     to_bernstein(lanes, column, w, order, h)
@@ -301,10 +303,10 @@ def isolate(lanes, column, w, order, bits):
 
 @kernel()
 def cross(lanes, column, order, bits) -> None:
-    """Find each column's only root in [0, reach] by Halley's method kept within the bracket (`polynomial`)."""
+    """Compute each polynomial's only root in [0, reach], by Halley's method with bisection as fallback."""
     low, high, x, zero = exact_splat(0.0), exact_row(lanes.reach, 0), exact_row(lanes.root, 0), exact_splat(0.0)
-    # if a polynomial falls from a double zero at 0, each change would only reduce x to a third, so the root is set to 0
-    # at once
+    # if a polynomial decreases from a double zero at 0, each iteration would only divide x by three, so the root is set
+    # to 0
     falls_from_zero = below(exact_row(column, 2), zero) & ~below(zero, magnitude(exact_row(column, 0)))
     x = choose(falls_from_zero & ~below(zero, magnitude(exact_row(column, 1))), zero, x)
     open_bits = bits & below(zero, x)
@@ -334,7 +336,7 @@ def cross(lanes, column, order, bits) -> None:
 
 @kernel()
 def _leaves(guard, i, order, h) -> bool:
-    """Return whether a penetration is proved to fall over the whole step."""
+    """Return whether a penetration provably decreases over the whole step."""
     rise = 0.0
     for k in range(order, 1, -1):
         rise = (rise + k * max(guard[k, i], 0.0)) * h
@@ -343,7 +345,7 @@ def _leaves(guard, i, order, h) -> bool:
 
 @kernel()
 def _note_root(lanes, lane, at, i, order) -> None:
-    """Use the root of a guard to end the step, or to record the parting of a CLIPPED or RELEASED pair."""
+    """Use the root of a guard function to end the step, or to record the separation of a CLIPPED or RELEASED pair."""
     guard, root = lanes.guarded[at, i], lanes.root[i] + lanes.begin[i]
     pair = guard % PAIR_COUNT
     if guard < SECOND and lanes.mode[pair, lane] > ON:
@@ -360,10 +362,10 @@ def _note_root(lanes, lane, at, i, order) -> None:
 
 @kernel()
 def first_events(lanes, w, order, full, hysteretic, power, fraction) -> None:
-    """Shorten each lane's step to end at its first event; write the guard to `lanes.event`, or -1 without an event.
+    """Shorten each lane's step to its first event. Write the number of the guard function, or -1, to `lanes.event`.
 
-    `order` is the order of the series. Guards always have the largest number of orders, `full`, because the rounding of
-    their Bernstein coefficients would otherwise depend on `order`.
+    `order` is the order of the series. Guard functions always have the order `full`, because the rounding of their
+    Bernstein coefficients would otherwise depend on `order`.
     """
     never = exact_splat(np.inf)
     for pair in range(PAIR_COUNT):
@@ -372,7 +374,7 @@ def first_events(lanes, w, order, full, hysteretic, power, fraction) -> None:
     for lane in range(WIDTH):
         lanes.event[lane] = -1
     _list_guards(lanes, order, hysteretic, power, fraction)
-    # every round searches at least one guard of each lane that still has guards to search
+    # every iteration searches at least one guard function of each lane that has any left to search
     for at in range(GUARDS):
         lanes.rounds[0] = at
         count = _choose_guards(lanes, at, hysteretic, fraction)
@@ -386,7 +388,7 @@ def first_events(lanes, w, order, full, hysteretic, power, fraction) -> None:
 
 @kernel()
 def _write_chosen(lanes, at, order, full, fraction):
-    """Write the series of a round's guards; return a bit for each guard that may turn negative."""
+    """Write the guard functions of an iteration. Return a bit mask of those that may become negative."""
     chosen, guard, zero = lanes.chosen, lanes.guard[at], exact_splat(0.0)
     places = places_of(lanes.row_place)
     for i in range(5):
@@ -405,7 +407,7 @@ def _write_chosen(lanes, at, order, full, fraction):
 
 @kernel()
 def _search(lanes, w, at, order, bits) -> None:
-    """Find each guard's first root; search a guard again later if a shorter step may change the result."""
+    """Search the first root of each guard function. List it again if a shorter step may change the result."""
     guard = lanes.guard[at]
     single, several = isolate(lanes, guard, w, order, bits)
     if single != 0:
@@ -433,7 +435,7 @@ def _search(lanes, w, at, order, bits) -> None:
 
 @kernel()
 def _next_mode(lanes, lane, mode, viscous, fraction):
-    """Return the mode that follows `mode` when the pair's first guard turns negative."""
+    """Return the mode after `mode`, when the first guard function of a pair becomes negative."""
     if mode == OFF:
         return ON if fraction is None or lanes.exponent[lane] == 1.5 else RELEASED
     if fraction is not None:  # noqa: SIM102 - left out by types
@@ -444,13 +446,13 @@ def _next_mode(lanes, lane, mode, viscous, fraction):
 
 @kernel(inline="source")
 def _other_mode(mode):
-    """Return the mode that follows `mode` when the pair's second guard turns negative."""
+    """Return the mode after `mode`, when the second guard function of a pair becomes negative."""
     return CLIPPED if mode == ON else ON
 
 
 @kernel()
 def _ends_with(guard, order, at, within):
-    """Return a bit for each lane whose guard turns negative no later than `within` after `at`."""
+    """Return a bit mask of the lanes whose guard function becomes negative before `at` + `within`."""
     value, slope, zero = exact_row(guard, order), exact_splat(0.0), exact_splat(0.0)
     for k in range(order - 1, -1, -1):
         slope = fused(slope, at, value)
@@ -460,9 +462,9 @@ def _ends_with(guard, order, at, within):
 
 @kernel()
 def note_switches(lanes, order, viscous, fraction) -> None:
-    """Write the modes that pairs take at the end of the steps to `lanes.switch`, -1 for pairs that keep their mode.
+    """Write the modes after the steps to `lanes.switch`, or -1 for pairs that keep their mode.
 
-    Pairs whose events differ in time only by rounding switch together, so that a symmetric motion stays symmetric.
+    Pairs whose events differ only by rounding change their modes together, so that a symmetric motion stays symmetric.
     """
     ending = 0
     for lane in range(WIDTH):
@@ -480,8 +482,8 @@ def note_switches(lanes, order, viscous, fraction) -> None:
             guard, lane = lanes.guarded[at, i], lanes.owner[at, i]
             if lanes.event[lane] >= 0 and 0 <= guard < AGAIN:
                 pair = guard % PAIR_COUNT
-                # if both guards of a pair turn negative here, the first guard decides: the second guard is ignored for
-                # a pair that already has a new mode
+                # if both guard functions of a pair become negative here, the first guard function takes precedence; the
+                # second guard function is ignored for a pair that already has a new mode
                 if lanes.switch[pair, lane] < 0 and lanes.parted[pair, lane] >= lanes.step[lane]:
                     _note_switch(lanes, lane, guard, viscous, fraction)
     for lane in range(WIDTH):
@@ -491,7 +493,7 @@ def note_switches(lanes, order, viscous, fraction) -> None:
 
 @kernel()
 def _note_switch(lanes, lane, guard, viscous, fraction) -> None:
-    """Record the mode that follows when a guard turns negative."""
+    """Record the new mode of a pair whose guard function becomes negative."""
     pair = guard % PAIR_COUNT
     mode = lanes.mode[pair, lane]
     if guard >= AGAIN:

@@ -1,4 +1,4 @@
-"""The loop over lanes: each lane runs a scene by the scene's own steps, then takes the next scene."""
+"""The main loop for lanes. Each lane runs a scene with the scene's own steps, and then takes the next scene."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ from plow_twin.solve.step import LONGEST_STEP, ONE_INSTANT, PAST_AN_INSTANT
 
 
 class Members(NamedTuple):
-    """Arrays of all scenes of a run; their first axis is the scene."""
+    """Arrays of all scenes of a run. The first axis of each array is the scene."""
 
     params: NDArray[np.void]
     states: NDArray[np.void]
     totals: NDArray[np.void]
-    harmonics: NDArray[np.void]  #: harmonics of all scenes, one scene after the other
-    extent: NDArray[np.int64]  #: for each scene, the index of its first harmonic and the number of its harmonics
+    harmonics: NDArray[np.void]  #: harmonic loads of all scenes, one scene after the other
+    extent: NDArray[np.int64]  #: for each scene, index of its first harmonic load and number of its harmonic loads
     status: NDArray[np.int64]
     first: NDArray[np.int64]  #: number of rows written
     q: NDArray[np.float64]
@@ -57,22 +57,22 @@ class Members(NamedTuple):
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
 _BUDGET, _PAUSED = int(Status.BUDGET), int(Status.PAUSED)
-#: Internal result of a lane whose next step must be taken by another method.
+#: Internal result for a lane whose next step requires another method.
 OTHER_METHOD: Final = 6
-#: Internal result of a lane whose scene has reached its end.
+#: Internal result for a lane whose scene has reached its end.
 _DONE: Final = 7
 
 
 @kernel()
 def lane_in_range(lanes, p, state, lane) -> bool:
-    """Return whether the model is valid at the state of a lane."""
+    """Return whether the model is valid for the state of a lane."""
     write_place(state, lanes, lane)
     return within_range(p, state, state.y)
 
 
 @kernel()
 def bits_in_range(lanes):
-    """Return a bit for each lane in which the model is surely valid (`modes.within_range`)."""
+    """Return a bit mask of lanes in which the model is certainly valid (`modes.within_range`)."""
     c, s, x, y = exact_row(lanes.y, COS), exact_row(lanes.y, SIN), exact_row(lanes.y, X), exact_row(lanes.y, Y)
     bits = below(magnitude(exact_row(lanes.y, THETA)), exact_splat(LARGEST_ANGLE))
     for pair in range(PAIR_COUNT):
@@ -82,7 +82,7 @@ def bits_in_range(lanes):
 
 @kernel()
 def _another_method(p, harmonics, extent, flight, rest, state, lanes, lane, w, span) -> bool:
-    """Return whether the next step of a lane may be free flight or rest, which cannot be computed in lanes."""
+    """Return whether the next step of a lane may be free flight or rest, which lanes do not support."""
     if lanes.inside[lane] == 0:
         if flight is not None:
             for j in range(3):
@@ -99,7 +99,7 @@ def _another_method(p, harmonics, extent, flight, rest, state, lanes, lane, w, s
 
 @kernel()
 def _look(members, flight, rest, lanes, lane, w, t_end, budget, in_range) -> int:
-    """Return `OK` if the lane can take its scene's next step, otherwise the status with which the scene leaves."""
+    """Return `OK` if the lane can take the next step of its scene, or else the status with which the scene leaves."""
     member = lanes.member[lane]
     p, state = members.params[member], members.states[member]
     if not in_range and not lane_in_range(lanes, p, state, lane):
@@ -118,7 +118,7 @@ def _look(members, flight, rest, lanes, lane, w, t_end, budget, in_range) -> int
 
 @kernel()
 def _fill_rows(lanes, lane, order, fraction, t, i, end, q, v) -> int:
-    """Fill the rows within a lane's step from row i on, eight at once; return the first row after the step."""
+    """Fill the output rows within a lane's step from row i on, eight at once. Return the first row after the step."""
     last, begin, sigma = i, lanes.time[lane], lanes.root
     while last < t.size and t[last] < end:
         last += 1
@@ -127,7 +127,7 @@ def _fill_rows(lanes, lane, order, fraction, t, i, end, q, v) -> int:
         for j in range(WIDTH):
             sigma[j] = sigma_of(lanes, lane, max(t[i + min(j, count - 1)] - begin, 0.0), fraction)
         at = exact_row(sigma, 0)
-        # four sums side by side keep the processor busy, since no sum waits for another
+        # four independent sums keep the processor busy, because no sum has to wait for another sum
         for first in range(0, COMPONENTS, 4):
             one, two = lanes.series[first], lanes.series[first + 1]
             three, four = lanes.series[first + 2], lanes.series[first + 3]
@@ -151,7 +151,7 @@ def _fill_rows(lanes, lane, order, fraction, t, i, end, q, v) -> int:
 
 @kernel()
 def turn(out, first, second) -> None:
-    """Convert a vector at eight instants to world axes."""
+    """Convert a vector at eight times, or in eight lanes, to world axes."""
     c, s, x, y = exact_row(out, COS), exact_row(out, SIN), exact_row(out, first), exact_row(out, second)
     set_row(out, first, fused(c, x, s * y * -1.0))
     set_row(out, second, fused(s, x, c * y))
@@ -159,7 +159,7 @@ def turn(out, first, second) -> None:
 
 @kernel()
 def _part(sums, lanes, lane) -> None:
-    """Set the CLIPPED and RELEASED pairs that leave their wall within a lane's step to OFF."""
+    """Set the CLIPPED and RELEASED pairs that separate from their walls within a lane's step to OFF."""
     for pair in range(PAIR_COUNT):
         if lanes.parted[pair, lane] < lanes.step[lane]:
             lanes.mode[pair, lane] = OFF
@@ -169,7 +169,7 @@ def _part(sums, lanes, lane) -> None:
 
 @kernel()
 def _rate(p, lanes, pair, lane) -> float:
-    """Return the rate of a lane's penetration at the step's end."""
+    """Return the rate of a pair's penetration in a lane at the end of the step."""
     y = lanes.y
     return rate_at(
         p, pair, y[COS, lane], y[SIN, lane], y[OMEGA, lane], y[X, lane], y[Y, lane], y[VX, lane], y[VY, lane]
@@ -178,14 +178,14 @@ def _rate(p, lanes, pair, lane) -> float:
 
 @kernel()
 def _touch(p, lanes, pair, lane) -> None:
-    """Start a contact: set its damping lambda = D / v0 from the impact speed v0 (`modes.touch`)."""
+    """Start a contact, with the damping factor lambda = D / v0 of its impact speed v0 (`modes.touch`)."""
     if p.damping_number >= 0.0:
         lanes.factor[pair, lane] = p.damping_number / max(_rate(p, lanes, pair, lane), p.speed_floor)
 
 
 @kernel()
 def _touch_or_release(p, lanes, pair, lane) -> None:
-    """Begin the contact of a pair whose force is d^n; after a slow touch the pair is RELEASED (`step`)."""
+    """Start the contact of a pair with the force law d^n. After a slow touch the pair is RELEASED (`step`)."""
     lanes.touched[lane] &= ~(1 << pair)
     if lanes.mode[pair, lane] == ON:
         if _rate(p, lanes, pair, lane) > slow_touch(p):
@@ -197,7 +197,7 @@ def _touch_or_release(p, lanes, pair, lane) -> None:
 
 @kernel()
 def _switch(p, sums, lanes, lane, hysteretic, fraction) -> None:
-    """Change the modes of a lane's pairs at the step's end."""
+    """Change the modes of a lane's pairs at the end of the step."""
     for pair in range(PAIR_COUNT):
         new, old = lanes.switch[pair, lane], lanes.mode[pair, lane]
         if new < 0:
@@ -215,7 +215,7 @@ def _switch(p, sums, lanes, lane, hysteretic, fraction) -> None:
                 _touch_or_release(p, lanes, pair, lane)
             else:
                 lanes.touched[lane] &= ~(1 << pair)
-            # a RELEASED pair counts as ON, so a change between RELEASED and ON is not counted
+            # a RELEASED pair is treated as ON, so a change between RELEASED and ON is not counted
             sums.logged += 0 if old in (ON, RELEASED) and new in (ON, RELEASED) else 1
 
 
@@ -230,9 +230,9 @@ def end_of(lanes, lane, fraction):
 
 @kernel()
 def complete(p, sums, lanes, lane, hysteretic, fraction) -> None:
-    """Move the time, counts and modes of a lane to the end of its step; its state must already be there.
+    """Set the time, counts and modes of a lane to the end of its step. Its state must already be at the end.
 
-    If modes change, `lanes.stale` is set, and `note_modes` must follow.
+    If modes change, `lanes.stale` is set, and the caller has to call `note_modes` afterwards.
     """
     begin, parted, counts = lanes.time[lane], False, lanes.counts
     counts[STEPS, lane] += 1
@@ -261,7 +261,7 @@ def complete(p, sums, lanes, lane, hysteretic, fraction) -> None:
 
 @kernel()
 def move(lanes) -> None:
-    """Add the changes over the steps to the states of scenes, and recompute cosine and sine from the angle."""
+    """Add the changes over the steps to the states, and compute cosine and sine from the angle."""
     y, moved, live = lanes.y, lanes.out, lanes.live[0]
     for i in range(COMPONENTS):
         set_row(moved, i, exact_row(y, i) + exact_row(lanes.change, i))
@@ -272,7 +272,7 @@ def move(lanes) -> None:
 
 @kernel()
 def go_past_an_instant(params, lanes) -> None:
-    """Step past an instant at which modes would switch back and forth endlessly; keep the present modes."""
+    """Take a short step with the current modes in each lane whose modes would alternate endlessly at one time."""
     for lane in range(WIDTH):
         member = lanes.member[lane]
         if member >= 0 and lanes.event[lane] >= 0:
@@ -285,7 +285,7 @@ def go_past_an_instant(params, lanes) -> None:
 
 @kernel()
 def _leave(members, lanes, w, order, lane, code, t) -> None:
-    """Take the scene out of a lane and record its status; if it is at the end, write the remaining rows."""
+    """Remove the scene from a lane and store its status. If it has reached its end, write the remaining output rows."""
     member = lanes.member[lane]
     p, state, totals = members.params[member], members.states[member], members.totals[member]
     find_peaks(lanes, w, order - 1)
@@ -308,7 +308,7 @@ def _leave(members, lanes, w, order, lane, code, t) -> None:
 
 @kernel(inline="source")
 def _unowned_members(members):
-    """Return the members with arrays that are not reference counted; the caller keeps them alive."""
+    """Return the members with arrays that are not reference counted. The caller has to keep them alive."""
     return Members(
         unowned(members.params),
         unowned(members.states),
@@ -324,7 +324,7 @@ def _unowned_members(members):
 
 @kernel()
 def _load(members, power, lanes, lane, member) -> None:
-    """Put a scene and its sums into a lane."""
+    """Load a scene and its sums into a lane."""
     totals = members.totals[member]
     load_lane(members.params[member], members.states[member], power, lanes, lane, member)
     join_lanes(lanes, 1 << lane)
@@ -338,12 +338,14 @@ def run_lanes(
     members, waves, second, viscous, hysteretic, power, fraction, flight, rest, order, lanes, w, queue, t_end, budget,
     iterations, t,
 ) -> bool:  # fmt: skip
-    """Advance the members numbered in `queue` to `t_end`, eight at a time; return False if `iterations` are used up.
+    """Advance the members with the indices `queue` to `t_end`, eight at a time.
 
-    `power` is 1 for exponents other than 1, otherwise None; `fraction` is 1 for exponents that are not integers,
-    otherwise None. `t` holds the times of the rows, `order` is the series' order, and `budget` the largest number of
-    steps of a scene. A scene leaves its lane with a `Status`, with `OTHER_METHOD` or, when the iterations are used up,
-    with `PAUSED`.
+    Returns False if `iterations` iterations were not sufficient.
+
+    `power` is 1 for exponents other than 1, and `fraction` is 1 for exponents that are not integers; otherwise they are
+    None. `t` contains the times of the output rows, `order` is the order of the series, and `budget` the largest number
+    of steps of a scene. A scene leaves its lane with a `Status` or with `OTHER_METHOD`. After the last iteration, all
+    scenes leave with `PAUSED`.
     """
     members, queue, t = _unowned_members(members), unowned(queue), unowned(t)
     waiting = 0

@@ -1,7 +1,7 @@
-"""The variable sigma of each lane's series, if the exponent is not an integer: time, or a root of time.
+"""The series variable sigma of each lane for exponents that are not integers: time, or a root of time.
 
-The time since a step's start is t = alpha sigma + beta sigma^2 / 2 (`method.series`). With exponent 1.5, sigma is
-derived from the square root of the time since a recent touch or of the time left until a near separation, as in
+The time since the start of a step is t = alpha sigma + beta sigma^2 / 2 (`method.series`). For the exponent 1.5, sigma
+is derived from the square root of the time since a recent touch, or of the time until a near separation, as in
 `method.taylor`.
 """
 
@@ -40,7 +40,7 @@ def note_durations(lanes) -> None:
 
 @kernel(inline="code")
 def sigma_of(lanes, lane, used, fraction) -> float:
-    """Return sigma at `used` seconds into a lane's step (`dense_output.sigma_at`)."""
+    """Return the sigma at `used` seconds after the start of a lane's step (`dense_output.sigma_at`)."""
     if fraction is None:
         return used
     alpha, beta = lanes.alpha[lane], lanes.beta[lane]
@@ -51,7 +51,7 @@ def sigma_of(lanes, lane, used, fraction) -> float:
 
 @kernel()
 def choose_maps(harmonics, extent, waves, second, hysteretic, fraction, segments, lanes, w) -> None:
-    """Choose each lane's variable, and convert `lanes.whole` to a value of it.
+    """Choose the series variable of each lane, and convert `lanes.whole` to a value of this variable.
 
     A pair that is ON becomes RELEASED if its penetration d is too small for a series of d^n.
     """
@@ -76,7 +76,7 @@ def choose_maps(harmonics, extent, waves, second, hysteretic, fraction, segments
 
 @kernel()
 def _choose_map(lanes, w, lane, order, near) -> None:
-    """Choose the variable sigma of one lane (`method.taylor`)."""
+    """Choose the series variable sigma of one lane (`method.taylor`)."""
     span = lanes.whole[lane]
     if lanes.touched[lane] != 0:
         lanes.whole[lane] = math.sqrt(span)
@@ -100,7 +100,7 @@ def _choose_map(lanes, w, lane, order, near) -> None:
 
 @kernel()
 def _mark_touching(lanes) -> None:
-    """Note in which lanes the pair of each slot touches at the step's start."""
+    """Write, for each slot, a bit mask of the lanes whose pair touches at the start of the step."""
     for slot in range(PAIR_COUNT):
         lanes.touching[slot] = 0
     for lane in range(WIDTH):
@@ -113,7 +113,7 @@ def _mark_touching(lanes) -> None:
 
 @kernel()
 def _look_at_pairs(lanes):
-    """Return two masks of lanes: with a pair too shallow for a series of d^n, with a pair that may part soon."""
+    """Return bit masks of lanes with a pair too shallow for a series of d^n, and with a pair near separation."""
     _mark_touching(lanes)
     y, zero = lanes.y, exact_splat(0.0)
     c, s, om = exact_row(y, COS), exact_row(y, SIN), exact_row(y, OMEGA)
@@ -135,7 +135,7 @@ def _look_at_pairs(lanes):
 
 @kernel()
 def _release(lanes) -> None:
-    """Release the pairs that are too shallow."""
+    """Set the pairs that are too shallow for a series of d^n to RELEASED."""
     found = False
     for lane in range(WIDTH):
         if lanes.member[lane] < 0:
@@ -151,7 +151,7 @@ def _release(lanes) -> None:
 
 @kernel()
 def _parting(lanes, w, lane, order) -> float:
-    """Return the time until the first pair of a lane parts, from short series in time; 0 if none parts soon."""
+    """Return the time until the first pair of a lane separates, or 0 without a near separation."""
     first, column = np.inf, w.column[0]
     for slot in range(PAIR_COUNT):
         if lanes.taken[slot] >> lane & 1 == 0:

@@ -1,4 +1,8 @@
-"""The record of eight scenes side by side: series and constants whose rows have one number for each scene (lane)."""
+"""Record of eight scenes that run together: series and constants whose rows contain one number for each scene.
+
+The position of a scene in these rows is its lane. The acting pairs of each lane are assigned to slots 0, 1, ..., so
+that one vector operation processes one acting pair of every lane. The pairs in a slot may differ between lanes.
+"""
 
 from __future__ import annotations
 
@@ -18,32 +22,32 @@ from plow_twin.solve.state import COS, MAX_ORDER, OFF, ON, Terms, new_records
 
 #: Number of scenes in a vector.
 WIDTH: Final = 8
-#: Number of state components in a lane's series.
+#: Number of state components in the series of a lane.
 COMPONENTS: Final = 8
-#: Indices in `moment` of the factors by which cosine, sine, X and Y are multiplied in the contacts' moment.
+#: Indices in `moment` of the factors of cosine, sine, X and Y in the contacts' moment.
 DC, DS, DX, DY = range(4)
-#: Numbering of guards: from 0 the first guards of the eight pairs, from `SECOND` their second guards, from `AGAIN` the
-#: guards of pairs that part within the step and may touch again.
+#: Numbering of guard functions: the first guard functions of the eight pairs begin at 0, their second guard functions
+#: at `SECOND`. Guard functions of pairs that separate within the step and may touch again begin at `AGAIN`.
 SECOND: Final = PAIR_COUNT
 AGAIN: Final = 2 * PAIR_COUNT
 GUARDS: Final = 3 * PAIR_COUNT
-#: Largest number of consecutive orders that may vanish (`Params.lacuna`).
+#: Largest number of successive terms of a series that can be zero (`Params.lacuna`).
 MOST_LACUNA: Final = 6
 
 _ROWS: Final = MAX_ORDER + 1
 _PAIRS: Final = (PAIR_COUNT, WIDTH)
 _LANES_OF: Final = (WIDTH,)
-#: Blocks of `staged`: five rows of the penetrations, two of the arms, then state, lambda, modes, and whether a pair can
-#: touch.
+#: Indices of the blocks of `staged`: five rows of the penetrations, two rows of the arms, then state, lambda, modes,
+#: and whether a pair can touch.
 _ARM, _Y, _FACTOR, _MODE, _ENABLED, _BLOCKS = 5, 7, 8, 9, 10, 11
-#: Indices in `counts`: steps, evaluations, events, searches of roots, recoveries, events at one instant.
+#: Indices in `counts`: steps, evaluations, events, searches of roots, recoveries, events at one time.
 STEPS, EVALUATIONS, EVENTS, GUARD_ROOTS, RECOVERIES, AT_ONCE = range(6)
 COUNTS: Final = 6
 
-#: The constants and the state of eight scenes, from which their next steps follow.
+#: Constants and state of eight scenes. They determine the next steps of these scenes.
 _BLOCK_FIELDS: Final[list[tuple[Any, ...]]] = [
-    ("rows", "f8", (PAIR_COUNT, 5, WIDTH)),  # factors of cosine, sine, X and Y in the penetration, and its constant
-    ("arms", "f8", (PAIR_COUNT, 2, WIDTH)),  # factors of cosine and sine in the arm
+    ("rows", "f8", (PAIR_COUNT, 5, WIDTH)),  # coefficients of cosine, sine, X, Y and 1 in the penetration
+    ("arms", "f8", (PAIR_COUNT, 2, WIDTH)),  # coefficients of cosine and sine in the arm
     ("enabled", "i8", _PAIRS),  # 1 if the pair can touch
     ("constant", "f8", (3, WIDTH)),
     ("inverse_mass", "f8", _LANES_OF),
@@ -54,35 +58,35 @@ _BLOCK_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("viscous", "f8", _LANES_OF),
     ("half_cavity", "f8", _LANES_OF),
     ("mass", "f8", (3, WIDTH)),  # sampled loads: mass, mass and inertia
-    ("small", "f8", _LANES_OF),  # size below which a term over the longest wanted step counts as vanished
+    ("small", "f8", _LANES_OF),  # size of a term, over the longest admissible step, below which it is treated as zero
     ("threshold", "f8", (MOST_LACUNA, WIDTH)),  # admissible sizes of the last orders, as velocities
     ("stretch", "f8", _LANES_OF),  # log2 of velocity tolerance / (position tolerance (order + 1))
-    # exponents other than 1
+    # the following fields are used only for exponents other than 1
     ("exponent", "f8", _LANES_OF),
     ("release", "f8", _LANES_OF),  # penetration below which the force is negligible
     # state
-    ("y", "f8", (COMPONENTS, WIDTH)),  # state at the step's start
+    ("y", "f8", (COMPONENTS, WIDTH)),  # state at the start of the step
     ("factor", "f8", _PAIRS),  # lambda
     ("mode", "i8", _PAIRS),
     ("time", "f8", _LANES_OF),
     ("before_it", "f8", _LANES_OF),  # size of the previous step in s
     ("touch_time", "f8", _LANES_OF),  # time of the last touch
-    ("touched", "i8", _LANES_OF),  # a bit for each pair that touches at the step's start
-    ("counts", "i8", (COUNTS, WIDTH)),  # by `STEPS` to `AT_ONCE`, as in the records of the states
-    # derived from modes (`note_modes`, `_weigh_lanes`)
+    ("touched", "i8", _LANES_OF),  # bit mask of the pairs that touch at the start of the step
+    ("counts", "i8", (COUNTS, WIDTH)),  # counts of the state records, indexed by `STEPS` to `AT_ONCE`
+    # the following fields are derived from the modes (`note_modes`, `_weigh_lanes`)
     ("ratio", "f8", _PAIRS),  # C / K of pairs that are ON
-    ("filled", "i8", _LANES_OF),  # number of slots that a lane's pairs fill
-    ("on", "i8", (PAIR_COUNT,)),  # a bit for each lane in which the pair is ON
-    ("off", "i8", (PAIR_COUNT,)),  # a bit for each lane in which the pair is OFF and can touch
-    ("taken", "i8", (PAIR_COUNT,)),  # a bit for each lane with a pair in the slot
-    ("watched", "i8", _LANES_OF),  # a bit for each guard that is always searched
+    ("filled", "i8", _LANES_OF),  # number of slots that are used by the lane
+    ("on", "i8", (PAIR_COUNT,)),  # bit mask of the lanes in which the pair is ON
+    ("off", "i8", (PAIR_COUNT,)),  # bit mask of the lanes in which the pair is OFF and can touch
+    ("taken", "i8", (PAIR_COUNT,)),  # bit mask of the lanes that use the slot
+    ("watched", "i8", _LANES_OF),  # bit mask of the guard functions that are always searched
     ("inside", "i8", _LANES_OF),  # number of pairs that penetrate
-    ("carrying", "i8", _LANES_OF),  # a bit for each pair that is ON
-    ("along", "f8", (2, 6, WIDTH)),  # factors of c, s, X or Y and of their rates in the forces along X and Y
-    # moment = c Gc + s Gs - X fy + Y fx: factors of c, s, X, Y and of their rates in Gc and Gs
+    ("carrying", "i8", _LANES_OF),  # bit mask of the pairs that are ON
+    ("along", "f8", (2, 6, WIDTH)),  # coefficients of c, s, X or Y and of their rates in the forces along X and Y
+    # the moment is c Gc + s Gs - X fy + Y fx; coefficients of c, s, X, Y and of their rates in Gc and Gs
     ("turn", "f8", (2, 8, WIDTH)),
-    ("slot", "i8", _PAIRS),  # the pair in each slot
-    ("gear", "f8", (PAIR_COUNT, 8, WIDTH)),  # for the pairs in each slot: `rows`, `arms` and `factor`
+    ("slot", "i8", _PAIRS),  # index of the pair in each slot
+    ("gear", "f8", (PAIR_COUNT, 8, WIDTH)),  # values of `rows`, `arms` and `factor` for the pair in each slot
 ]
 BLOCK: Final = np.dtype(_BLOCK_FIELDS)
 
@@ -92,7 +96,8 @@ def _begin_of(field: str) -> int:
     return int(parts[field][1])
 
 
-#: Where state, notes on modes and slots begin in `BLOCK`, in bytes, and where the slots' gears begin; size of a gear.
+#: Offsets in `BLOCK` [B] of the state, of the data derived from modes, of `slot` and of `gear`. `_SIZE` and `_GEAR` are
+#: the sizes [B] of a block and of one slot's data in `gear`.
 _STATE, _NOTES, _SLOTS, _GEARS = _begin_of("y"), _begin_of("ratio"), _begin_of("slot"), _begin_of("gear")
 _SIZE: Final = BLOCK.itemsize
 _GEAR: Final = (_SIZE - _GEARS) // PAIR_COUNT
@@ -103,92 +108,92 @@ LANES: Final = np.dtype(
         ("series", "f8", (COMPONENTS, _ROWS, WIDTH)),  # state
         ("moment", "f8", (4, _ROWS, WIDTH)),  # factors of c, s, X and Y in the moment of the contacts
         ("load", "f8", (3, _ROWS, WIDTH)),  # S1, S2, M
-        # penetrations of the pairs in each slot; not written if F is linear in d and d'
+        # penetration of the pair in each slot; not used if F is linear in d and d'
         ("depth", "f8", (PAIR_COUNT, _ROWS, WIDTH)),
-        ("push", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # F / K of the pairs in each slot
-        ("guard", "f8", (GUARDS, _ROWS, WIDTH)),  # the eight guards of each round, which may belong to any lanes
+        ("push", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # F / K of the pair in each slot
+        ("guard", "f8", (GUARDS, _ROWS, WIDTH)),  # eight guard functions of each iteration, which may be of any lanes
         ("bernstein", "f8", (_ROWS, WIDTH)),
-        ("bulge", "f8", (_ROWS, WIDTH)),  # forces whose maximum must still be found, because it may exceed the peak
-        ("bulge_step", "f8", _LANES_OF),  # step sizes that belong to the forces in `bulge`
-        # guards of a round: the penetration's rows, factors of d and d', a further constant
+        ("bulge", "f8", (_ROWS, WIDTH)),  # forces whose maximum is not yet computed and may exceed the peak
+        ("bulge_step", "f8", _LANES_OF),  # step sizes for the forces in `bulge`
+        # guard functions of an iteration: coefficients of the penetration, factors of d and d', constant
         ("chosen", "f8", (8, WIDTH)),
         ("direction", "f8", (4, WIDTH)),
         ("slope", "f8", (3, WIDTH)),  # sampled loads: slope from the previous sample to the next sample
         ("sample", "f8", (3, WIDTH)),  # sampled loads: value at the previous sample
-        ("held", "f8", (3, WIDTH)),  # load at the step's start, including the constant loads
+        ("held", "f8", (3, WIDTH)),  # load at the start of the step, including the constant loads
         ("next", "f8", (3, WIDTH)),  # sampled loads: value at the next sample
         ("knot", "f8", _LANES_OF),  # sampled loads: time of the previous sample
         ("change", "f8", (COMPONENTS, WIDTH)),  # change of the state over the step
-        ("gained", "f8", (2, WIDTH)),  # scratch for one slot: impulse over the step, and peak
-        ("sum", "f8", (4, WIDTH)),  # integrals over the step of the changes of cosine, sine, X, Y
+        ("gained", "f8", (2, WIDTH)),  # scratch space for one slot: impulse over the step, and peak
+        ("sum", "f8", (4, WIDTH)),  # time integrals over the step of the changes of cosine, sine, X, Y
         # one harmonic load: frequency, sine, cosine, amplitudes of S1, S2 and M, phase
         ("harmonic", "f8", (10, WIDTH)),
         ("size", "f8", (MOST_LACUNA, WIDTH)),  # sizes of the terms of the last orders, as velocities
         ("step", "f8", _LANES_OF),  # step size in s
         ("accurate", "f8", _LANES_OF),  # step size without events
-        ("stop", "f8", _LANES_OF),  # time at which the present step must end at the latest
-        ("whole", "f8", _LANES_OF),  # longest wanted step in s
-        ("reach", "f8", _LANES_OF),  # guards of a round: end of the interval that is searched
-        ("root", "f8", _LANES_OF),  # guards of a round: first root
-        ("begin", "f8", _LANES_OF),  # guards of a round: time at which the pair has parted, else 0
-        ("parted", "f8", _PAIRS),  # time at which a CLIPPED pair parts within the step, else infinity
+        ("stop", "f8", _LANES_OF),  # latest time at which the current step may end
+        ("whole", "f8", _LANES_OF),  # longest admissible step in s
+        ("reach", "f8", _LANES_OF),  # guard functions of an iteration: end of the interval that is searched
+        ("root", "f8", _LANES_OF),  # guard functions of an iteration: first root
+        ("begin", "f8", _LANES_OF),  # guard functions of an iteration: time of the pair's separation, else 0
+        ("parted", "f8", _PAIRS),  # time at which a CLIPPED pair separates within the step, else infinity
         ("peak", "f8", _PAIRS),
         ("impulse", "f8", _PAIRS),
         ("time_in_contact", "f8", _PAIRS),
-        ("out", "f8", (COMPONENTS, WIDTH)),  # values of one scene at eight instants, or of eight scenes
+        ("out", "f8", (COMPONENTS, WIDTH)),  # values of one scene at eight times, or of eight scenes at one time
         ("told", "f8", (3, PAIR_COUNT, WIDTH)),  # penetration, rate, force
-        # blocks whose rows are lanes and whose columns are pairs or components, and the transposed blocks
+        # blocks whose rows are lanes and whose columns are pairs or components, and the transposes of these blocks
         ("staged", "f8", (_BLOCKS, WIDTH, PAIR_COUNT)),
         ("turned", "f8", (_BLOCKS, PAIR_COUNT, WIDTH)),
         # state, lambda, modes, `touch_time`, `before_it` and `touched` at the previous sample
         ("kept", "f8", (3 * PAIR_COUNT + 3, WIDTH)),
         ("kept_counts", "i8", (COUNTS, WIDTH)),
-        ("member", "i8", _LANES_OF),  # the scene in a lane, -1 for an empty lane
-        ("switch", "i8", _PAIRS),  # modes that pairs take at the step's end, -1 for no change
-        ("event", "i8", _LANES_OF),  # the guard that ends the step, or -1
+        ("member", "i8", _LANES_OF),  # index of the scene in a lane, -1 for an empty lane
+        ("switch", "i8", _PAIRS),  # modes of the pairs after the step, -1 for no change
+        ("event", "i8", _LANES_OF),  # number of the guard function that ends the step, or -1
         ("ends_at_stop", "i8", _LANES_OF),
-        ("todo", "i8", _LANES_OF),  # a bit for each guard that remains to be searched
-        ("guarded", "i8", (GUARDS, WIDTH)),  # the guards of each round, by their numbers from 0 to `GUARDS` - 1, or -1
-        ("owner", "i8", (GUARDS, WIDTH)),  # lanes of these guards
-        ("row_place", "i8", _LANES_OF),  # index in `rows` of each guard of a round
+        ("todo", "i8", _LANES_OF),  # bit mask of the guard functions that have not been searched yet
+        ("guarded", "i8", (GUARDS, WIDTH)),  # numbers of the guard functions of each iteration, or -1
+        ("owner", "i8", (GUARDS, WIDTH)),  # lanes of these guard functions
+        ("row_place", "i8", _LANES_OF),  # offset in `rows` for each guard function of an iteration
         ("bulge_pair", "i8", _LANES_OF),
         ("bulge_lane", "i8", _LANES_OF),
-        ("orders", "i8", _LANES_OF),  # order of each lane's series; the terms beyond have vanished
+        ("orders", "i8", _LANES_OF),  # order of each lane's series; higher terms are negligible
         # the following fields are used only for exponents other than 1
-        ("power", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d^n of each slot's pairs
-        # base of the power: d, or d / sigma^2 for a pair that touches at the step's start; d^2 if n is an integer
+        ("power", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d^n of the pair in each slot
+        # base of the power: d, or d / sigma^2 for a pair that touches at the start of the step; d^2 if n is an integer
         ("base", "f8", (PAIR_COUNT, _ROWS, WIDTH)),
-        ("rate", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d' of each slot's pairs
-        ("per_base", "f8", _PAIRS),  # 1 / base at the step's start
+        ("rate", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d' of the pair in each slot
+        ("per_base", "f8", _PAIRS),  # 1 / base at the start of the step
         # the following fields are used only for exponents that are not integers
         ("rates", "f8", (4, _ROWS, WIDTH)),  # rates of cosine, sine, X and Y
-        ("alpha", "f8", _LANES_OF),  # time since the step's start: alpha sigma + beta sigma^2 / 2
+        ("alpha", "f8", _LANES_OF),  # the time since the start of the step is alpha sigma + beta sigma^2 / 2
         ("beta", "f8", _LANES_OF),
-        ("duration", "f8", _LANES_OF),  # step size in s, where `step` and `whole` are values of sigma
+        ("duration", "f8", _LANES_OF),  # step size in s; `step` and `whole` are values of sigma
         ("may_stop", "i8", _LANES_OF),  # 1 if a step of the size `whole` ends at `stop`
-        ("touching", "i8", (PAIR_COUNT,)),  # a bit for each lane whose pair in the slot touches at the step's start
-        # single numbers come last, so that every row before them fills a cache line
-        ("live", "i8", (1,)),  # a bit for each lane that has a scene
-        ("noted", "i8", (1,)),  # `live` at the last `note_modes`; -1 if the notes are those of the lanes' block
-        ("parting", "i8", (1,)),  # a bit for each lane in which a CLIPPED pair parts
+        ("touching", "i8", (PAIR_COUNT,)),  # bit mask of the lanes whose pair in the slot touches at the step's start
+        # single numbers come last, so that each of the rows before them fills a cache line
+        ("live", "i8", (1,)),  # bit mask of the lanes that have a scene
+        ("noted", "i8", (1,)),  # `live` at the last call of `note_modes`; -1 if its results were read from the block
+        ("parting", "i8", (1,)),  # bit mask of the lanes in which a CLIPPED pair separates
         ("rounds", "i8", (1,)),
         ("bulges", "i8", (1,)),  # number of forces in `bulge`
-        ("vanished", "i8", (1,)),  # a bit for each lane whose series ends early
-        ("failed", "i8", (1,)),  # sampled loads: a bit for each lane whose series was not finite
-        ("stale", "i8", (1,)),  # 1 if modes or scenes have changed since the last `_weigh_lanes`
+        ("vanished", "i8", (1,)),  # bit mask of the lanes whose series ends early
+        ("failed", "i8", (1,)),  # sampled loads: bit mask of the lanes whose series was not finite
+        ("stale", "i8", (1,)),  # 1 if modes or scenes have changed since the last call of `_weigh_lanes`
     ]
 )
 
 
-#: Terms that a scene in lanes may have: those of its law without a ramp, harmonic loads, flight and rest. For a step of
-#: flight or rest the scene leaves its lane.
+#: Terms that lanes support: those of a contact law without a ramp, harmonic loads, flight and rest. For a step of
+#: flight or rest, the scene is taken out of its lane.
 _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "fraction", "flight", "rest"}
 
 
 def fits_lanes(compiled: CompiledScene, *, sampled: bool = False) -> bool:
     """Return whether a scene can run in lanes.
 
-    Its terms must be those of its contact law and of harmonics (or samples); it may have no ramp and no `Options`.
+    Its only terms must be those of the contact law and of harmonic loads or samples. A ramp and `Options` are excluded.
     """
     parts = compiled.parts._replace(terms=compiled.parts.terms._replace(segments=None)) if sampled else compiled.parts
     there = (name for name, term in zip(Terms._fields, parts.terms, strict=True) if term is not None)
@@ -204,14 +209,14 @@ def new_lanes() -> NDArray[np.void]:
     """Return empty lanes, shape (1,)."""
     lanes = new_records(LANES, 1)
     lanes["member"] = -1
-    # an empty lane has the numbers of a scene at rest, so that its results stay finite
+    # an empty lane contains the numbers of a scene at rest, so that its results are finite
     lanes["y"][:, COS] = lanes["half_cavity"] = lanes["whole"] = 1.0
     return lanes
 
 
 @kernel()
 def load_lane(p, state, power, lanes, lane, member) -> None:
-    """Put a scene into a lane; `join_lanes` must follow."""
+    """Load a scene into a lane. The caller has to call `join_lanes` afterwards."""
     lanes.member[lane], lanes.time[lane] = member, state.step_start
     lanes.live[0] |= 1 << lane
     for i in range(5):
@@ -249,7 +254,7 @@ def load_lane(p, state, power, lanes, lane, member) -> None:
 
 @kernel()
 def join_lanes(lanes, bits) -> None:
-    """Spread the staged numbers of newly loaded lanes over the rows of all lanes, and note the modes."""
+    """Copy the staged numbers of newly loaded lanes to the rows of all lanes, and derive data from the modes."""
     for block in range(_BLOCKS):
         transpose(lanes.turned[block], lanes.staged[block])
     turned = lanes.turned
@@ -272,7 +277,7 @@ def join_lanes(lanes, bits) -> None:
 
 @kernel()
 def write_place(state, lanes, lane) -> None:
-    """Write the time and body coordinates of a lane to a state's record."""
+    """Write the time and the body coordinates of a lane to a state record."""
     for i in range(COMPONENTS):
         state.y[i] = lanes.y[i, lane]
     state.step_start = lanes.time[lane]
@@ -301,7 +306,7 @@ def save_lanes(states, lanes, bits) -> None:
 
 @kernel()
 def empty_lanes(lanes, bits) -> None:
-    """Empty some lanes; `note_modes` must follow."""
+    """Empty some lanes. The caller has to call `note_modes` afterwards."""
     for lane in range(WIDTH):
         if bits >> lane & 1:
             lanes.member[lane] = -1
@@ -310,7 +315,7 @@ def empty_lanes(lanes, bits) -> None:
 
 @kernel()
 def note_modes(lanes) -> None:
-    """Derive the guards of all lanes from the modes of their pairs, and put the pairs that are ON into slots."""
+    """Derive the guard functions of all lanes from the modes, and assign the pairs that are ON to slots."""
     live, damped = lanes.live[0], exact_row(lanes.viscous, 0) / exact_row(lanes.stiffness, 0)
     lanes.noted[0] = live
     for lane in range(WIDTH):
@@ -337,7 +342,7 @@ def note_modes(lanes) -> None:
 
 @kernel()
 def _take_slot(lanes, lane, pair, slot) -> None:
-    """Put a pair that is ON into a slot of its lane."""
+    """Assign a pair that is ON to a slot of its lane."""
     gear = lanes.gear[slot]
     for i in range(5):
         gear[i, lane] = lanes.rows[pair, i, lane]
@@ -347,7 +352,7 @@ def _take_slot(lanes, lane, pair, slot) -> None:
 
 @kernel()
 def refresh(lanes, hysteretic, power) -> None:
-    """Renew the maps of `_weigh_lanes` if modes or scenes have changed."""
+    """Update the linear maps of `_weigh_lanes` if modes or scenes have changed."""
     if lanes.stale[0] == 1:
         if hysteretic is None and power is None:
             _weigh_lanes(lanes)
@@ -356,10 +361,10 @@ def refresh(lanes, hysteretic, power) -> None:
 
 @kernel()
 def _weigh_lanes(lanes) -> None:
-    """Sum, over each lane's acting pairs, the linear maps from an order of the state to that of the forces.
+    """Write the linear maps from an order of the state to the same order of the forces, summed over acting pairs.
 
-    Along a wall's normal  f = -n F  with  F = K (a c + b s + n Z) + C (a c' + b s' + n Z'),  where Z is X or Y. The
-    moment is  c Gc + s Gs - X fy + Y fx,  where Gc and Gs are the sums of the arms' factors times F.
+    Along a wall's normal, f = -n F with F = K (a c + b s + n Z) + C (a c' + b s' + n Z'), where Z is X or Y. The moment
+    is c Gc + s Gs - X fy + Y fx, where Gc and Gs are sums of F times the coefficients of the arms.
     """
     along, turn, zero = lanes.along, lanes.turn, exact_splat(0.0)
     for i in range(6):
@@ -381,7 +386,7 @@ def _weigh_lanes(lanes) -> None:
 
 @kernel()
 def _add(there, rates, factor, gear, third, fourth, stiffness, viscous) -> None:
-    """Add a factor times a slot's force to a linear map: to the rows of cosine, sine and of further components."""
+    """Add `factor` times the force of a slot to a linear map."""
     spring, damper = factor * stiffness, factor * viscous
     for i in range(rates):
         at = third if i == 2 else fourth if i == 3 else i
@@ -391,7 +396,7 @@ def _add(there, rates, factor, gear, third, fourth, stiffness, viscous) -> None:
 
 @kernel()
 def read_block(lanes, block) -> None:
-    """Copy constants, state and notes from a block to the lanes."""
+    """Copy constants, state and the data derived from modes from a block to the lanes."""
     copy_part(lanes, block, 0, _SLOTS)
     used = 0
     while used < PAIR_COUNT and lanes.taken[used] != 0:
@@ -403,13 +408,16 @@ def read_block(lanes, block) -> None:
 
 @kernel()
 def write_block(block, lanes, new) -> None:
-    """Copy the state of the lanes to their block, also the notes if they have changed, and all if the block is new."""
+    """Copy the state of the lanes to their block.
+
+    The data derived from modes is copied if it has changed, and the constants are copied if the block is new.
+    """
     copy_part(block, lanes, 0 if new else _STATE, _NOTES if lanes.noted[0] < 0 else _SIZE)
 
 
 @kernel(inline="code")
 def places_of(numbers):
-    """Return eight integers as the tuple of places that `gathered` takes."""
+    """Return an array of eight integers as a tuple for `gathered`."""
     return (
         numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5], numbers[6], numbers[7],
     )  # fmt: skip
@@ -432,7 +440,7 @@ def linear_at(rows, c, s, x, y):
 
 @kernel()
 def to_bernstein(lanes, column, w, order, h) -> None:
-    """Write the Bernstein coefficients of one polynomial of each lane on [0, h] to `lanes.bernstein`."""
+    """Write the Bernstein coefficients on [0, h] of one polynomial of each lane to `lanes.bernstein`."""
     b, power = lanes.bernstein, exact_splat(1.0)
     for k in range(order + 1):
         set_row(b, k, exact_row(column, k) * (power * w.binomial[order, k]))

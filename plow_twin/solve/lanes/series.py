@@ -1,10 +1,9 @@
-"""Taylor series of eight scenes side by side with the contact modes frozen (equations in `method.series`).
+"""Taylor series of eight scenes with fixed contact modes. `method.series` contains the equations.
 
 If the contact force is linear in penetration and rate, the sum over a scene's acting pairs is one affine map of the
-state. An order then takes twelve Cauchy products, for any number and choice of acting pairs. A force with the damping
-lambda d' takes more: K d (1 + lambda d') is K (d + lambda / 2 (d^2)'), which takes half a product more for each slot,
-and d^n (1 + lambda d') takes three more. A slot holds one acting pair of each lane; the pairs of different lanes in a
-slot may differ.
+state. An order then needs twelve Cauchy products, for any number of acting pairs. A force with the damping lambda d'
+needs more products for each slot of acting pairs (`record`). K d (1 + lambda d') is K (d + lambda / 2 (d^2)'), which
+needs half a product more. d^n (1 + lambda d') needs three products more.
 """
 
 from __future__ import annotations
@@ -17,16 +16,16 @@ from plow_twin.solve.lanes.waves import coarse_exp2, coarse_log2, turn_lanes
 from plow_twin.solve.method.taylor import FURTHEST
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
-#: Largest usable term; products of larger terms would not be finite.
+#: Largest usable term of a series. Products of larger terms would not be finite.
 _FINITE = 1e300
-#: A series whose terms vanish ends early, but not below this order.
+#: Lowest order at which a series with negligible terms may end.
 _FEWEST_ORDERS = 4
 _ALL = 2**WIDTH - 1
 
 
 @kernel()
 def _gather_harmonic(harmonics, extent, lanes, i) -> None:
-    """Write harmonic number `i` of each lane to `lanes.harmonic`, zeros if the lane's scene has fewer harmonics."""
+    """Write the harmonic load with index `i` of each lane to `lanes.harmonic`, or zeros beyond the last load."""
     there = lanes.harmonic
     for lane in range(WIDTH):
         member = lanes.member[lane]
@@ -44,16 +43,16 @@ def _gather_harmonic(harmonics, extent, lanes, i) -> None:
 
 @kernel()
 def _add_wave(load, k, lanes, first, sine, cosine) -> None:
-    """Add order k of a harmonic to one of the loads; rows `first` and `first` + 1 hold its amplitudes."""
+    """Add order k of a harmonic load to `load`. Rows `first` and `first` + 1 of `lanes.harmonic` are its amplitudes."""
     wave = fused(exact_row(lanes.harmonic, first), sine, exact_row(load, k))
     set_row(load, k, fused(exact_row(lanes.harmonic, first + 1), cosine, wave))
 
 
 @kernel()
 def expand_loads(harmonics, extent, second, fraction, lanes, w, order) -> None:
-    """Write the series of the harmonic loads S1, S2, M of each lane's scene.
+    """Write the series of the harmonic loads S1, S2 and M of each lane's scene.
 
-    `extent`, shape (n, 2), has the index of each scene's first harmonic and the number of its harmonics.
+    `extent`, shape (n, 2), contains the index of each scene's first harmonic load and the number of its harmonic loads.
     """
     zero, most = exact_splat(0.0), 0
     alpha, beta = exact_row(lanes.alpha, 0), exact_row(lanes.beta, 0)
@@ -83,11 +82,11 @@ def expand_loads(harmonics, extent, second, fraction, lanes, w, order) -> None:
 
 @kernel()
 def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction, segments) -> int:
-    """Write the series of the state; return the order.
+    """Write the series of the state. Return the order.
 
-    Under sampled loads the series of a lane ends at the order from which its terms are negligible over the longest
-    wanted step. Its further terms are zero, so that a lane's results do not depend, even in the last bit, on the orders
-    of the other lanes.
+    Under sampled loads, the series of a lane ends at the order from which its terms are negligible over the longest
+    admissible step. Its higher terms are set to zero, so that the bits of a lane's results do not depend on the orders
+    of other lanes.
     """
     series, moment = lanes.series, lanes.moment
     zero = exact_splat(0.0)
@@ -127,7 +126,7 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction,
                     break
             if power is None:
                 calm = quiet
-        # the newest orders are added last, so that most of the sum need not wait until they are computed
+        # the rows with the highest orders are added last, so the processor can start the sum before they are available
         px = py = pvx = pvy = pc = ps = torque = other = wc = ws = zero
         for j in range(1, k):
             turned = exact_row(series[OMEGA], j)
@@ -147,7 +146,7 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction,
                 one = exact_row(load[0], j)
                 wc = fused(one, exact_row(series[COS], k - j), wc)
                 ws = fused(one, exact_row(series[SIN], k - j), ws)
-        share = 0.0 if k == 0 else 1.0  # order 0 has a single product, which must not be added twice
+        share = 0.0 if k == 0 else 1.0  # order 0 has only one product, which must not be added twice
         early = om0 * share
         px, py = fused(om, x0, fused(early, x, px)), fused(om, y0, fused(early, y, py))
         pvx, pvy = fused(om, vx0, fused(early, vx, pvx)), fused(om, vy0, fused(early, vy, pvy))
@@ -168,7 +167,7 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction,
                     turned_by = exact_row(lanes.slope, 2)
                 before_c, before_s = c, s
             else:
-                # the series of the time t(sigma) has the terms alpha and beta / 2
+                # the series of the time t(sigma) has the coefficients alpha and beta / 2
                 if k == 1:
                     turned_by = exact_row(lanes.slope, 2) * alpha
                 if k == 2:
@@ -247,7 +246,7 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction,
 
 @kernel(inline="code")
 def tested(power) -> int:
-    """Return how many of the last orders tell the size of a step."""
+    """Return how many of the last orders determine the size of a step."""
     if power is None:
         return 2
     return MOST_LACUNA
@@ -255,7 +254,7 @@ def tested(power) -> int:
 
 @kernel(inline="code")
 def _long_quiet(history) -> int:
-    """Return a bit for each lane whose terms were negligible in all the orders just before the newest."""
+    """Return a bit mask of the lanes whose terms were negligible in all orders just before the newest order."""
     bits = history
     for i in range(1, MOST_LACUNA - 1):
         bits &= history >> WIDTH * i
@@ -272,7 +271,7 @@ def _set_rates(lanes, k, dx, dy, dc, ds) -> None:
 
 @kernel()
 def _end_series(lanes, active, ended, k) -> int:
-    """Record that the series of the lanes `ended` end at order k; return the bits of the other active lanes."""
+    """Record that the series of the lanes `ended` end at order k. Return a bit mask of the other active lanes."""
     for lane in range(WIDTH):
         if (ended & active) >> lane & 1:
             lanes.orders[lane] = k
@@ -294,17 +293,17 @@ def _set_state(series, k, x, y, vx, vy, om, c, s, angle) -> None:
 
 @kernel(inline="code")
 def _add_ends(load, k, c0, s0, c, s, share, wc, ws):
-    """Complete order k of a load times cosine and sine by the products with the first and the newest order."""
+    """Return order k of a load times cosine and sine, after adding the products with the first and the newest order."""
     first, newest = exact_row(load, 0) * share, exact_row(load, k)
     return fused(newest, c0, fused(first, c, wc)), fused(newest, s0, fused(first, s, ws))
 
 
 @kernel()
 def _start(lanes, viscous, c, s, x, y, dc, ds, dx, dy):
-    """Return order 0 of the contacts' forces along X and Y and of their factors of cosine and sine in the moment.
+    """Return order 0 of the contacts' forces along X and Y, and of their factors of cosine and sine in the moment.
 
-    They are computed from the same penetrations as the guards. The summed maps (`record._weigh_lanes`) would be rounded
-    differently, so that the force would begin 1e-17 m away from the event.
+    They are computed from the same penetrations as the guard functions. The summed maps (`record._weigh_lanes`) have
+    different rounding, so the force would begin 1e-17 m away from the event.
     """
     fx = fy = gc = gs = exact_splat(0.0)
     for slot in range(PAIR_COUNT):
@@ -322,7 +321,7 @@ def _start(lanes, viscous, c, s, x, y, dc, ds, dx, dy):
 
 @kernel(inline="code")
 def _add_force(lanes, gear, push, fx, fy, gc, gs):
-    """Add a slot's force, given as F / K, to the forces along X and Y and to the factors of c and s in the moment."""
+    """Return the forces along X and Y and the factors of c and s in the moment, after adding a slot's F = K `push`."""
     force = exact_row(lanes.stiffness, 0) * push
     return (
         fused(exact_row(gear, 2) * -1.0, force, fx), fused(exact_row(gear, 3) * -1.0, force, fy),
@@ -332,10 +331,10 @@ def _add_force(lanes, gear, push, fx, fy, gc, gs):
 
 @kernel(inline="code")
 def _push(lanes, w, k, acts, c, s, x, y, dc, ds, dx, dy):
-    """Return order k of the forces along X and Y and of the factors of cosine and sine in the contacts' moment.
+    """Return order k of the forces along X and Y, and of the factors of cosine and sine in the contacts' moment.
 
-    This is the sum over the slots for F = K d (1 + lambda d'). The penetrations of the next order and F / K are written
-    to `lanes`.
+    They are sums over the slots for F = K d (1 + lambda d'). The next order of the penetrations and order k of F / K
+    are written to `lanes`.
     """
     fx = fy = gc = gs = exact_splat(0.0)
     for slot in range(PAIR_COUNT):
@@ -361,7 +360,7 @@ def _push(lanes, w, k, acts, c, s, x, y, dc, ds, dx, dy):
 
 @kernel(inline="code")
 def _push_by_power(lanes, w, k, acts, hysteretic, fraction, c, s, x, y, dc, ds, dx, dy, alpha, beta):
-    """Return what `_push` does, for F = K d^n (1 + lambda d') with exponents n other than 1."""
+    """Return the same results as `_push`, for F = K d^n (1 + lambda d') with exponents n other than 1."""
     fx = fy = gc = gs = zero = exact_splat(0.0)
     for slot in range(PAIR_COUNT):
         gear, depth = lanes.gear[slot], lanes.depth[slot]
@@ -398,9 +397,9 @@ def _push_by_power(lanes, w, k, acts, hysteretic, fraction, c, s, x, y, dc, ds, 
 
 @kernel(inline="code")
 def _multiply(lanes, slot, k, hysteretic):
-    """Return order k of d^n and of d^n d'; the latter lacks the product with order k of d^n.
+    """Return order k of d^n, and order k of d^n d' without the product that contains order k of d^n.
 
-    The exponents are integers from 2 to 4, which may differ from lane to lane.
+    The exponents are integers from 2 to 4, and may differ between lanes.
     """
     depth, square, power, exponent = lanes.depth[slot], lanes.base[slot], lanes.power[slot], lanes.exponent
     set_row(square, k, _product(depth, depth, k))
@@ -428,10 +427,10 @@ def _product(a, b, k):
 
 @kernel(inline="code")
 def _raise(lanes, w, slot, k, hysteretic):
-    """Return what `_multiply` does, for exponents n that are not integers.
+    """Return the same results as `_multiply`, for exponents n that are not integers.
 
-    The recurrence for the power P of the base b is that of `model.contact.power_term`. The base is d, or d / sigma^2 in
-    lanes whose pair touches at the step's start, where P begins with sigma^3 (n = 1.5).
+    The recurrence for the power P of the base b is that of `model.contact.power_term`. The base is d. If the pair of a
+    lane touches at the start of the step, the base is d / sigma^2, and P begins with sigma^3 (n = 1.5).
     """
     power, base, rate = lanes.power[slot], lanes.base[slot], lanes.rate[slot]
     touching, zero, above = lanes.touching[slot], exact_splat(0.0), exact_row(lanes.exponent, 0) + 1.0
@@ -447,7 +446,7 @@ def _raise(lanes, w, slot, k, hysteretic):
     set_row(base, k, here)
     if k == 0:
         _invert(lanes, slot, here, ~touching)
-        # the powers of lanes without a pair in the slot stay zero
+        # the powers of lanes without a pair in the slot remain zero
         return choose(lanes.taken[slot] & ~touching, _first_power(lanes, here), zero), zero
     found = damped = zero
     for j in range(1, k):
@@ -469,14 +468,14 @@ def _raise(lanes, w, slot, k, hysteretic):
 
 @kernel(inline="code")
 def _invert(lanes, slot, value, bits) -> None:
-    """Write 1 / `value` for the lanes in `bits`, and 0 for those of them without a pair in the slot."""
+    """Write 1 / `value` for the lanes in `bits`, or 0 for lanes without a pair in the slot."""
     there = choose(lanes.taken[slot], exact_splat(1.0) / value, exact_splat(0.0))
     set_row(lanes.per_base, slot, choose(bits, there, exact_row(lanes.per_base, slot)))
 
 
 @kernel()
 def raised(lanes, value, fraction):
-    """Return value^n of each lane, 0 for negative values."""
+    """Return value^n of each lane, or 0 for negative values."""
     if fraction is not None:
         return _first_power(lanes, value)
     zero, square, exponent = exact_splat(0.0), value * value, exact_row(lanes.exponent, 0)
@@ -487,7 +486,7 @@ def raised(lanes, value, fraction):
 
 @kernel()
 def _first_power(lanes, value):
-    """Return value^n of each lane for exponents that are not integers, 0 for negative values."""
+    """Return value^n of each lane for exponents that are not integers, or 0 for negative values."""
     zero, half = exact_splat(0.0), exact_splat(1.5)
     value = choose(below(zero, value), value, zero)
     found = value * square_root(value)
@@ -523,14 +522,14 @@ def _lever(row, viscous, c, s, x, y, dc, ds, dx, dy):
 
 @kernel(inline="code")
 def _size(lanes, vx, vy, om, c, s):
-    """Return the size of an order's terms as a velocity."""
+    """Return the size of the terms of one order, converted to a velocity."""
     size = fused(exact_row(lanes.weight, 0), magnitude(c) + magnitude(s), magnitude(vx) + magnitude(vy))
     return fused(exact_row(lanes.radius, 0), magnitude(om), size)
 
 
 @kernel()
 def _not_too_far(lanes, step):
-    """Limit the steps whose variable is the square root of the time since a touch (`method.taylor`)."""
+    """Return the steps, limited where the variable is the square root of the time since a touch (`method.taylor`)."""
     zero, alpha, beta = exact_splat(0.0), exact_row(lanes.alpha, 0), exact_row(lanes.beta, 0)
     furthest = alpha / beta * FURTHEST
     far = below(zero, alpha) & below(zero, beta) & below(furthest, step)
@@ -542,10 +541,10 @@ def _not_too_far(lanes, step):
 
 @kernel()
 def accurate_steps(lanes, w, order, power, fraction) -> int:
-    """Write to `lanes.step` the step over which each lane's series meets its share of the tolerance.
+    """Write the accurate step size of each lane's series to `lanes.step`. Return a bit mask of non-finite series.
 
-    The test is that of `method.step_size.accurate_step`. A coarse logarithm suffices, because a step that is longer by
-    1e-4 has an error that is larger by 0.2 %. Returns a bit for each lane whose series is not finite.
+    The test is that of `method.step_size.accurate_step`. A coarse logarithm is sufficient, because a step that is
+    longer by 1e-4 has an error that is larger by 0.2 %.
     """
     whole, least, zero, infinite = exact_row(lanes.whole, 0), exact_splat(1e3), exact_splat(0.0), 0
     recent = tested(power)
@@ -555,8 +554,8 @@ def accurate_steps(lanes, w, order, power, fraction) -> int:
         here = coarse_log2(exact_row(lanes.threshold, i) / size) * w.inverse[order - i]
         least = choose(below(here, least), here, least)
     shorter = below(coarse_exp2(least), whole)
-    # over a long step an admissible error of velocity becomes too large an error of position; the step is then
-    # shortened
+    # over a long step, an admissible error of the velocity results in an error of the position that is too large; the
+    # step is then shortened
     stretch = least + exact_row(lanes.stretch, 0)
     stretch = choose(below(zero, stretch), stretch, zero)
     step = choose(shorter, coarse_exp2(fused(stretch, exact_splat(-w.inverse[order]), least)), whole)

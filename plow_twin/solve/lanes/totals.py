@@ -1,4 +1,4 @@
-"""Totals of the motions in the lanes: impulses, peaks and times, from the series of each lane's step."""
+"""Totals of the motions in the lanes (impulses, peaks and times in contact), from the series of each lane's step."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from plow_twin.solve.lanes.record import COMPONENTS, WIDTH, linear_at, penetrati
 from plow_twin.solve.state import COS, SIN, X, Y
 from plow_twin.solve.totals import add_set_times
 
-#: Allowances for rounding: the factor by which the upper bound of a force is raised, and the ratio of a maximum to a
-#: peak up to which the two count as equal.
+#: Allowances for rounding. `_ROUNDED`: factor by which the upper bound of a force is increased. `_SAME`: ratio of a
+#: maximum to a peak up to which they are treated as equal.
 _ROUNDED, _SAME = 1.0 + 1e-9, 1.0 + 1e-12
 
 
@@ -21,10 +21,11 @@ _ROUNDED, _SAME = 1.0 + 1e-9, 1.0 + 1e-12
 def sum_step(lanes, w, order, power) -> None:
     """Write the change of the state over each lane's step, and the integrals of the changes of cosine, sine, X and Y.
 
-    A change is the difference from the value at the step's start. Only impulses with exponent 1 need the integrals.
+    A change is the difference from the value at the start of the step. The integrals are necessary only for impulses
+    with the exponent 1.
     """
     h, zero = exact_row(lanes.step, 0), exact_splat(0.0)
-    # four sums side by side keep the processor busy, since no sum waits for another
+    # four independent sums keep the processor busy, because no sum has to wait for another sum
     for i in range(0, COMPONENTS, 4):
         a = b = c = d = zero
         for k in range(order, 0, -1):
@@ -50,13 +51,13 @@ def sum_step(lanes, w, order, power) -> None:
 
 @kernel()
 def add_step(totals, lanes, w, order, full, viscous, hysteretic, power, fraction) -> None:
-    """Add the laid-out steps to the sums in the lanes, and the times of sets of corners to `totals` unless it is None.
+    """Add the current steps to the sums in the lanes, and the times of sets of corners to `totals`, if it is not None.
 
-    `order` and `full` have the meaning that they have in `first_events`.
+    The arguments `order` and `full` are those of `first_events`.
     """
     last = order - 1
     if totals is None and hysteretic is None and power is None:
-        # under samples a lane's series may end earlier than the others, and its guard then has one more term
+        # under sampled loads, the series of a lane can end before those of other lanes, and then has one more term
         last = order
     for slot in range(PAIR_COUNT):
         taken = lanes.taken[slot]
@@ -108,7 +109,7 @@ def _impulses(lanes, gear, viscous, hysteretic):
 
 @kernel()
 def _impulses_by_power(lanes, w, slot, order, fraction):
-    """Return the impulses of a slot's pairs over the step from the series of F / K."""
+    """Return the impulses of a slot's pairs over the step, from the series of F / K."""
     h, push, first = exact_row(lanes.step, 0), lanes.push[slot], exact_splat(0.0)
     second = first
     for k in range(order, -1, -1):
@@ -123,11 +124,11 @@ def _impulses_by_power(lanes, w, slot, order, fraction):
 
 @kernel()
 def _raise_peaks(totals, lanes, w, slot, order, full, on) -> int:
-    """Raise the peaks in `lanes.gained` by the series of F / K; return a bit for each lane that was checked.
+    """Increase the peaks in `lanes.gained`, by the series of F / K. Return a bit mask of the lanes that were checked.
 
-    If an upper bound of the force exceeds the peak so far, the peak is raised to the larger of the forces at the step's
-    two ends. A force whose maximum may lie between the ends is kept for `find_peaks`. Under samples it is examined at
-    once, because rows need their peaks and steps are short.
+    If an upper bound of the force exceeds the peak, the peak is increased to the larger of the two end values of the
+    force. A force whose maximum may be within the step is stored for `find_peaks`. Under sampled loads its maximum is
+    computed at once, because each row needs its peak.
     """
     h, zero, half, push = exact_row(lanes.step, 0), exact_splat(0.0), exact_splat(0.5), lanes.push[slot]
     end = bend = slope = zero
@@ -137,7 +138,7 @@ def _raise_peaks(totals, lanes, w, slot, order, full, on) -> int:
         if k > 1:
             size = magnitude(term)
             slope = fused(size, exact_splat(1.0 * k), slope) * h
-            # a function exceeds the values at its ends by at most h^2 / 8 times its largest downward curvature
+            # a function exceeds its end values by at most h^2 / 8 times its largest downward curvature
             bend = fused((size - term) * half, exact_splat(0.125 * k * (k - 1)), bend) * h
     start, stiffness, peak = exact_row(push, 0), exact_row(lanes.stiffness, 0), exact_row(lanes.gained, 1)
     most = choose(below(start, end), end, start)
@@ -164,7 +165,7 @@ def _raise_peaks(totals, lanes, w, slot, order, full, on) -> int:
 
 @kernel()
 def _hull_top(lanes, push, w, order, full):
-    """Return the largest Bernstein coefficient of `push`, its upper bound over each lane's step."""
+    """Return the largest Bernstein coefficient of `push`, which is its upper bound over each lane's step."""
     zero = exact_splat(0.0)
     for k in range(order + 1, full + 1):
         set_row(push, k, zero)
@@ -189,7 +190,7 @@ def _raise_at_once(lanes, w, push, full, bulges) -> None:
 
 @kernel()
 def _keep_bulge(lanes, push, pair, lane, order) -> None:
-    """Keep the force of a lane's pair for `find_peaks`."""
+    """Store the force of a lane's pair for `find_peaks`."""
     i, stiffness = lanes.bulges[0], lanes.stiffness[lane]
     for k in range(order + 1):
         lanes.bulge[k, i] = stiffness * push[k, lane]
@@ -199,10 +200,10 @@ def _keep_bulge(lanes, push, pair, lane, order) -> None:
 
 @kernel()
 def find_peaks(lanes, w, order) -> None:
-    """Raise the peaks by the maxima of the forces in `lanes.bulge`, which are of any lanes and steps.
+    """Increase the peaks by the maxima of the forces in `lanes.bulge`, which may be from any lanes and steps.
 
-    A maximum is found as a root of F', independently of the peak so far, so that it does not depend, even in the last
-    bit, on the other lanes.
+    Each maximum is computed as a root of F', independently of the current peak. The bits of a peak therefore do not
+    depend on other lanes.
     """
     if lanes.bulges[0] == 0:
         return

@@ -1,4 +1,4 @@
-"""Functions of eight numbers in a SIMD vector: sine and cosine, and a coarse logarithm and power for step sizes."""
+"""Functions of the eight numbers in a SIMD vector: sine, cosine, and a coarse logarithm and power for step sizes."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from plow_twin.kernel.simd import (
 
 #: Largest angle for which the product of the number of quarter turns and the first part of pi / 2 is exact.
 _LARGEST = 1e5
-#: Adding this number to a double and then subtracting it rounds the double to an integer.
+#: Number that rounds a double to an integer, if it is added to the double and then subtracted.
 _ROUNDS = 6755399441055744.0
-#: pi / 2 in three parts, the first two of 33 bits (fdlibm, e_rem_pio2.c).
+#: 2 / pi, and pi / 2 in three parts, the first two of 33 bits (fdlibm, e_rem_pio2.c).
 _QUARTERS = (0.6366197723675814, 1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
 #: Polynomials of sine and cosine on [-pi/4, pi/4] (fdlibm, k_sin.c, k_cos.c).
 _SINE = (
@@ -33,8 +33,8 @@ _COSINE = (
     -1.13596475577881948265e-11, 2.08757232129817482790e-09, -2.75573143513906633035e-07, 2.48015872894767294178e-05,
     -1.38888888888741095749e-03, 4.16666666666666019037e-02,
 )  # fmt: skip
-#: Polynomials that interpolate at Chebyshev points: log2 on [1, 2] (error 1.2e-4), and 2^x on [0, 1] (relative error
-#: 3.5e-6).
+#: Interpolating polynomials with Chebyshev nodes: log2 on [1, 2] with an error of 1.2e-4, and 2^x on [0, 1] with a
+#: relative error of 3.5e-6.
 _LOGARITHM = (
     -0.07844067620915011, 0.6260321821639458, -2.0783351682517304, 4.029211391071475, -2.4983531488141586,
 )  # fmt: skip
@@ -45,7 +45,7 @@ _POWER = (
 
 @kernel(inline="code")
 def coarse_log2(value):
-    """Return the binary logarithm of each lane's positive number with an error of 1.2e-4."""
+    """Return the binary logarithm of the positive number in each lane, with an error of 1.2e-4."""
     part = significand_of(value)
     found = exact_splat(_LOGARITHM[0])
     for i in range(1, 5):
@@ -55,7 +55,7 @@ def coarse_log2(value):
 
 @kernel(inline="code")
 def coarse_exp2(value):
-    """Return 2 to the power of each lane's number, at most 1e3 in size, with a relative error of 3.5e-6."""
+    """Return 2 to the power of the number in each lane, with a relative error of 3.5e-6, for |number| <= 1e3."""
     whole = (value - 0.5 + _ROUNDS) - _ROUNDS
     part, found = value - whole, exact_splat(_POWER[0])
     for i in range(1, 5):
@@ -65,7 +65,7 @@ def coarse_exp2(value):
 
 @kernel()
 def turn_lanes(angle, cosine, sine) -> None:
-    """Write cosine and sine of the eight numbers in `angle`, each exact to one or two rounding errors."""
+    """Write cosine and sine of the eight numbers in `angle`. Each has an error of one or two rounding errors."""
     x = exact_row(angle, 0)
     turns = (x * _QUARTERS[0] + _ROUNDS) - _ROUNDS
     r = fused(turns, exact_splat(-_QUARTERS[1]), x)
@@ -78,7 +78,7 @@ def turn_lanes(angle, cosine, sine) -> None:
         c = fused(c, square, exact_splat(_COSINE[i]))
     s = fused(s * square, r, r)
     c = fused(c * square, square, fused(square, exact_splat(-0.5), exact_splat(1.0)))
-    # `quarter`, from 0 to 3, is the number of quarter turns that remain after the whole turns
+    # `quarter`, from 0 to 3, is the number of quarter turns after subtraction of whole turns
     whole = (turns * 0.25 - 0.375 + _ROUNDS) - _ROUNDS
     quarter = turns - whole * 4.0
     first, half, last = (
