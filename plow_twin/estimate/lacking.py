@@ -1,7 +1,8 @@
-"""Fits with harmonics that the measured load lacks.
+"""Fits with harmonics that are missing from the measured load.
 
-A linearised step of all unknowns, amplitudes included, alternates with a short fit of all unknowns but the amplitudes,
-first for the beginnings of the swings, which have few false optima, then for whole swings.
+Two steps alternate: a linearised step of all unknowns, including the amplitudes of the harmonics, and a short fit of
+all unknowns except the amplitudes. The beginnings of the swings are fitted first, because they have few false optima.
+Whole swings are fitted afterwards.
 """
 
 from __future__ import annotations
@@ -19,20 +20,22 @@ from plow_twin.estimate.verdict import Verdict, judge
 
 Array = NDArray[np.float64]
 
-#: Bound: largest number of fits with harmonics; number of iterations of each fit; number of consecutive fits without an
-#: improvement after which the rounds end.
+#: Upper bounds of the number of fits with harmonics, of the iterations in each fit, and of the number of consecutive
+#: fits without improvement.
 _ROUNDS, _ITERATIONS, _IN_VAIN = 12, 6, 4
-#: Bound: horizon of the middle stage, relative to the horizon of the first stage; the last stage has whole swings.
+#: Horizon, the upper bound of the fitted part of each swing, in the second stage relative to the first stage. The third
+#: stage fits whole swings.
 _LONGER = 2.0
 
 
 def with_harmonics(
     problem: Problem, found: Fit, felt: Load, period: float
 ) -> tuple[tuple[Problem, Fit], Verdict] | None:
-    """Repeat a fit with harmonics of the measured load `felt`.
+    """Return a fit that includes harmonics of the measured load `felt`, and its verdict.
 
-    Returns None if the load is not periodic, swings are linked, the model cannot be run, or a check fails. If the fit
-    of the beginnings fails a check, so would the fit of whole swings, which costs several times as much.
+    The result is None if the load is not periodic, if swings are linked, if the motion cannot be simulated, or if a
+    check fails. The checks are made after each stage, because a fit of whole swings, which is much more expensive,
+    would fail too.
     """
     harmonics, poses = Harmonics.of(felt), problem.window.poses
     if harmonics is None or len(problem.link):
@@ -56,7 +59,10 @@ def with_harmonics(
 def _alternated(
     problem: Problem, found: Fit, felt: Load, harmonics: Harmonics
 ) -> tuple[Problem, Fit, Harmonics] | None:
-    """Alternate steps of the amplitudes, which begin at `harmonics`, with fits of the other unknowns."""
+    """Return the result of alternating steps of the amplitudes, which begin at `harmonics`, and fits of other unknowns.
+
+    The result is None if the motion cannot be simulated.
+    """
     best, in_vain = found.loss, 0
     for index in range(_ROUNDS):
         value = harmonics.amplitude.ravel()
@@ -65,7 +71,7 @@ def _alternated(
         step, covariance, states = whole_step(problem, found, columns, precision, -value * precision)
         (shared, change), covariance = np.split(step, [SIZE]), covariance[SIZE:, SIZE:]
         size = float(change @ np.linalg.solve(covariance, change))
-        # a change within the noise needs no further fit, because grading a fit allows for it by a linear step
+        # a change within the noise needs no further fit, because `discrepancy.graded` applies it as a linearised step
         if in_vain == _IN_VAIN or (index and size < tuning.SETTLED * len(COMPONENTS)):
             break
         harmonics = harmonics.moved(np.clip(change, -tuning.LACKING, tuning.LACKING), np.diag(covariance))
@@ -87,7 +93,7 @@ def _alternated(
 
 
 def _named(harmonics: Harmonics) -> str:
-    """Describe the most significant harmonic in words, as a reason of the estimate."""
+    """Return a description of the most significant harmonic, as a reason of the estimate."""
     clear = harmonics.amplitude**2 / harmonics.variance
     clear[1::2] += clear[2::2]
     clear[2::2] = 0.0

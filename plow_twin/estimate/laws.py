@@ -1,8 +1,8 @@
-"""The odds of two laws for a hard contact, from the likelihood of the motion under each law.
+"""Odds of two contact laws for a hard contact, from the likelihood of the measured motion under each law.
 
-Under each law, the features of drawn motions are modelled as a polynomial of the drawn parameters plus normal noise.
-This gives the likelihood of the measured motion under each law, and thus the odds (synthetic likelihood: Wood, Nature
-466 (2010) 1102). Laplace's method integrates over the parameters.
+Motions are drawn and simulated under each law. Their features are modelled as a polynomial of the drawn parameters plus
+normal noise (synthetic likelihood: Wood, Nature 466 (2010) 1102). The likelihood is integrated over the parameters with
+Laplace's method, and the ratio of the two integrals is the odds.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from plow_twin.estimate.regression import ridge, shrunk_root
 
 Array = NDArray[np.float64]
 
-#: Guard: smallest variance that a feature can have.
+#: Guard against division by zero: smallest variance of a feature.
 _LEAST = 1e-9
-#: Definition: indices of the parameters with terms up to the third degree (penetration, damping), and of the
-#: clearances, whose effect depends on these parameters.
+#: Indices of the parameters with terms up to the third degree (penetration, damping), and of the clearances, which have
+#: products with these parameters, by definition.
 _CURVED, _CHANGING = (0, 1), (5, 6)
-#: Bound: number of Levenberg-Marquardt steps to the likeliest parameters; damping of the first step; gain at which the
-#: steps end.
-#: Step: for the difference quotients with respect to the parameters.
+#: Levenberg-Marquardt steps to the most likely parameters: upper bound of their number, damping of the first step, gain
+#: below which they end, and step of the difference quotients.
 _STEPS, _DAMPED, _ENOUGH, _SMALL = 30, 1e-2, 1e-2, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Motions simulated under one law: their features (n, m), and the randomly drawn unknowns (n, 7).
+    """Motions simulated under one law.
 
-    The unknowns are the logarithms of penetration and damping, three gains of the load, and the differences of the two
-    clearances from the reach.
+    like : (n, m) features of the motions
+    drawn : (n, 7) drawn unknowns: logarithms of penetration and damping, three gains of the load, and two differences
+    between clearance and reach
     """
 
     like: Array
@@ -42,7 +42,9 @@ class Draws:
 
 
 def log_odds(believed: Draws, other: Draws, measured: Array) -> float:
-    """Return the log odds of the other law given the features `measured`, shape (m,)."""
+    """Return the logarithm of the odds of the law of `other` against the law of `believed`, given m measured
+    features.
+    """
     both = np.concatenate([believed.like, other.like])
     middle, scale = both.mean(axis=0), both.std(axis=0) + _LEAST
     surfaces = [_Surface.through(law.drawn, (law.like - middle) / scale) for law in (believed, other)]
@@ -56,11 +58,11 @@ def log_odds(believed: Draws, other: Draws, measured: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Surface:
-    """Features as a polynomial of the parameters, both in units of their scatter about the mean.
+    """Features as a polynomial of the parameters; features and parameters are standardised.
 
-    coefficients : (terms, m)
-    left : (n, m) cross-validated residuals
-    points : (n, 7) of the draws
+    coefficients : (terms, m) coefficients of the polynomial
+    left : (n, m) leave-one-out residuals
+    points : (n, 7) parameters of the draws
     """
 
     coefficients: Array
@@ -78,7 +80,10 @@ class _Surface:
         return _Surface(coefficients, left, points)
 
     def ln_evidence(self, root: Array, seen: Array) -> float:
-        """Return the logarithm of the evidence of `seen` (m,), whitened by the `root` of the covariance."""
+        """Return the logarithm of the evidence, given the measured features `seen`, shape (m,).
+
+        `root` is the Cholesky factor of the residual covariance, with which `seen` is already whitened.
+        """
         matrix = np.linalg.solve(root, self.coefficients.T)
 
         def misfit(points: Array) -> tuple[Array, Array]:
@@ -106,7 +111,7 @@ class _Surface:
 
 
 def _terms(points: Array) -> Array:
-    """Return the polynomial's terms at some points (n, 7)."""
+    """Return the terms of the polynomial at n points, shape (n, 7)."""
     products = [
         np.prod(points[:, list(index)], axis=1)
         for degree in (2, 3)

@@ -1,10 +1,15 @@
-"""Learning of the members' parameters from the poses by which the members of a follower are moved.
+"""Estimation of the members' parameters from the poses that move the members of a follower.
 
-With a hard contact the motion is too irregular to be fitted, so an estimate hardly determines stiffness and load gains.
-The members' predictions differ partly because their parameters differ. Regression of the predictions on the parameters
-gives the sensitivity of a pose; the residuals give the covariance of a prediction with known parameters. The
-innovations then determine the parameters as in a two-stage Kalman filter (Friedland, IEEE Trans. Autom. Control 14
-(1969) 359). The duration pi sqrt(m / K) of each rebound from a hard contact shows the stiffness.
+With a hard contact the motion is too irregular for a fit, so an estimate hardly determines stiffness and load gains.
+These parameters are estimated from the poses while the twin follows the machine, as in a two-stage Kalman filter
+(Friedland, IEEE Trans. Autom. Control 14 (1969) 359):
+
+1. The predicted poses of the members are regressed on the parameters of the members. The slope is the sensitivity of a
+pose to the parameters.
+2. The residuals of the regression give the covariance of a prediction with known parameters.
+3. The innovations, which are the differences between measured and predicted poses, then correct the parameters.
+
+The stiffness, for example, affects the duration pi sqrt(m / K) of each rebound from a hard contact.
 """
 
 from __future__ import annotations
@@ -22,17 +27,17 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Bound: smallest number of members, as a multiple of the number of learned parameters plus one.
+#: Lower bound of the number of members, as a multiple of the number of learned parameters plus one.
 _MEMBERS: Final = 4
-#: Guard: largest restitution.
+#: Upper bound of a restitution.
 _MOST_RESTITUTION = 0.999
 
 
 def numbers_of(scenes: Sequence[Scene], gain: Array, bias: Array) -> Array:
-    """Return the parameters of members in units of `tuning.LEARNED_TO`, shape (m, 10).
+    """Return the parameters of m members in units of `tuning.LEARNED_TO`, shape (m, 10).
 
-    They are the logarithms of K^-1/2 and of the damping (or restitution), the clearances, the load gains, (m, 3), and
-    the sensor's biases, (m, 3).
+    The parameters are the logarithm of K^-1/2, the logarithm of the damping or restitution, two clearances, three load
+    gains, and three biases of the sensor.
     """
     damping = [one.contact.damping if one.contact.restitution is None else one.contact.restitution for one in scenes]
     raw = np.column_stack([
@@ -48,13 +53,13 @@ def numbers_of(scenes: Sequence[Scene], gain: Array, bias: Array) -> Array:
 
 
 def biases_of(numbers: Array) -> Array:
-    """Return the biases of the sensor, (..., 3), among the parameters of members, (..., 10)."""
+    """Return the biases of the sensor in m, m, rad, shape (..., 3), from the parameters of members, shape (..., 10)."""
     found: Array = (numbers * np.array(tuning.LEARNED_TO))[..., -3:]
     return found
 
 
 def with_numbers(scene: Scene, numbers: Array) -> tuple[Scene, Array]:
-    """Return a member's scene and load gains, (3,), with its parameters replaced by `numbers`, (10,)."""
+    """Return the scene and the load gains, shape (3,), of a member with the parameters `numbers`, shape (10,)."""
     softness, damping, horizontal, vertical, *gain = (numbers * np.array(tuning.LEARNED_TO)).tolist()[:-3]
     number = None
     if scene.contact.restitution is not None:
@@ -66,12 +71,14 @@ def with_numbers(scene: Scene, numbers: Array) -> tuple[Scene, Array]:
 
 
 class Learner:
-    """The normal distribution of the members' parameters given the poses, in units of `tuning.LEARNED_TO`.
+    """Normal distribution of the parameters of the machine given the poses, in units of `tuning.LEARNED_TO`.
+
+    A parameter is *learned* if it is estimated from the poses; other parameters have the drawn values.
 
     Parameters
     ----------
     drawn : ndarray, shape (m, 10)
-        Parameters of the members as drawn from an estimate, those of the median twin first.
+        Parameters of the members as drawn from an estimate; the first row belongs to the median twin.
     learned : ndarray of int, shape (k,)
         Indices of the learned parameters.
     time : float
@@ -84,7 +91,7 @@ class Learner:
         self._least, self._most = own.min(axis=0), own.max(axis=0)
         self.mean, self.covariance = own[0].copy(), np.cov(own.T).reshape(len(learned), -1)
         self._widest = np.sqrt(np.diag(self.covariance))
-        # standardised differences of the members from the mean; the first member, the median twin, is at the mean
+        # standardised differences of the members from the mean; that of the first member, the median twin, is zero
         white = own - own.mean(axis=0)
         white[0] = 0.0
         self._white = white @ np.linalg.inv(np.linalg.cholesky(self.covariance)).T
@@ -92,17 +99,22 @@ class Learner:
 
     @classmethod
     def of(cls, drawn: Array, time: float) -> Learner | None:
-        """Return a learner of the parameters with a deviation above one unit; None without them or with few members."""
+        """Return a learner of all parameters whose deviation exceeds one unit.
+
+        The result is None if there is no such parameter, or if there are too few members.
+        """
         learned = np.flatnonzero(drawn[1:].std(axis=0) > 1.0)
         enough = len(drawn) >= _MEMBERS * (len(learned) + 1)
         return cls(drawn, learned, time) if len(learned) and enough else None
 
     def _begin(self) -> None:
-        """Forget the information from poses since the last update of the distribution."""
+        """Drop the information from poses since the last update of the distribution."""
         self._precision, self._score = np.zeros((len(self.open), len(self.open))), np.zeros(len(self.open))
 
     def take_over(self, before: Learner) -> None:
-        """Combine the previous learner's distribution with the new estimate, unless they contradict each other."""
+        """Combine the distribution with that of the previous learner, unless the two distributions contradict each
+        other.
+        """
         both, here, there = np.intersect1d(self.open, before.open, return_indices=True)
         if not len(both):
             return
@@ -115,7 +127,7 @@ class Learner:
         self.covariance = self.covariance - gain @ self.covariance[here]
 
     def add(self, numbers: Array, seen: Array, off: Array, noise: Array) -> None:
-        """Add a pose.
+        """Add the information from a pose.
 
         Parameters
         ----------
@@ -136,23 +148,22 @@ class Learner:
         rest = seen - apart @ slope
         alone = rest.T @ rest / (len(own) - len(self.open) - 1)
         inverse = np.linalg.inv(alone + np.diag(noise**2))
-        # with unrelated numbers the scatter of the members would give a slope too; the information that such a random
-        # slope seems to contain is subtracted
+        # random scatter of the members also causes a slope; the information in such a random slope is subtracted
         self._precision += slope @ inverse @ slope.T - spread * np.trace(inverse @ alone)
         self._score += slope @ inverse @ (off - (self.mean - middle) @ slope)
 
     def learn(self, time: float) -> None:
-        """Update the distribution with the poses since the last update."""
+        """Update the distribution with the information from poses since the last update."""
         root = np.linalg.cholesky(self.covariance)
         value, axes = np.linalg.eigh(tuning.LEARNING * root.T @ self._precision @ root)
         turned = root @ axes
         before = np.sqrt(np.diag(self.covariance))
         self.covariance = (turned / (1.0 + value.clip(0.0))) @ turned.T
         step = tuning.LEARNING * (self.covariance @ self._score)
-        # the linearisation is good within one deviation, so a step is at most this long
+        # the linearisation is accurate within one standard deviation, which limits the step
         step /= max(1.0, float(np.abs(step / before).max()))
         self.mean = np.clip(self.mean + step, self._least, self._most)
-        # the machine changes, so deviations grow with time; they stay between one unit and the estimate's deviation
+        # the machine changes with time, so deviations grow; the limits are one unit and the deviation of the estimate
         deviation = np.sqrt(np.diag(self.covariance))
         wider = np.maximum(deviation, 1.0) * np.exp(0.5 * (time - self.time) / tuning.LEARNED_FOR)
         share = np.minimum(wider, self._widest) / deviation
@@ -161,19 +172,19 @@ class Learner:
         self._begin()
 
     def numbers(self, which: NDArray[np.int64]) -> Array:
-        """Return the learned parameters of the members `which`, shape (k, 10)."""
+        """Return the parameters of the members with the indices `which`, shape (k, 10), after learning."""
         found = self._all[which].copy()
         own = self.mean + self._white[which] @ np.linalg.cholesky(self.covariance).T
         found[:, self.open] = np.clip(own, self._least, self._most)
         return found
 
     def state(self) -> Array:
-        """Return the state as one array."""
+        """Return the whole state as one array."""
         parts = (self.mean, self.covariance.ravel(), self._precision.ravel(), self._score, [self.time])
         return np.concatenate(parts)
 
     def set_state(self, state: Array) -> None:
-        """Restore a state that `state` returned."""
+        """Restore a state that `state` has returned."""
         count = len(self.open)
         ends = np.cumsum([count, count * count, count * count, count])
         mean, covariance, precision, score, (time,) = np.split(state, ends)

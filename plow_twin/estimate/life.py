@@ -1,9 +1,10 @@
-"""Wear over months, computed in seconds: some load periods give the mean force on each pad, then many are skipped.
+"""Wear over months, computed in seconds: a few load periods give the mean force on each pad, then many are skipped.
 
-The wear rate of a pad is k_s <F> v / A (Archard). The depths therefore depend on time, travel speed and coefficient
-only through the exposure E = k_s s / A in 1/N, where s is the travel in m, and dh/dE = <F>(h). One path h(E) holds for
-every coefficient. Heun's method follows the path. The size of a step is limited by the difference from Euler's step and
-by the change of the clearance.
+The wear rate of a pad is k_s <F> v / A (Archard), where k_s is the wear coefficient, <F> the mean force, v the travel
+speed and A the area of a pad. The wear depths h therefore depend on time, travel speed and coefficient only through the
+exposure E = k_s s / A in 1/N, where s is the travel in m. They satisfy dh/dE = <F>(h), so one path h(E) holds for every
+coefficient. The path is computed with Heun's method. The step is limited by the difference from Euler's method, and by
+the change of the clearance.
 
 References: Archard, J. Appl. Phys. 24 (1953) 981; Lemaitre and Doghri, Comput. Methods Appl. Mech. Eng. 115 (1994) 197
 (jump in cycles); ISO 13381-1 (prognosis).
@@ -27,29 +28,29 @@ from plow_twin.run.simulate import simulate
 
 Array = NDArray[np.float64]
 
-#: Guard: wear in m of a trial run by which sliding is measured: large enough to show the sliding distance, and too
-#: small to change the motion.
+#: Wear depth in m of a trial simulation that measures the sliding distance; its lower bound is the rounding error, its
+#: upper bound an influence on the motion.
 _TRACE_M = 1e-12
-#: Bound: number of interpolated rows between two rows of a path with running-in.
+#: Upper bound of the number of interpolated rows between two rows of a path with running-in.
 _FINER = 16
-#: Bound: largest number of steps of a path.
+#: Upper bound of the number of steps of a path.
 _MOST_STEPS = 400
-#: Guard: smallest clearance in m of a path, because a path from zero would not end.
+#: Lower bound of the clearance in m that limits a step, because steps from a clearance of zero would not grow.
 _LEAST_CLEARANCE = 1e-3
 
 
 class LifeError(PlowTwinError):
-    """The wear over a machine's life cannot be computed from the given input."""
+    """The wear of a machine cannot be computed from the given input."""
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Wear depths along the exposure.
+    """Wear depths as functions of the exposure.
 
-    exposure : (n,) in 1/N, rising from 0
+    exposure : (n,) rising exposures in 1/N, from 0
     depth : (n, 8) wear depth of each pad in m
-    force, deviation : (n, 8) mean normal force of each pad in N and the standard error of that mean
-    error : largest estimated error of a depth at the end in m
+    force, deviation : (n, 8) mean normal force of each pad in N, and standard error of the mean
+    error : estimate of the largest error of a depth in m at the end of the path
     """
 
     exposure: Array
@@ -59,9 +60,10 @@ class Path:
     error: float
 
     def clearance_growth(self) -> Array:
-        """Return the growth of the horizontal and the vertical clearance, shape (n, 2), in m.
+        """Return the growth of the horizontal and the vertical clearance in m, shape (n, 2).
 
-        A wall moves by the mean wear of its two pads. The growth of a clearance is the sum over its two walls.
+        A wall is assumed to move by the mean wear depth of its two pads. A clearance grows by the sum over its two
+        walls.
         """
         horizontal = 0.5 * self.depth @ np.abs(NORMAL_X)
         vertical = 0.5 * self.depth @ np.abs(NORMAL_Y)
@@ -69,12 +71,12 @@ class Path:
 
 
 def period_of(scene: Scene) -> float:
-    """Return the period in s of the slowest harmonic load or, if there is none, of the longest table.
+    """Return the period in s of the slowest harmonic load or, without harmonic loads, of the longest table.
 
     Raises
     ------
     LifeError
-        If there is neither, or if the table is too short for mean forces.
+        If the scene has neither a harmonic load nor a table, or if the table is too short for mean forces.
     """
     omegas = [load.omega_rad_s for load in scene.loads if isinstance(load, Harmonic)]
     if omegas:
@@ -91,14 +93,15 @@ def period_of(scene: Scene) -> float:
 
 
 def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, Array]:
-    """Return the mean force of each pad in N with worn walls, shape (8,), and its standard error over the periods.
+    """Return the mean force of each worn pad in N, shape (8,), and its standard error over the periods.
 
-    If pads also wear by sliding in the plane, each force is weighted by the sliding distance per travel.
+    If pads also wear by sliding in the plane of the motion, each force is multiplied by the sliding distance per
+    travel.
 
     Raises
     ------
     LifeError
-        If the scene has no period, or the head leaves the model's range.
+        If the scene has no period, or the head leaves the range of the model.
     """
     period = period_of(scene)
     wear = scene.wear or Wear(0.0, 1.0, 0.0)
@@ -126,7 +129,7 @@ def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, A
 
 
 def wear_in_travel(scene: Scene) -> Wear:
-    """Return the wear section of a scene; raise LifeError without the section or with a travel speed of 0."""
+    """Return the wear section of a scene; raise `LifeError` without the section or with a travel speed of 0."""
     if scene.wear is None:
         raise LifeError("wear: missing, expected a section `wear` with travel_speed_m_s above 0")
     if scene.wear.travel_speed_m_s <= 0.0:
@@ -135,23 +138,23 @@ def wear_in_travel(scene: Scene) -> Wear:
 
 
 def _trace(scene: Scene, period: float) -> float:
-    """Return a wear coefficient [m^2/N], so small that under the head's weight a pad wears by about `_TRACE_M`."""
+    """Return the wear coefficient [m^2/N] with which a pad under the head's weight wears by about `_TRACE_M`."""
     wear = wear_in_travel(scene)
     impulse = scene.head.mass_kg * 10.0 * sum(tuning.MEAN_PERIODS) * period
     return _TRACE_M * wear.pad_area_m2 / (wear.travel_speed_m_s * impulse)
 
 
 def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) -> Path:
-    """Follow the wear until a clearance reaches its limit in m, or the exposure reaches `most_exposure` in 1/N.
+    """Return the path until a clearance reaches its limit in m, or the exposure reaches `most_exposure` in 1/N.
 
     Raises
     ------
     LifeError
-        If the scene has no wear or no period, or the path does not end.
+        If the scene has no wear or no period, or the path has too many steps.
     """
     if scene.wear is None:
         raise LifeError("wear: got no wear, expected a section `wear`")
-    # the depths are converted to depths without running-in, for which all pads have the same coefficient
+    # without running-in, the wear coefficient is the same for all pads at all depths
     steady = without_running_in(scene.wear, np.array(scene.wear.initial_depth_m, dtype=np.float64))
     depth = with_running_in(scene.wear, steady)
     smallest = max(min(_clearances(scene, depth)), _LEAST_CLEARANCE)
@@ -186,7 +189,7 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
 
 
 def _finer(columns: list[Array]) -> list[Array]:
-    """Return the columns with linearly interpolated rows in between, where running-in is neglected."""
+    """Return the columns of a path without running-in, with linearly interpolated rows inserted."""
     at = np.arange(len(columns[0]), dtype=np.float64)
     more = np.linspace(0.0, at[-1], _FINER * (len(at) - 1) + 1)
     before = np.minimum(more.astype(int), max(len(at) - 2, 0))
@@ -201,7 +204,7 @@ def _beyond(scene: Scene, depth: Array, limit: tuple[float, float]) -> bool:
 
 
 def _clearances(scene: Scene, depth: Array) -> tuple[float, float]:
-    """Return the horizontal and the vertical clearance with worn walls in m."""
+    """Return the horizontal and the vertical clearance in m with the given wear depths."""
     return (
         scene.clearance.horizontal_m + 0.5 * float(depth @ np.abs(NORMAL_X)),
         scene.clearance.vertical_m + 0.5 * float(depth @ np.abs(NORMAL_Y)),

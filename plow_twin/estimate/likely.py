@@ -1,10 +1,10 @@
-"""The clearances that make the measured path over the load's period most likely.
+"""Clearances of largest likelihood, given the measured path (the mean pose at each phase of the load).
 
-Motions with randomly drawn parameters are simulated. Their features, including the mean path over the period, are
-modelled as a quadratic function of the parameters plus normal noise (synthetic likelihood: Wood, Nature 466 (2010)
-1102). The clearances of largest likelihood are then features of a regression over the simulated motions (semi-automatic
-approximate Bayesian computation: Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012) 419). A regression on the path
-itself is not possible, because a path has more numbers than there are motions.
+Motions with random parameters are simulated. Their features, including the path, are modelled as a quadratic function
+of the parameters plus normal noise (synthetic likelihood: Wood, Nature 466 (2010) 1102). The clearances of largest
+likelihood are then used as features of a regression over the simulated motions (semi-automatic approximate Bayesian
+computation: Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012) 419). The path itself cannot be used for the
+regression, because it has more numbers than there are motions.
 """
 
 from __future__ import annotations
@@ -20,36 +20,48 @@ from plow_twin.estimate.regression import ridge, shrunk_root
 
 Array = NDArray[np.float64]
 
-#: Guard: least variance of a feature, and least deviation of a drawn parameter.
+#: Guards against division by zero: smallest variance of a feature, and smallest deviation of a drawn parameter.
 _LEAST, _SAME = 1e-14, 1e-12
-#: Definition: pairs of parameters with a quadratic term, from clearances, softness and damping.
+#: Pairs of parameters with a quadratic term (clearances, softness and damping), by definition.
 _CURVED = tuple(combinations_with_replacement(range(4), 2))
-#: Definition: number of folds of the cross-validation.
+#: Number of folds of the cross-validation, by definition.
 _PARTS = 10
-#: Bound: number of Gauss-Newton steps, and the longest step in deviations of the draws.
+#: Upper bounds of the number of Gauss-Newton steps, and of the size of a step in deviations of the draws.
 _STEPS, _LONGEST = 5, 1.5
-#: Guard: prior deviation of a parameter without a prior, in deviations of the draws.
+#: Prior deviation in deviations of the draws that is so large that the parameter has practically no prior.
 _FREE = 100.0
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Features of motions, (n, m), and their derivatives with respect to the delay, (n, m) in 1/s."""
+    """Features of motions.
+
+    like : (n, m) features
+    late : (n, m) derivatives of the features with respect to the delay in 1/s
+    """
 
     like: Array
     late: Array
 
     def rows(self, which: NDArray[np.bool_]) -> Seen:
-        """Return the selected motions."""
+        """Return the features of the selected motions."""
         return Seen(self.like[which], self.late[which])
 
 
 def likeliest(drawn: Array, gain: float, motions: Seen, measured: Seen) -> Array:
-    """Return the likeliest clearances in m of n simulated motions and of the measured motion, shape (n + 1, 2).
+    """Return the most likely clearances in m of n simulated motions and of the measured motion, shape (n + 1, 2).
 
-    The clearances of a simulated motion are found without this motion; the last row belongs to the measured motion.
-    `drawn`, shape (n, 7), holds the drawn parameters: clearances, the logarithms of penetration and damping, and the
-    load gains, whose deviation is `gain`.
+    The last row belongs to the measured motion. For the simulated motions the model is cross-validated, so that no
+    motion contributes to its own result.
+
+    Parameters
+    ----------
+    drawn : ndarray, shape (n, 7)
+        Drawn parameters: two clearances, logarithms of penetration and damping, and three load gains.
+    gain : float
+        Prior standard deviation of the load gains.
+    motions, measured : Seen
+        Features of the n simulated motions, and of the measured motion.
     """
     found = np.zeros((len(drawn) + 1, 2))
     found[-1] = _likeliest(drawn, gain, motions, measured)[0]
@@ -60,7 +72,9 @@ def likeliest(drawn: Array, gain: float, motions: Seen, measured: Seen) -> Array
 
 
 def _likeliest(drawn: Array, gain: float, motions: Seen, asked: Seen) -> Array:
-    """Return the likeliest clearances in m, shape (k, 2), of the motions `asked`, by comparison with drawn motions."""
+    """Return the most likely clearances in m of k motions `asked`, shape (k, 2), from the model of the drawn
+    motions.
+    """
     middle, scale = drawn.mean(axis=0), drawn.std(axis=0)
     scale[scale <= _SAME] = 1.0
     terms = _terms((drawn - middle) / scale)
@@ -88,7 +102,7 @@ def _likeliest(drawn: Array, gain: float, motions: Seen, asked: Seen) -> Array:
 
 
 def _terms(points: Array) -> Array:
-    """Return the polynomial's terms at some points (n, 7)."""
+    """Return the terms of the polynomial at n points, shape (n, 7)."""
     products = [points[:, one] * points[:, other] for one, other in _CURVED]
     return np.column_stack([np.ones(len(points)), points, *products])
 

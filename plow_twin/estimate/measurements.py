@@ -1,4 +1,4 @@
-"""Input of the estimate: the measured pose and the believed load, as arrays on one clock."""
+"""Input of the estimate: measured poses and measured loads, as arrays with stamps of one clock."""
 
 from __future__ import annotations
 
@@ -18,21 +18,22 @@ from plow_twin.model.pairs import PAIR_COUNT
 
 Array = NDArray[np.float64]
 Deviation = tuple[float, ...]
-#: Definition: deviations that are not stated.
+#: Standard deviations that are not stated; by definition they are 0.
 UNSTATED: Deviation = (0.0, 0.0, 0.0)
-#: Derived: smallest numbers of values for a standard deviation. From n values it has the relative error 1 / sqrt(2 n):
-#: 22 % for a cell in contact, 16 % for poses and gaps, 10 % for a scatter in a comparison.
+#: Smallest numbers of values for a standard deviation, derived from its relative error 1 / sqrt(2 n): 22 % for a load
+#: cell in contact, 16 % for poses and gaps, 10 % for the scatter in a comparison.
 FEWEST_IN_CONTACT, FEWEST_POSES, FEWEST_FOR_SCATTER = 10, 20, 50
-#: Guard: longest interval in s between poses or samples; over it the motion in a soft contact is nearly cubic.
+#: Upper bound of the interval in s between poses or samples that resolve the motion. Over this interval, the motion in
+#: a soft contact is nearly a cubic polynomial.
 RESOLVING: Final = 0.02
-#: Bound: smallest number of points between two knots over which a load is averaged.
+#: Lower bound of the number of points between two knots when a load is averaged.
 _FINER = 8
-#: Guard: largest possible component of a pose, in m or rad, and of a load, in N or N m.
+#: Guard against faulty data: largest component of a pose in m or rad, and of a load in N or N m.
 _LARGEST_POSE, _LARGEST_LOAD = 1e6, 1e15
 
 
 class EstimateError(PlowTwinError):
-    """The data cannot be used; the text names the value got and the value expected."""
+    """The data cannot be used for an estimate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +48,8 @@ class Poses:
         x, y [m] and theta [rad]; NaN where a component was not measured.
     deviation : tuple of 3 float
         Stated standard deviation of each component; 0 if not stated.
-    assumed : ndarray, shape (n, 3), optional
-        Poses of a model, used where all three components are needed and a component was never measured.
+        assumed : ndarray, shape (n, 3), optional
+            Poses of a model, which replace a component that was never measured where all three components are needed.
     """
 
     t: Array
@@ -63,10 +64,10 @@ class Poses:
 
     @staticmethod
     def of(t: ArrayLike, q: ArrayLike, deviation: Deviation = UNSTATED) -> tuple[Poses, int]:
-        """Return rows in order of time, and the number of rows left out.
+        """Return the usable rows in order of time, and the number of rows that are left out.
 
-        Rows are left out if their stamp is not finite or repeated, if they have no finite component, or a component
-        beyond 1e6.
+        A row is left out if its stamp is not finite or occurs twice, if it contains no finite component, or if a
+        component exceeds 1e6.
 
         Raises
         ------
@@ -83,37 +84,37 @@ class Poses:
         return Poses(times[index], rows[index], deviation), len(times) - len(index)
 
     def interval(self) -> float:
-        """Return the interval in s between complete poses, after poses of single components have been merged."""
+        """Return the mean interval in s per complete pose, from the number of measured components."""
         measured = int(np.isfinite(self.q).sum())
         return float(np.median(np.diff(self.t))) * self.q.size / max(measured, 1)
 
     def gap(self) -> float:
-        """Return the median gap in s between measured values of a component, weighted by the gaps' lengths."""
+        """Return the median gap in s between measured values of a component, in which a gap's weight is its length."""
         gaps = np.sort(np.concatenate([np.diff(self.t[np.isfinite(column)]) for column in self.q.T]))
         return float(gaps[np.searchsorted(gaps.cumsum(), 0.5 * gaps.sum())])
 
     def between(self, start: float, end: float) -> Poses:
-        """Return the poses stamped in [start, end)."""
+        """Return the poses with stamps in [start, end)."""
         inside = (self.t >= start) & (self.t < end)
         assumed = None if self.assumed is None else self.assumed[inside]
         return Poses(self.t[inside], self.q[inside], self.deviation, assumed)
 
     def moved(self, by: Array) -> Poses:
-        """Return the poses with `by`, shape (3,), added to each."""
+        """Return the poses after `by`, shape (3,), has been added to each."""
         return replace(self, q=self.q + by, assumed=None if self.assumed is None else self.assumed + by)
 
     def without_spikes(self, level: Array) -> tuple[Poses, int]:
-        """Leave out values far from all four neighbours, and return their number.
+        """Return the poses without spikes, and the number of spikes.
 
-        `level`, shape (3,), is the noise from row to row. If there are many such values, the sensor is bad, and all
-        values are kept.
+        A spike is a value far from all four neighbours, compared with the noise `level`, shape (3,). If there are too
+        many spikes, the sensor is faulty, and all values are returned.
         """
         if len(self.t) < FEWEST_FOR_SCATTER:
             return self, 0
         about = np.stack([np.roll(self.q, shift, axis=0) for shift in (-2, -1, 1, 2)])
         low, high = about.min(axis=0), about.max(axis=0)
         far = tuning.SPIKE[0] * level + (high - low)
-        # a value with a NaN beside it is no spike, because comparisons with NaN are false
+        # comparisons with NaN are False, so a value next to a missing value is not a spike
         spikes = (self.q > high + far) | (self.q < low - far)
         spikes[[0, 1, -2, -1]] = False
         count = int(spikes.sum())
@@ -122,9 +123,10 @@ class Poses:
         return Poses(self.t, np.where(spikes, np.nan, self.q), self.deviation), count
 
     def fresh(self) -> Poses:
-        """Leave out repeated values from a sensor slower than its sender: they are late and repeat the same noise.
+        """Return the poses without repeated values, which occur if a sensor is slower than its sender.
 
-        A value that is repeated for longer shows that the sensor has stopped; then all values are kept.
+        Repeated values are late and repeat the same noise. A longer repetition shows that the sensor has stopped. In
+        this case, all values are returned.
         """
         one, next_one = self.q[:-1], self.q[1:]
         again = ((one == next_one) | (np.isnan(one) & np.isnan(next_one))).all(axis=1)
@@ -139,7 +141,7 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Load:
-    """The believed load: linear between its samples, constant before the first sample and after the last.
+    """The measured load, which is linear between samples and constant before the first and after the last sample.
 
     Attributes
     ----------
@@ -150,7 +152,7 @@ class Load:
     deviation : tuple of 3 float
         Stated standard deviation of each component; 0 if not stated.
     unknown : tuple of 3 float
-        Spectral density of the unknown part of the load between its samples (`believable`), in N2 s and (N m)2 s.
+        Spectral density of the unknown part of the load between its samples, in N2 s and (N m)2 s (see `believable`).
     """
 
     t: Array
@@ -160,9 +162,9 @@ class Load:
 
     @staticmethod
     def of(t: ArrayLike, wrench: ArrayLike, deviation: Deviation = UNSTATED) -> tuple[Load, int]:
-        """Return samples in order of time, and the number of samples left out.
+        """Return the usable samples in order of time, and the number of samples that are left out.
 
-        Samples are left out if they are not finite, beyond 1e15, or have a repeated stamp.
+        A sample is left out if it contains a number that is not finite or exceeds 1e15, or if its stamp occurs twice.
 
         Raises
         ------
@@ -185,7 +187,7 @@ class Load:
         return Load(self.t[first:last], self.wrench[first:last])
 
     def longest_stretch(self) -> Load:
-        """Return the longest part of the load in which no samples are missing."""
+        """Return the longest part of the load without long gaps between samples."""
         apart = np.diff(self.t)
         silent = np.flatnonzero(apart > max(tuning.LONGEST_GAP[0], tuning.LONGEST_GAP[1] * float(np.median(apart))))
         if not len(silent):
@@ -206,7 +208,9 @@ class Load:
         return float(np.median(np.diff(self.t)))
 
     def gain_deviations(self) -> Array:
-        """Return the stated deviations as shares of the components' root mean squares, shape (3,); 0 without a load."""
+        """Return the stated deviations divided by the root mean square of each component, shape (3,); 0 without a
+        load.
+        """
         size = np.sqrt((self.wrench**2).mean(axis=0))
         shares: Array = np.divide(self.deviation, size, out=np.zeros(3), where=size > 0.0)
         return shares
@@ -232,7 +236,7 @@ class Load:
         return span / peak if power[peak - 1 : peak + 2].sum() > 0.3 * power.sum() else None
 
     def with_knot(self, t: float) -> Load:
-        """Return the load with a further sample at `t` in s, interpolated."""
+        """Return the load with an additional, interpolated sample at the time `t` in s."""
         place = int(np.searchsorted(self.t, t))
         if not 0 < place < len(self.t) or self.t[place] == t:
             return self
@@ -240,9 +244,10 @@ class Load:
         return Load(np.insert(self.t, place, t), np.insert(self.wrench, place, value, axis=0), self.deviation)
 
     def smooth(self, step: float) -> Load:
-        """Return values of a cubic spline through the samples every `step` s, with the deviation `tuning.COARSE_GAIN`.
+        """Return values of a cubic spline through the samples at intervals of about `step` in s.
 
-        Rare samples may be averages, which reduce the amplitude and keep the shape.
+        The deviation of the result includes `tuning.COARSE_GAIN`, because samples at long intervals may be averages,
+        which have a smaller amplitude than the load.
         """
         t = np.linspace(self.t[0], self.t[-1], math.ceil((self.t[-1] - self.t[0]) / step) + 1)
         size = tuning.COARSE_GAIN * np.sqrt((self.wrench**2).mean(axis=0))
@@ -250,23 +255,26 @@ class Load:
         return Load(t, np.asarray(CubicSpline(self.t, self.wrench)(t), np.float64), (fx, fy, moment))
 
     def thinned(self, share: float = 1e-3) -> Load:
-        """Leave out samples that straight lines reproduce within `share` of the range (Ramer, Douglas and Peucker)."""
+        """Return the load without samples that linear interpolation reproduces within `share` of the range.
+
+        The algorithm is that of Ramer, Douglas and Peucker.
+        """
         return self.kept(self.significance(share) > share)
 
     def kept(self, keep: NDArray[np.bool_]) -> Load:
-        """Return the samples selected by `keep`, shape (n,)."""
+        """Return the samples that the mask `keep`, shape (n,), selects."""
         return Load(self.t[keep], self.wrench[keep])
 
     def significance(self, share: float) -> Array:
-        """Return for each sample the smallest `share` at which `thinned` leaves it out, shape (n,).
+        """Return for each sample the smallest argument of `thinned` for which the sample is left out, shape (n,).
 
-        It is infinite for the two ends, and 0 for samples that `share` itself leaves out.
+        The result is infinite for the first and the last sample, and 0 for samples that `thinned(share)` leaves out.
         """
         scale = np.ptp(self.wrench, axis=0)
         rows = self.wrench / np.where(scale > 0.0, scale, 1.0)
         out = np.zeros(len(rows))
         out[[0, -1]] = np.inf
-        # all lines of one level are divided at once; a line that is not divided has no lines in lower levels
+        # all lines of one level of the recursion are processed at once
         left, right, least = np.array([0]), np.array([len(rows) - 1]), np.array([np.inf])
         while len(left):
             inner = right - left > 1
@@ -281,7 +289,7 @@ class Load:
             chord = rows[right] - rows[left]
             error = np.abs(rows[place] - rows[left][line] - along[:, None] * chord[line]).max(axis=1)
             largest = np.maximum.reduceat(error, first[:-1])
-            # for each line, the first of the samples that are farthest from the line
+            # index of the sample with the largest distance from each line, the first one if there are several
             at = np.flatnonzero(error == largest[line])
             middle = place[at[np.unique(line[at], return_index=True)[1]]]
             least = np.minimum(least, largest)
@@ -293,12 +301,13 @@ class Load:
         return out
 
     def _roughness(self) -> tuple[Array, Array, Array]:
-        """Return the correlation from sample to sample, and spectral densities of the load and of the lines, (3,) each.
+        """Return the correlation of successive samples, and two spectral densities at low frequency, shape (3,) each.
 
-        The rough part of the load is modelled as an Ornstein-Uhlenbeck process with the correlation a from sample to
-        sample. Consider the mean square distance of samples from the straight lines through their neighbours. With
-        neighbours twice as far away, it grows by (1 + a) (3 - a^2) / (3 - a). The factor is 2 for a = 1, where the
-        lines miss a Brownian bridge, and 1 for a = 0, where samples are too rare and the lines themselves are wrong.
+        The first density is that of the load, the second that of the linear interpolation of its samples. The rough
+        part of the load is modelled as an Ornstein-Uhlenbeck process with the correlation a of successive samples. The
+        correlation follows from the mean square distance of samples from the straight line through two neighbours. If
+        the neighbours are twice as far away, this distance grows by the factor (1 + a) (3 - a^2) / (3 - a). The factor
+        is 2 for a Brownian motion (a = 1) and 1 for uncorrelated samples (a = 0).
         """
         if len(self.t) < 5:
             return np.ones(3), np.zeros(3), np.zeros(3)
@@ -311,13 +320,13 @@ class Load:
         return a, -2.0 * variance / np.log(a), variance * (1.0 + a) / (1.0 - a)
 
     def believable(self) -> Load:
-        """Return the best estimate of the load between its samples, with the spectral density of its unknown part.
+        """Return the best estimate of the load between its samples, with the spectral density of the unknown part.
 
-        Rare samples without correlation say little about the load between them, so only their strong oscillations are
-        kept.
+        Samples at long intervals without correlation do not determine the load between them. Only the strong
+        oscillations of such samples are used.
         """
         correlation, its, of_samples = self._roughness()
-        # samples count as uncorrelated if their correlation is within three standard errors of zero
+        # samples are treated as uncorrelated if the correlation is within three standard errors of zero
         rare = (correlation < 3.0 / math.sqrt(len(self.t))) & (self.interval() > RESOLVING)
         fx, fy, moment = np.where(rare, its, of_samples - its).tolist()
         if not rare.any():
@@ -331,9 +340,9 @@ class Load:
         return Load(t, np.where(rare, mean + strong, wrench), self.deviation, (fx, fy, moment))
 
     def averaged(self, count: int) -> Load:
-        """Return `count` equidistant knots, joined by the straight lines that fit this load best (least squares).
+        """Return the least-squares fit of a piecewise linear load with `count` equidistant knots.
 
-        The remainder has a mean of zero over some knots, so it hardly moves the head.
+        The difference from the original load has a mean of zero over some knots, so it hardly moves the head.
         """
         knots = np.linspace(self.t[0], self.t[-1], count)
         within = max(_FINER, math.ceil(2.0 * len(self.t) / count))
@@ -341,7 +350,7 @@ class Load:
         times = self.t[0] + (self.t[-1] - self.t[0]) * place / (count - 1)
         left = np.minimum(place.astype(np.int64), count - 2)
         share = place - left
-        # the bands of the normal equations, whose matrix is tridiagonal
+        # the matrix of the normal equations is tridiagonal
         bands = np.zeros((2, count))
         bands[1] = np.bincount(left, (1.0 - share) ** 2, count) + np.bincount(left + 1, share**2, count)
         bands[0, 1:] = np.bincount(left, share * (1.0 - share), count)[:-1]
@@ -355,7 +364,7 @@ class Load:
 
 
 def _from_lines(t: Array, value: Array) -> Array:
-    """Return the mean square distance of inner values from the lines through their neighbours, shape (3,)."""
+    """Return the mean square distance of values from the straight line through their two neighbours, shape (3,)."""
     step = np.diff(t)
     slope = np.diff(value, axis=0) / step[:, None]
     off = np.diff(slope, axis=0) * (step[:-1] * step[1:] / (step[:-1] + step[1:]))[:, None]
@@ -364,9 +373,9 @@ def _from_lines(t: Array, value: Array) -> Array:
 
 
 def filled(poses: Poses) -> Array:
-    """Return the poses with missing values bridged by straight lines.
+    """Return the poses, shape (n, 3), with missing values interpolated linearly.
 
-    A component that was never measured has its assumed values, or zeros.
+    A component that was never measured has its assumed values, or zeros without assumed values.
     """
     out = np.zeros_like(poses.q) if poses.assumed is None else poses.assumed.copy()
     for i, column in enumerate(poses.q.T):
@@ -377,29 +386,31 @@ def filled(poses: Poses) -> Array:
 
 
 def own_deviations(brought: Iterable[tuple[float, ...]]) -> Array:
-    """Return the deviations that the messages of poses state, shape (n, 3); NaN where a message states none."""
+    """Return the standard deviations in n messages of poses, shape (n, 3); NaN for a message without deviations."""
     return np.array([one or (math.nan,) * 3 for one in brought], dtype=np.float64).reshape(-1, 3)
 
 
 def useless_deviation() -> Deviation:
-    """Return the stated deviations of x, y [m], theta [rad] above which a component is treated as not measured."""
+    """Return the largest standard deviations of x, y [m] and theta [rad] with which a component is used."""
     return tuple(tuning.MUCH_WORSE * bias for bias in priors.BIAS)
 
 
 def believed(stated: Deviation, q: Array, own: Array) -> tuple[Array, Deviation]:
-    """Return poses without components of a large stated deviation, and the deviation of the others.
+    """Return poses without components of a large stated deviation, and the deviations of the remaining components.
 
     Parameters
     ----------
     stated : tuple of 3 float
-        Smallest deviation of each component.
+        Lower limit of the deviation of each component.
     q, own : ndarray, shape (n, 3)
-        Poses, and the deviations stated with them; NaN where not stated.
+        Poses, and the standard deviation of each component; NaN if not stated.
 
     Returns
     -------
-    ndarray, tuple of 3 float
-        Poses, NaN where left out; root mean square of the deviations of the others, at least `stated`.
+    q : ndarray, shape (n, 3)
+        Poses, with NaN for components that are left out.
+    deviation : tuple of 3 float
+        Root mean square of the deviations of the remaining components, at least `stated`.
     """
     known = [column[np.isfinite(column)] for column in own.T]
     usual = np.array([float(np.median(column)) if len(column) else 0.0 for column in known])
@@ -416,7 +427,7 @@ def _check_deviation(name: str, deviation: Deviation) -> None:
 
 
 def _in_order(times: Array, usable: Any) -> NDArray[np.int64]:
-    """Return the indices of usable rows in order of time; of rows with equal stamps only the first is kept."""
+    """Return the indices of usable rows in order of time; only the first of several rows with equal stamps is used."""
     candidates = np.flatnonzero(usable & np.isfinite(times))
     _, first = np.unique(times[candidates], return_index=True)
     index: NDArray[np.int64] = candidates[first]
@@ -426,10 +437,11 @@ def _in_order(times: Array, usable: Any) -> NDArray[np.int64]:
 def usable_rows(
     t: ArrayLike, values: ArrayLike, largest: float, names: tuple[str, str], error: type[PlowTwinError]
 ) -> tuple[Array, Array, int]:
-    """Return stamps (n,) and rows of numbers by pair (n, 8) in order of time, and the number of rows left out.
+    """Return stamps (n,) and rows (n, 8) in order of time, and the number of rows that are left out.
 
-    Rows are left out if their stamp is not finite or repeated, if they have no number, or a number beyond `largest`.
-    Arrays of the wrong shape raise `error`; `names` are the words for the rows and for a number in its message.
+    A row has a number for each pair. It is left out if its stamp is not finite or occurs twice, if it contains no
+    number, or if a number exceeds `largest`. Arrays of the wrong shape raise an exception of type `error`. Its message
+    contains the texts `names`, for a set of rows and for a number.
     """
     times, rows = np.asarray(t, dtype=np.float64), np.array(values, dtype=np.float64)
     if times.ndim != 1 or rows.shape != (len(times), PAIR_COUNT):

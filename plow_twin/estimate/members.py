@@ -1,12 +1,12 @@
-"""The members of a follower: twins drawn from a prior or an estimate, moved by an ensemble Kalman filter.
+"""The members of a follower, which are twins drawn from a prior or an estimate and moved by an ensemble Kalman filter.
 
-Each pose moves all members, with perturbed observations (Burgers et al., Mon. Weather Rev. 126 (1998) 1719). A late
-pose acts through the covariance between past and present states. A member skips a correction that would press it
-against a wall with more than half of the head's weight, because with a hard contact a correction of a tenth of a
-millimetre would cause a false impact.
+Each measured pose moves all members, with perturbed observations (Burgers et al., Mon. Weather Rev. 126 (1998) 1719). A
+late pose corrects the present state through the covariance between past and present states. With a hard contact, a
+correction of a tenth of a millimetre could cause a false impact. A member therefore skips a correction that would press
+it against a wall with more than half of the head's weight.
 
-Parameters that an estimate hardly determines are learned from the poses (`learned`). At each pose some members adopt
-their learned parameters.
+Parameters that an estimate hardly determines are estimated from the poses (module `learned`). At each pose, some
+members adopt the parameters learned so far.
 """
 
 from __future__ import annotations
@@ -37,21 +37,21 @@ from plow_twin.stream.outputs import clearances
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 
-#: Bound: largest age in s of a late pose that is still used, including the sensor's delay; the motion is kept for this
+#: Upper bound of the age in s of a late pose that is used, including the sensor's delay. The motion is stored for this
 #: time.
 LATEST_S: Final = 0.25
-#: Bound: smallest interval in s between kept states of the motion.
+#: Lower bound of the interval in s between stored states of the motion.
 _PATH_S: Final = 2e-3
-#: Bound: largest number of successive outliers that are ignored. More successive outliers mean that the head really has
-#: jumped.
+#: Upper bound of the number of consecutive outliers that are ignored. More consecutive outliers show that the head has
+#: really moved.
 _MOST_OUTLYING: Final = 5
-#: Bound: smallest number of members whose parameters are changed at once, because one call costs as much as the change
-#: of three members.
+#: Lower bound of the number of members whose parameters are changed together, because a call costs as much as the
+#: change of three members.
 _AT_ONCE: Final = 8
-#: Definition: slice that selects all members.
+#: Slice that selects all members.
 _ALL: Final = slice(None)
 _THETA: Final = DOF_NAMES.index("theta")
-#: Derived: indices of c, s, X, Y in the solver's state.
+#: Indices of cos(theta), sin(theta), X and Y in the state of the solver, derived from its layout.
 _PLACES: Final = (5, 6, 0, 1)
 
 
@@ -60,14 +60,22 @@ class Ensemble:
 
     Parameters
     ----------
-    scene, known
-        The nominal scene; the prior with the clearances of unworn pads, or an estimate with the present clearances.
-    members, rng, start, tol
-        Number of twins; generator of the random numbers; time in s of the scene's initial state; tolerance.
+    scene : Scene
+        The nominal scene.
+    known : Estimate
+        The prior, with the clearances of unworn pads, or an estimate, with the present clearances.
+    members : int
+        Number of twins.
+    rng : numpy.random.Generator
+        Generator of the random numbers.
+    start : float
+        Time in s of the scene's initial state.
+    tol : float
+        Tolerance of the solver.
     worn : ndarray, shape (8,)
         Wear depth of the pads in m.
     learns : bool
-        Whether parameters that an estimate hardly determines are learned from the poses.
+        Whether parameters that an estimate hardly determines are estimated from the poses.
     """
 
     def __init__(
@@ -76,35 +84,33 @@ class Ensemble:
     ) -> None:  # fmt: skip
         scenes, gain = draw_scenes(scene, known, members, rng) if members > 1 else ([scene], np.ones((1, 3)))
         scenes[0], gain[0] = middle_of(scene, known)
-        #: whether poses move the first member, as they do once there is an estimate; while the prior is followed, they
-        #: move the second member, which is a copy of the first
+        #: whether poses move the first member, which is the case for an estimate; for the prior, poses move the second
+        #: member instead, which is a copy of the first
         self._steers_first = known.horizontal_state is not State.PRIOR
         if not self._steers_first and members > 1:
             scenes[1], gain[1] = scenes[0], gain[0]
-        #: `worn_before`: wear of the pads at the beginning
-        #: `moved_before`: part of the estimated clearances that is due to this wear, shape (2, 1)
+        #: wear depths of the pads at the start, and part of the estimated clearances that is due to this wear, shape
+        #: (2, 1)
         self.worn_before, self.moved_before = worn, np.zeros((2, 1))
         if scene.wear is not None:
             states = (known.horizontal_state, known.vertical_state)
             self.moved_before = np.where([[state.known] for state in states], widening(scene, worn)[:, None], 0.0)
             scenes = [_worn(one, scene, worn, self.moved_before[:, 0]) for one in scenes]
-        #: the first member is advanced by itself, so that its forces need not wait for the other members
+        #: the first member is advanced separately, so that its forces are available before the other members are
+        #: advanced
         self.first = Twin(scenes[0], tol=tol, excitation="sampled", start=start)
         self.others = TwinBatch(scenes[1:], tol=tol, start=start) if members > 1 else None
         self._scene, self._gain, self._rng, self._speed = scene, gain, rng, 0.0
         self._numbers = numbers_of(scenes, gain, draw_biases(known, members, rng))
-        #: `_learner`: learner of the parameters that an estimate hardly determines
-        #: `_turn`: the next member to adopt learned parameters
-        #: `_waiting`: number of members that are due to adopt them
+        # `_turn` is the next member to adopt learned parameters, `_waiting` the number of members due to adopt
+        # parameters
         learns = learns and self._steers_first and members > 1
         self._learner = Learner.of(self._numbers.copy(), start) if learns else None
         self._turn, self._waiting = 0, 0.0
-        #: `_harmonics`: harmonics that the measured load lacks
-        #: `_amplitude`: their amplitudes for each member, (m, k, 3), in N, N, N m
+        # harmonics that are missing from the measured load, and amplitudes for each member, (m, k, 3), in N, N, N m
         self._harmonics = known.load_harmonics
         self._amplitude = amplitudes_of(known, members, rng)
-        #: `_load_off`: error of each member's load in N and N m
-        #: `_drifted`: time in s up to which these errors have drifted
+        # error of the load of each member in N, N, N m, and time in s up to which the errors have been advanced
         self._load_off, self._drifted = np.zeros((members, 3)), start
         self._walls = np.stack([penetration_rows(one) for one in scenes])
         self._clearance = np.array([[one.clearance.horizontal_m, one.clearance.vertical_m] for one in scenes])
@@ -112,35 +118,34 @@ class Ensemble:
         self._stiffness, self._exponent = np.array([one.contact.stiffness for one in scenes]), scene.contact.exponent
         self._pressed = tuning.PRESSED * scene.head.mass_kg * Gravity().acceleration_m_s2
         self.good = np.ones(members, dtype=bool)
-        #: force of each member's pairs, and their peak and impulse since the beginning of the span
+        #: force, peak and impulse of each pair of each member; peak and impulse count from the beginning of the span
         self._sums = np.zeros((members, 3, PAIR_COUNT))
         self._peak, self._impulse = self._sums[:, 1], self._sums[:, 2]
-        #: sum of the squares of each member's normalised innovations
+        #: sum of the squared normalised innovations of each member
         self.square = np.zeros(members)
-        #: `_free`: whether each degree of freedom is free
-        #: `outlying`: number of outlying poses in a row
+        # whether each degree of freedom is free, and number of consecutive outliers
         self._free = np.array([name not in scene.locked for name in DOF_NAMES])
         self.outlying = 0
-        #: `_path`: recent times and poses (m, 3), oldest first
-        #: `_v`, `worn`, `_depth`: present rates (m, 3), wear (m, 8) and penetrations (m, 8)
+        # `_path`: recent times in s and poses (m, 3) in order of time
+        # `_v`, `worn`, `_depth`: present rates (m, 3), wear depths (m, 8) and penetrations (m, 8)
         self._path: deque[tuple[float, Array]] = deque([(start, np.tile(np.array(scene.initial.q), (members, 1)))])
         self._v, self.worn = np.tile(np.array(scene.initial.v), (members, 1)), np.tile(worn, (members, 1))
         self._depth = self._penetration(self._path[-1][1])
-        #: the newest rows of all members, until `settle` copies them
+        #: newest rows of all members, until `settle` copies from them
         self._newest: Rows | None = None
 
     @property
     def moved(self) -> bool:
-        """Whether a pose has already moved the members."""
+        """Whether a pose has moved the members."""
         return bool(self.square.any())
 
     @property
     def pose(self) -> Array:
-        """The present pose of each member, (m, 3)."""
+        """The present pose of each member, x, y [m] and theta [rad], shape (m, 3)."""
         return self._path[-1][1]
 
     def set_travel_speed(self, speed_m_s: float) -> None:
-        """Set the speed along the face, for each member at most the speed that its wear and contact allow."""
+        """Set the travel speed along the face, limited for each member to the speed that its wear and contact allow."""
         self._speed = speed_m_s
         speeds = np.minimum(speed_m_s, self._fastest)
         self.first.set_travel_speed(float(speeds[0]))
@@ -148,13 +153,13 @@ class Ensemble:
             self.others.set_travel_speed(speeds[1:])
 
     def _loads(self, t: Array, wrench: Array, which: slice) -> Array:
-        """Return the loads of some members, (m, n, 3), at the times and values of samples, (n,) and (n, 3)."""
+        """Return the loads of some members, shape (m, n, 3), from samples at n times."""
         loads = loads_of(t, wrench, self._gain[which], self._harmonics, self._amplitude[which])
         found: Array = loads + self._load_off[which, None, :]
         return found
 
     def advance_first(self, t: Array, wrench: Array, rows: Rows) -> int:
-        """Advance the first member and write its rows, shape (n,); return how many advances failed."""
+        """Advance the first member and write its rows, shape (n,); return the number of failed advances."""
         failed, _ = self.first.advance_rows(t, self._loads(t, wrench, slice(1))[0], rows)
         rows["followed"] = FOLLOWED
         return failed
@@ -162,9 +167,10 @@ class Ensemble:
     def advance_others(
         self, t: Array, wrench: Array, rows: Rows, wanted: NDArray[np.bool_], ends: NDArray[np.bool_]
     ) -> None:
-        """Advance the other members to the time of the first member, whose rows are given.
+        """Advance the other members to the time of the first member, and add intervals to the first member's rows.
 
-        The rows that are `wanted` get intervals. A span of peaks and impulses ends with each row of `ends`.
+        `wanted` marks the rows that receive intervals. `ends` marks the rows at which a span of peaks and impulses
+        ends.
         """
         parts = [_bytes(rows[None])]
         if self.others is not None:
@@ -186,7 +192,7 @@ class Ensemble:
         self._newest = whole[:, -1]
 
     def settle(self) -> None:
-        """Copy rates, wear and penetration from the newest rows; called only when they are needed."""
+        """Copy rates, wear and penetration from the newest rows; to be called before they are used."""
         rows, self._newest = self._newest, None
         if rows is not None:
             self._v, self.worn, self._depth = rows["v"].copy(), rows["wear_depth"].copy(), rows["penetration"].copy()
@@ -200,7 +206,7 @@ class Ensemble:
             path.popleft()
 
     def _add_intervals(self, row: Rows) -> None:
-        """Write the intervals of forces, peaks and impulses."""
+        """Write the intervals of forces, peaks and impulses to a row."""
         _, low, high = self._points(self._sums)
         for index, name in enumerate(("force", "peak", "impulse")):
             row[f"{name}_low"], row[f"{name}_high"] = low[index], high[index]
@@ -208,7 +214,7 @@ class Ensemble:
             row["followed"] = WITH_INTERVALS
 
     def held(self, t: float, row: Rows) -> None:
-        """Write the row at a later time under the newest sample; the state does not change."""
+        """Write the row at a later time `t` under the load of the newest sample; the state does not change."""
         before = self.twins()
         row[:] = self.first.advance(t).rows
         self._sums[0, 0] = row["force"][0]
@@ -222,22 +228,30 @@ class Ensemble:
         self._peak[:], self._impulse[:] = 0.0, 0.0
 
     def span(self) -> tuple[Array, Array]:
-        """Return peaks and impulses of the span: the first member's, and the 5 % and 95 % points, (3, 8) each."""
+        """Return peaks and impulses of the span, shape (3, 8) each: value of the first member, 5 % and 95 %
+        quantile.
+        """
         return np.stack(self._points(self._peak)), np.stack(self._points(self._impulse))
 
     def _points(self, values: Array) -> tuple[Array, Array, Array]:
-        """Return the first member's values, and the 5 % and 95 % points over the members that are in range."""
+        """Return the values of the first member, and the 5 % and 95 % quantiles over the members in range.
+
+        The quantiles are widened, where necessary, to include the value of the first member.
+        """
         low, _, high = quantiles(values if self.good.all() else values[self._used()])
         return values[0].copy(), np.minimum(low, values[0]), np.maximum(high, values[0])
 
     def _used(self) -> NDArray[np.bool_]:
-        """Return which members determine intervals: those in the model's range, or all members if none is in range."""
+        """Return the mask of the members that determine intervals: members in the model's range, or all if none is in
+        range.
+        """
         return self.good if self.good.any() else np.ones(len(self.good), dtype=bool)
 
     def clearance(self) -> Array:
-        """Return the clearances of unworn pads with their 5 % and 95 % points, (2, 3), weighted by the likelihoods.
+        """Return the clearances of unworn pads in m, shape (2, 3): value, 5 % and 95 % quantile.
 
-        The likelihoods are tempered until enough members have a notable weight.
+        Members are weighted by the likelihood of the measured poses. The likelihood is tempered until enough members
+        have a significant weight.
         """
         use = self._used()
         excess = np.clip(self.square - self.square[use].min(), 0.0, 1e9)
@@ -256,11 +270,12 @@ class Ensemble:
         return out
 
     def stand_like(self, before: Ensemble, wrench: Array) -> None:
-        """Start at the poses of other members, scaled to the clearances, with their peaks and impulses, under a load.
+        """Start from the state of the members `before`, under the load `wrench`.
 
-        Poses move the second member of a prior, but the first member of an estimate. After a prior, the first member of
-        an estimate therefore starts at the second member's pose. After an estimate, the second member of a prior starts
-        at the first member's pose.
+        Poses are scaled to the clearances; peaks and impulses are copied. Measured poses move the second member of a
+        prior, but the first member of an estimate. If an estimate follows a prior, its first member therefore starts at
+        the pose of the second member. If a prior follows an estimate, its second member starts at the pose of the first
+        member.
         """
         before.settle()
         from_ = np.where(before.good, np.arange(len(before.good)), int(np.argmax(before.good)))[: len(self.good)]
@@ -281,28 +296,31 @@ class Ensemble:
             self._learner.take_over(before._learner)
             self._take_numbers(np.arange(len(self.good)))
         elif self.others is None and before._learner is not None:
-            # the estimate is the same, but from here on a single twin follows it, with the numbers of the first member
+            # the estimate has not changed, so the single twin continues with the parameters of the first member
             self._set_numbers(np.zeros(1, np.int64), before._numbers[:1])
 
     def stand_about(self, q: Array, v: Array) -> None:
-        """Move the first member to a pose, and the other members to this pose scaled to their clearances."""
+        """Move the first member to the pose `q`, and the other members to the pose scaled to their clearances."""
         places = q * self._shares(np.broadcast_to(self._room()[0], (len(self.good), 3)))
         force = self._force(self._penetration(places))[:1]
         self._stand(places, np.tile(v, (len(places), 1)), np.tile(force, (len(places), 1)))
 
     def _room(self) -> Array:
-        """Return the head's free space: horizontal, vertical and at its corners, shape (m, 3); 1 for a locked
-        direction.
+        """Return the scale in m of a member's motion in x, y and theta, shape (m, 3), or 1 for a locked direction.
+
+        The scale is the horizontal clearance, the vertical clearance, and the smaller of the two.
         """
         room = np.column_stack([self._clearance, self._clearance.min(axis=1)])
         return np.where(self._free, room, 1.0)
 
     def _shares(self, room: Array) -> Array:
-        """Return each member's free space relative to the free space `room`, shape (m, 3)."""
+        """Return the quotients of `_room` and another scale `room`, shape (m, 3), by which poses are scaled."""
         return np.divide(self._room(), room, out=np.ones_like(room), where=room > 0.0)
 
     def _stand(self, q: Array, v: Array, force: Array, which: NDArray[np.int64] | None = None) -> None:
-        """Move members to poses, or less far from the middle, so that no pair bears much more than `force`, (m, 8)."""
+        """Move members to poses `q`, but only so far from the middle that no pair bears much more than `force`, (m,
+        8).
+        """
         which = np.arange(len(q)) if which is None else which
         q, v, force = q[which], v[which], force[which]
         low, high = np.zeros(len(q)), np.ones(len(q))
@@ -315,14 +333,15 @@ class Ensemble:
         self._put(which, self._nearer(q, low), v)
 
     def _nearer(self, q: Array, share: Array) -> Array:
-        """Return poses moved toward the middle in the directions in which the head is free."""
+        """Return poses that are scaled toward the middle by `share`, shape (m,), in the free directions."""
         return np.where(self._free, share[:, None] * q, q)
 
     def correct(self, t: float, q: Array, noise: Array, load_error: Array) -> bool:
-        """Move the members toward a pose measured at `t` by a step of the Kalman filter; return whether it was used.
+        """Correct the members with a pose that was measured at time `t`, and return whether the pose was used.
 
-        `load_error`, shape (3,), is the standard deviation of the members' load errors in N and N m, which the pose
-        also corrects. A pose that is too late is not used. Outliers are used only after several outliers in a row.
+        The correction is a step of the ensemble Kalman filter. It also corrects the errors of the members' loads, whose
+        standard deviation in N, N, N m is `load_error`, shape (3,). A pose that is too late is not used. An outlier is
+        used only after several consecutive outliers.
         """
         self.settle()
         there = np.flatnonzero(np.isfinite(q) & self._free)
@@ -332,7 +351,7 @@ class Ensemble:
         after = min(bisect_left(times, t), len(times) - 1)
         path = np.stack([self._path[index][1] for index in range(after - 1, len(times))])
         share = min((t - times[after - 1]) / (times[after] - times[after - 1]), 1.0)
-        # the pose of each member as its sensor would have measured it
+        # measurement that the sensor of each member would have given
         then = ((1.0 - share) * path[0] + share * path[1] + biases_of(self._numbers))[:, there]
         since = self.first.time - self._drifted
         self._drift(load_error)
@@ -355,7 +374,7 @@ class Ensemble:
         if self._learner is not None:
             self._learner.add(self._numbers[use], seen[use], center, noise[there])
         off = _off(q, then, there)
-        # the innovation is clipped, so that a bad pose does not outweigh all others
+        # the innovation is clipped, so that a single wrong pose has a limited influence
         most = tuning.OUTLYING * noise[there]
         self.square += ((off.clip(-most, most) / noise[there]) ** 2).sum(axis=1)
         weight = np.linalg.solve(scatter, seen[use].T @ about[use] / freedom)
@@ -383,10 +402,10 @@ class Ensemble:
             self._load_off = kept * self._load_off + math.sqrt(1.0 - kept**2) * load_error * white
 
     def _learn(self, since: float) -> None:
-        """Learn every `tuning.LEARNED_EACH` seconds, and let members adopt the learned parameters.
+        """Update the learned parameters every `tuning.LEARNED_EACH` s, and let members adopt the parameters.
 
-        The first member adopts them at once, the others in turn, each about once in this time. `since` is the time in s
-        since the previous pose.
+        The first member adopts the parameters at once. The other members follow one after another, each about once in
+        `LEARNED_EACH`. `since` is the time in s since the previous pose.
         """
         learner, count = self._learner, len(self.good) - 1
         if learner is None:
@@ -403,14 +422,15 @@ class Ensemble:
             self._take_numbers(which)
 
     def _take_numbers(self, which: NDArray[np.int64]) -> None:
-        """Give members, in ascending order, their learned parameters."""
+        """Set the parameters of the members with the ascending indices `which` to the learned values."""
         assert self._learner is not None
         self._set_numbers(which, self._learner.numbers(which))
 
     def _set_numbers(self, which: NDArray[np.int64], numbers: Array) -> None:
-        """Give members, in ascending order, other parameters, and scale their poses to the new clearances.
+        """Set the parameters of the members with the ascending indices `which`, and scale their poses to the new
+        clearances.
 
-        A member keeps its parameters if the new ones need other equations, as an overdamped contact does.
+        The parameters of a member do not change if the new values need other equations, as an overdamped contact does.
         """
         now = [self.first.scene, *(() if self.others is None else self.others.scenes)]
         changed = [with_numbers(now[place], own) for place, own in zip(which.tolist(), numbers, strict=True)]
@@ -438,7 +458,7 @@ class Ensemble:
         self._stand(self.pose, self._v, force, which)
 
     def _recover(self) -> None:
-        """Move members outside the model's range to the poses of members in range, unless all are outside."""
+        """Move members outside the model's range to the poses of members in range, if any."""
         lost, left = np.flatnonzero(~self.good), np.flatnonzero(self.good)
         self.good[:] = True
         if not len(lost) or not len(left):
@@ -450,12 +470,15 @@ class Ensemble:
         self._stand(self._path[-1][1], self._v[from_], self._force(self._depth)[from_], lost)
 
     def _force(self, depth: Array, which: NDArray[np.int64] | slice = _ALL) -> Array:
-        """Return the elastic force of each pair of some members, (m, 8)."""
+        """Return the elastic force of each pair of some members in N, shape (m, 8), from the penetrations in m."""
         found: Array = self._stiffness[which, None] * np.maximum(depth, 0.0) ** self._exponent
         return found
 
     def _allowed(self, q: Array, force: Array, which: NDArray[np.int64] | slice = _ALL) -> NDArray[np.bool_]:
-        """Return which members may be moved to poses (m, 3), because no pair bears much more than `force`, (m, 8)."""
+        """Return the mask of the members that may be moved to poses `q`, (m, 3).
+
+        A member may be moved if no pair bears much more than `force`, shape (m, 8), in N.
+        """
         there = self._force(self._penetration(q, which), which)
         return np.asarray((there < force + self._pressed).all(axis=1))
 
@@ -469,18 +492,18 @@ class Ensemble:
         self._depth[which] = self._penetration(q, which)
 
     def _penetration(self, q: Array, which: NDArray[np.int64] | slice = _ALL) -> Array:
-        """Return the penetration of each pair in m, (m, 8), for some members at poses of shape (m, 3)."""
+        """Return the penetration of each pair in m, shape (m, 8), for some members at poses `q`, shape (m, 3)."""
         state = states_of(self._scene, np.concatenate([q, np.zeros_like(q)], axis=1))
         body = np.concatenate([state[:, _PLACES], np.ones((len(q), 1))], axis=1)
         found: Array = np.einsum("mi,mij->mj", body, self._walls[which]) - self.worn[which]
         return found
 
     def twins(self) -> list[bytes]:
-        """Return the exact states of the first twin and of the others."""
+        """Return the exact states of the first twin and of the other twins."""
         return [self.first.snapshot(), b"" if self.others is None else self.others.snapshot()]
 
     def set_twins(self, states: Sequence[bytes]) -> None:
-        """Restore the states that `twins` returned."""
+        """Restore states that `twins` has returned."""
         self.first.restore(states[0])
         if self.others is not None:
             self.others.restore(states[1])
@@ -492,7 +515,7 @@ class Ensemble:
         return self._numbers, np.concatenate([[self._turn, self._waiting], self._learner.state()])
 
     def state(self) -> tuple[list[bytes], Any]:
-        """Return the whole state, as bytes and as JSON."""
+        """Return the whole state: arrays as bytes, and the state of the random generator as JSON values."""
         self.settle()
         times, path = np.array([time for time, _ in self._path]), np.stack([q for _, q in self._path])
         wide = (self._peak, self._impulse, self._v, self.worn, self._depth, self._load_off)
@@ -501,7 +524,7 @@ class Ensemble:
         return [*self.twins(), *(one.tobytes() for one in arrays)], self._rng.bit_generator.state
 
     def set_state(self, blobs: list[bytes], random: Any) -> None:
-        """Restore a state that `state` returned."""
+        """Restore a state that `state` has returned."""
         self.good = np.frombuffer(blobs[2], np.bool_).copy()
         count = len(self.good)
         self.square, *wide, drifted, numbers, learned, times, path = (np.frombuffer(blob).copy() for blob in blobs[3:])
@@ -521,13 +544,15 @@ class Ensemble:
 
 
 def _bytes(rows: Rows) -> NDArray[np.uint8]:
-    """Return the fields of `ADVANCE` in rows (m, n) as bytes, because numpy copies a record field by field."""
+    """Return the fields of `ADVANCE` in rows (m, n) as bytes, which NumPy copies faster than records."""
     found: NDArray[np.uint8] = np.ascontiguousarray(rows)[..., None].view(np.uint8)[..., : ADVANCE.itemsize]
     return found
 
 
 def _off(q: Array, then: Array, there: NDArray[np.int64]) -> Array:
-    """Return a pose minus others (..., k) in the coordinates `there`, with angles from -pi to pi."""
+    """Return the pose `q` minus the poses `then`, shape (..., k), in the k components `there`; angles are in [-pi,
+    pi].
+    """
     off: Array = q[there] - then
     turn = there == _THETA
     off[..., turn] = np.remainder(off[..., turn] + np.pi, 2.0 * np.pi) - np.pi
@@ -535,7 +560,9 @@ def _off(q: Array, then: Array, there: NDArray[np.int64]) -> Array:
 
 
 def _worn(one: Scene, scene: Scene, worn: Array, moved: Array) -> Scene:
-    """Return a member's scene with worn pads; `moved` (2,) is the part of its clearances that is due to wear."""
+    """Return the scene of a member with worn pads; `moved`, shape (2,), is the part of its clearances due to wear in
+    m.
+    """
     assert scene.wear is not None
     depths = tuple(worn.tolist())
     horizontal, vertical = one.clearance.horizontal_m - moved[0], one.clearance.vertical_m - moved[1]
@@ -544,14 +571,14 @@ def _worn(one: Scene, scene: Scene, worn: Array, moved: Array) -> Scene:
 
 
 def widening(scene: Scene, worn: Array) -> Array:
-    """Return by how much the wear `worn` (..., 8) of the pads widens the clearances in m, shape (..., 2)."""
+    """Return the growth of the clearances in m, shape (..., 2), due to wear depths `worn` in m, shape (..., 8)."""
     own = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
     found: Array = clearances(scene, worn)[..., :2] - own
     return found
 
 
 def middle_of(scene: Scene, known: Estimate) -> tuple[Scene, Array]:
-    """Return the scene and the load gains, shape (3,), with the median values of an estimate."""
+    """Return the scene, and the load gains, shape (3,), with the median values of an estimate."""
     if known.horizontal_state is State.PRIOR:
         return replace(scene, loads=(), wear=None), np.ones(3)
 

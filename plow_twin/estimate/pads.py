@@ -1,9 +1,10 @@
-"""Turned walls, a sensor's lever arm and low pass, and the clearances by groups of pads.
+"""Rotations of walls, lever arm and low pass of the sensor, and the clearances between facing pads.
 
-The two pads of a wall may be worn differently, which turns the wall. One linearised step from a fit of the clearances
-estimates these turns together with the lever arm and the low pass of the sensor. Their intervals show whether the
-motion determines them. If they are so large that the fit fails a check, the fit is repeated with them. Poses cannot
-show how a clearance is divided between the two sides of the head, because a bias of the sensor has the same effect.
+The two pads of a wall may be worn differently, which rotates the wall. The rotations of the walls, the lever arm and
+the low pass are called *differences* from the model. They are estimated in one linearised step from a fit. If the
+differences are so large that the fit fails a check, the fit is repeated with the differences as unknowns. Poses do not
+determine how a clearance is divided between the two sides of the head, because a bias of the sensor has the same
+effect.
 """
 
 from __future__ import annotations
@@ -22,15 +23,15 @@ from plow_twin.estimate.unknowns import GX, GY, SIZE
 
 Array = NDArray[np.float64]
 
-#: Definition: for each group of pads the index of its clearance, and the shares with which the turns of the left,
-#: right, top and bottom wall change the group's own clearance.
+#: Clearance of each group of two facing pads, by definition: index of the clearance of the axis, and factors on the
+#: rotations of the left, right, top and bottom wall, which are added to this clearance.
 _MADE_OF: Final = {
     "horizontal_top": (GX, np.array([0.5, 0.5, 0.0, 0.0])),
     "horizontal_bottom": (GX, np.array([-0.5, -0.5, 0.0, 0.0])),
     "vertical_left": (GY, np.array([0.0, 0.0, 0.5, 0.5])),
     "vertical_right": (GY, np.array([0.0, 0.0, -0.5, -0.5])),
 }
-#: Bound: number of fits with differences, and number of iterations of each fit.
+#: Upper bounds of the number of fits with differences, and of the iterations in each fit.
 _ROUNDS, _ITERATIONS = 6, 15
 assert list(_MADE_OF) == list(GROUPS)
 
@@ -43,9 +44,9 @@ def deviations() -> Array:
 
 
 def by_group(problem: Problem, found: Fit, widened: float) -> dict[str, tuple[Interval, float]]:
-    """Return the clearance of each group with its standard deviation in m.
+    """Return the clearance of each group of facing pads, and its standard deviation in m.
 
-    `widened` multiplies the deviations of the fit to allow for scatter beyond the noise.
+    `widened` is a factor on the standard deviations of the fit.
     """
     step, covariance = _joint_step(problem, found)
     out = {}
@@ -60,14 +61,14 @@ def by_group(problem: Problem, found: Fit, widened: float) -> dict[str, tuple[In
 
 
 def shown(problem: Problem, found: Fit) -> float:
-    """Return chi^2 of the linearised step of the differences; a large value means that the motion shows them."""
+    """Return chi^2 of the linearised step of the differences; a large value is evidence of differences."""
     step, covariance = _joint_step(problem, found)
     step, covariance = step[SIZE:], covariance[SIZE:, SIZE:]
     return float(step @ np.linalg.solve(covariance, step))
 
 
 def with_differences(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None:
-    """Repeat a fit with differences of machine and sensor; None if the model cannot be run."""
+    """Return a fit that includes the differences; None if the motion cannot be simulated."""
     forward, most = problem.forward.renewed(), 0.5 * deviations()
     for index in range(_ROUNDS):
         step, covariance = _joint_step(problem, found)
@@ -75,7 +76,7 @@ def with_differences(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None
         differences[LAG] = max(differences[LAG], 0.0)
         change = differences - problem.differences
         size = float(change @ np.linalg.solve(covariance[SIZE:, SIZE:], change))
-        # a change within the noise needs no further fit, because grading a fit allows for it by a linear step
+        # a change within the noise needs no further fit, because `discrepancy.graded` applies it as a linearised step
         if index and size < tuning.SETTLED:
             break
         problem = Problem(
@@ -90,9 +91,9 @@ def with_differences(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None
 
 
 def of_differences(problem: Problem, found: Fit) -> Array:
-    """Return the covariance that uncertain differences of pads and sensor cause in the shared unknowns, (SIZE, SIZE).
+    """Return the part of the covariance of the shared unknowns that uncertain differences cause, shape (SIZE, SIZE).
 
-    If the head touches only one pad of each wall, the places of the other pads are unknown.
+    For example, the position of a pad is uncertain if the head touches only the other pad of the wall.
     """
     _, covariance = _joint_step(problem, found)
     held = np.linalg.inv(covariance)[:SIZE, :SIZE]
@@ -101,6 +102,6 @@ def of_differences(problem: Problem, found: Fit) -> Array:
 
 
 def _joint_step(problem: Problem, found: Fit) -> tuple[Array, Array]:
-    """Return the linearised step of the shared unknowns and the differences together, (18,), and its covariance."""
+    """Return the linearised step of shared unknowns and differences, shape (18,), and its covariance."""
     precision = deviations() ** -2.0
     return joint_step(problem, found, problem.by_differences(found.point), precision, -problem.differences * precision)

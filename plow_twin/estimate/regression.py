@@ -1,4 +1,4 @@
-"""Ridge regression and covariances from few draws."""
+"""Ridge regression, and covariance matrices from few samples."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ Array = NDArray[np.float64]
 
 
 def ridge(basis: Array, penalty: float, weight: Array | None = None) -> tuple[Array, Array]:
-    """Return the inverse normal matrix (k, k) of a ridge regression, and the leverage of its rows (n,).
+    """Return the inverse of the normal matrix of a ridge regression, (k, k), and the leverage of each row, (n,).
 
     Parameters
     ----------
     basis : ndarray, shape (n, k)
-        Terms of each row; the first is the constant, which is not penalised.
-    penalty : float
-        Added to the diagonal of the normal matrix.
+        Design matrix. The first column is the constant term, which is not penalised.
+        penalty : float
+            Number that is added to the diagonal of the normal matrix.
     weight : ndarray, shape (n,), optional
         Weights of the rows.
     """
@@ -30,7 +30,9 @@ def ridge(basis: Array, penalty: float, weight: Array | None = None) -> tuple[Ar
 
 
 def shrunk_root(covariance: Array, least: float) -> Array:
-    """Return the Cholesky factor of a covariance shrunk toward its diagonal, to which `least` is added."""
+    """Return the Cholesky factor of a covariance that is shrunk toward its diagonal; `least` is added to the
+    diagonal.
+    """
     share = tuning.SHRINKAGE[0]
     shrunk = (1.0 - share) * covariance + np.diag(share * np.diag(covariance) + least)
     return np.asarray(np.linalg.cholesky(shrunk), np.float64)
