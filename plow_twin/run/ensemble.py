@@ -217,7 +217,6 @@ class _Run:
             self._report_progress(len(done))
 
     def _run_alone(self, index: int) -> None:
-        """Run a member without lanes."""
         self._look()
         compiled, ensemble = self._compiled[index], self._ensemble
         motion = Motion.start(compiled, ensemble.q[index], ensemble.v[index])

@@ -324,7 +324,6 @@ def _by_equations(scene: Scene, t_end: float, tol: float, parameters: Sequence[s
 
 
 def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str]) -> _Stretches:
-    """Return the derivatives from finite differences between the motion and its shadows."""
     # `SHADOW_TOLERANCE` is 1e-5 of the displacement; a tighter tolerance of the run takes precedence
     fine = min(max(SHADOW_TOLERANCE, TOLERANCE_RANGE[0]), tol)
     compiled = compile_scene(scene, fine)

@@ -295,7 +295,6 @@ def options(scene: Scene) -> Options:
 
 
 def _of_options(scene: Scene) -> dict[str, Any]:
-    """Return the constants of a scene's options."""
     there, contact, found = options(scene), scene.contact, dict[str, Any]()
     if there.corners:
         found["tumbles"] = float(geometry.tumbles(scene))
@@ -323,7 +322,6 @@ def damping_numbers(law: str) -> Array:
 def _scene_terms(
     scene: Scene, law: Terms, loads: LoadSet, harmonics: Harmonics | None, segments: bool, shared: _Shared
 ) -> Terms:
-    """Return the terms of the scene, including the terms of its contact law."""
     present = dict(
         harmonics=harmonics is not None,
         second=harmonics is not None and shared.of(_has_second, harmonics),
@@ -572,7 +570,6 @@ def _slip(scene: Scene) -> dict[str, Any]:
 
 
 def _frame(scene: Scene) -> dict[str, Any]:
-    """Return the constants of a `Support`, if the scene has one."""
     support = scene.support
     if support is None:
         return {}

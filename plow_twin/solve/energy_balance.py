@@ -87,7 +87,6 @@ def _powers(p, parts, state, wear_depth, y, frame, t, balance, out) -> None:
 
 @kernel()
 def _taken_by_support(p, support, frame):
-    """Return the power in W that the springs and dampers of a frame take."""
     power = 0.0
     if support is not None:
         for j in range(3):
@@ -165,7 +164,6 @@ def _balance(p, support, seen, frame, balance, start) -> None:
 
 @kernel()
 def _frame_of(support, state):
-    """Return the state of a frame on springs, or None for a fixed frame."""
     if support is not None:
         return state.frame
     return None

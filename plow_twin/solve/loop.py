@@ -101,7 +101,6 @@ def _worn_at(state, w, wear, sigma, out) -> None:
 
 @kernel()
 def _worn_now(state, w, wear, out) -> None:
-    """Write each pad's wear depth at the current time, which can be within a step."""
     if state.step_size >= 0.0:
         _worn_at(state, w, wear, sigma_at(state, state.elapsed), out)
     else:
@@ -110,7 +109,6 @@ def _worn_now(state, w, wear, out) -> None:
 
 @kernel()
 def _clear(totals) -> None:
-    """Reset the sums of an advance to zero."""
     if totals is not None:
         set_row(totals.peak, 0, splat(0.0))
         set_row(totals.impulse, 0, splat(0.0))

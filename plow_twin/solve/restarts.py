@@ -15,8 +15,7 @@ _integrate = for_kernels(loop.integrate)
 
 @kernel(entry=True)
 def run_restarts(p, parts, states, w, totals, log, edges, budgets, t, q, v) -> int:
-    """Run state m through the times t[edges[m]:edges[m + 1]], and write the poses and rates to the same rows of q and
-    v.
+    """Run state m through the times t[edges[m]:edges[m + 1]], and write poses and rates to these rows of q and v.
 
     The caller sets the coordinates, rates and time of each state; this function sets the modes of its pairs. If a run
     fails, the function returns its `Status` and omits the remaining runs.

@@ -1,10 +1,9 @@
-"""Short motions of many square blocks with rounded corners that are tossed on a table. Each block has its own
-parameters.
+"""Short motions of many square blocks with rounded corners that are tossed on a table.
 
-Contacts have the normal force of `model.contact` and the spring friction of `solve.grip`. Restitution and friction
-decrease with the impact speed, and vary from touch to touch by a given scatter. In flight, the drag is linear in the
-velocity. A step in contact is a fixed fraction of the contact time. A step in flight is as long as possible before a
-corner can reach the table.
+Each block has its own parameters. Contacts have the normal force of `model.contact` and the spring friction of
+`solve.grip`. Restitution and friction decrease with the impact speed, and vary from touch to touch by a given scatter.
+In flight, the drag is linear in the velocity. A step in contact is a fixed fraction of the contact time. A step in
+flight is as long as possible before a corner can reach the table.
 """
 
 from __future__ import annotations

@@ -200,7 +200,7 @@ def params_type(options: Options) -> np.dtype[np.void]:
 _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("y", "f8", (STATE_SIZE,)),  # body coordinates at the start of the step
     ("damping_factor", "f8", (PAIR_COUNT,)),  # lambda of each pair in s/m
-    ("wear_depth", "f8", (PAIR_COUNT,)),  # wear depth of each pad in m
+    ("wear_depth", "f8", (PAIR_COUNT,)),
     ("mode", "i8", (PAIR_COUNT,)),
     ("beyond_ramp", "i8", (PAIR_COUNT,)),  # 1 if the penetration exceeds the ramp
     ("step_start", "f8"),
@@ -212,11 +212,11 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     # time at which a step has to end because of a sample, a knot of the load, or the end of the run
     ("stop_time", "f8"),
     ("last_step_size", "f8"),
-    ("touch_time", "f8"),  # time of the last touch
+    ("touch_time", "f8"),
     ("time", "f8"),  # current time, bit-identical to the value that the caller gave
     ("implicit_size", "f8"),  # size of the next implicit step
     ("decay_times", "f8"),  # duration of overdamped contact since the last change of contact, divided by the decay time
-    # values of `implicit_size` and `decay_times` before the current step was computed
+    # fields with the suffix `_before` contain the values before the current step was computed
     ("implicit_size_before", "f8"),
     ("decay_times_before", "f8"),
     ("order", "i8"),  # order of the series of the current step
@@ -228,7 +228,7 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("piece", "i8"),  # index of the current piece of the sampled load
     ("ends_at_stop", "i8"),  # 1 if the step ends at `stop_time`
     ("refused", "i8"),  # number of failed attempts at implicit steps since the last change of contact
-    ("refused_before", "i8"),  # value of `refused` before the current step was computed
+    ("refused_before", "i8"),
     ("in_flight", "i8"),  # 1 if the current step is a step of free flight
     ("at_rest", "i8"),  # 1 if the current step is a step at rest
     # the following fields are counts since the start of the motion
@@ -382,11 +382,11 @@ Segments: TypeAlias = NDArray[np.void]
 
 
 class Terms(NamedTuple):
-    """Terms of the equations of motion: 1 for a term that is present, `None` otherwise. `Params` contains the
-    constants.
+    """Terms of the equations of motion: 1 for a term that is present, `None` otherwise.
 
-    The types are part of the compiled signature. Kernels take the terms as separate arguments, because numba omits a
-    branch from the compiled code only if a separate argument is `None`.
+    `Params` contains the constants of the terms. The types of the terms are part of the compiled signature. Kernels
+    take the terms as separate arguments, because numba omits a branch from the compiled code only if a separate
+    argument is `None`.
     """
 
     harmonics: int | None
@@ -441,7 +441,7 @@ PACE: Final = np.dtype(
         ("row", "i8"),  # index of the next advance; all advances of one member precede those of the next member
         ("underway", "i8"),  # 1 if this advance has started
         ("mark", "i8"),  # index of the next element of `marks` (see `advance_rows`)
-        ("failed", "i8"),  # number of failed advances
+        ("failed", "i8"),
     ]
 )
 

@@ -109,7 +109,6 @@ def lay_out_series_step(p, parts, state, w, stop_time) -> bool:
 
 @kernel()
 def _end_at_event(p, state, w, span, penetrating, law, stick) -> None:
-    """Shorten a computed step so that it ends at its first event, and write its size in s."""
     sigma, order = state.sigma_end, state.order
     end, pair, target = first_event(p, state, w, order, sigma, penetrating, *law, stick)
     if pair >= 0 and state.events_at_once > p.max_events:
@@ -167,7 +166,6 @@ def complete_step(p, harmonics, flight, support, state, w, totals, log, wear, fr
 
 @kernel()
 def _switch(p, state, pair, new, totals, log, fraction, stick) -> None:
-    """Change the mode of a pair, and record the change in the totals and in the log."""
     old = state.mode[pair]
     if stick is not None and new >= SLIPS_FORWARD:
         switch_grip(p, state, pair, new)

@@ -236,7 +236,6 @@ def _change_force(p, state, w, along, columns, pair, k, moved, moved_rate, visco
 
 @kernel()
 def _expand_columns(p, state, w, along, columns, order, acts, viscous, hysteretic, curved) -> None:
-    """Write the series of eight columns over a step."""
     series, alpha, beta = columns.series, state.alpha, state.beta
     x, y, angle = series[PLACE_X], series[PLACE_Y], series[PLACE_THETA]
     vx, vy, spin = series[RATE_X], series[RATE_Y], series[RATE_THETA]

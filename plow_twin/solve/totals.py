@@ -89,7 +89,6 @@ def publish(rows, stamps, held, taken, windows, waits) -> int:
 
 @kernel()
 def _copy_motion(row_of, target) -> None:
-    """Copy the motion of a row to another record."""
     target.t, target.stamp_ns, target.held = row_of.t, row_of.stamp_ns, row_of.held
     for j in range(3):
         target.q[j], target.v[j] = row_of.q[j], row_of.v[j]

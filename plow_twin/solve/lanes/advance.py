@@ -170,7 +170,6 @@ def _undo(s, lanes, bits) -> None:
 
 @kernel()
 def _steps_since(lanes, lane) -> int:
-    """Return the number of steps since the previous sample."""
     taken: int = lanes.counts[STEPS, lane] - lanes.kept_counts[STEPS, lane]
     return taken
 
@@ -323,7 +322,6 @@ def _tell(lanes, reached, viscous, hysteretic, power, fraction) -> None:
 
 @kernel()
 def _write_rows(s, lanes, reached) -> None:
-    """Write the rows of the samples that lanes have reached."""
     turned = lanes.turned
     transpose(turned[0], lanes.out)
     for i in range(3):
@@ -459,7 +457,6 @@ def _leave(s, lanes, lane) -> None:
 
 @kernel()
 def _step(s, viscous, hysteretic, power, fraction, order, lanes, w) -> None:
-    """Take one step in each lane."""
     time = exact_row(lanes.time, 0) - exact_row(lanes.knot, 0)
     for j in range(3):
         sampled = fused(exact_row(lanes.slope, j), time, exact_row(lanes.sample, j))

@@ -493,7 +493,6 @@ def note_switches(lanes, order, viscous, fraction) -> None:
 
 @kernel()
 def _note_switch(lanes, lane, guard, viscous, fraction) -> None:
-    """Record the new mode of a pair whose guard function becomes negative."""
     pair = guard % PAIR_COUNT
     mode = lanes.mode[pair, lane]
     if guard >= AGAIN:

@@ -169,7 +169,6 @@ def _part(sums, lanes, lane) -> None:
 
 @kernel()
 def _rate(p, lanes, pair, lane) -> float:
-    """Return the rate of a pair's penetration in a lane at the end of the step."""
     y = lanes.y
     return rate_at(
         p, pair, y[COS, lane], y[SIN, lane], y[OMEGA, lane], y[X, lane], y[Y, lane], y[VX, lane], y[VY, lane]
@@ -197,7 +196,6 @@ def _touch_or_release(p, lanes, pair, lane) -> None:
 
 @kernel()
 def _switch(p, sums, lanes, lane, hysteretic, fraction) -> None:
-    """Change the modes of a lane's pairs at the end of the step."""
     for pair in range(PAIR_COUNT):
         new, old = lanes.switch[pair, lane], lanes.mode[pair, lane]
         if new < 0:
@@ -324,7 +322,6 @@ def _unowned_members(members):
 
 @kernel()
 def _load(members, power, lanes, lane, member) -> None:
-    """Load a scene and its sums into a lane."""
     totals = members.totals[member]
     load_lane(members.params[member], members.states[member], power, lanes, lane, member)
     join_lanes(lanes, 1 << lane)
@@ -378,7 +375,6 @@ def run_lanes(
 
 @kernel()
 def _step(members, waves, second, viscous, hysteretic, power, fraction, order, lanes, w, t) -> None:
-    """Take one step in each lane."""
     if fraction is not None:
         choose_maps(members.harmonics, members.extent, waves, second, hysteretic, fraction, None, lanes, w)
     if waves is not None:

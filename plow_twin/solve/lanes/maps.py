@@ -76,7 +76,6 @@ def choose_maps(harmonics, extent, waves, second, hysteretic, fraction, segments
 
 @kernel()
 def _choose_map(lanes, w, lane, order, near) -> None:
-    """Choose the series variable sigma of one lane (`method.taylor`)."""
     span = lanes.whole[lane]
     if lanes.touched[lane] != 0:
         lanes.whole[lane] = math.sqrt(span)

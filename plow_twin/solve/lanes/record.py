@@ -342,7 +342,6 @@ def note_modes(lanes) -> None:
 
 @kernel()
 def _take_slot(lanes, lane, pair, slot) -> None:
-    """Assign a pair that is ON to a slot of its lane."""
     gear = lanes.gear[slot]
     for i in range(5):
         gear[i, lane] = lanes.rows[pair, i, lane]

@@ -418,7 +418,6 @@ def _multiply(lanes, slot, k, hysteretic):
 
 @kernel(inline="code")
 def _product(a, b, k):
-    """Return order k of the product of two series of each lane."""
     total = exact_splat(0.0)
     for j in range(k + 1):
         total = fused(exact_row(a, j), exact_row(b, k - j), total)
@@ -522,7 +521,6 @@ def _lever(row, viscous, c, s, x, y, dc, ds, dx, dy):
 
 @kernel(inline="code")
 def _size(lanes, vx, vy, om, c, s):
-    """Return the size of the terms of one order, converted to a velocity."""
     size = fused(exact_row(lanes.weight, 0), magnitude(c) + magnitude(s), magnitude(vx) + magnitude(vy))
     return fused(exact_row(lanes.radius, 0), magnitude(om), size)
 

@@ -89,7 +89,6 @@ def add_step(totals, lanes, w, order, full, viscous, hysteretic, power, fraction
 
 @kernel()
 def _impulses(lanes, gear, viscous, hysteretic):
-    """Return the impulses of a slot's pairs over the step."""
     y, sums, change = lanes.y, lanes.sum, lanes.change
     depth = penetration_at(gear, exact_row(y, COS), exact_row(y, SIN), exact_row(y, X), exact_row(y, Y))
     swept = linear_at(gear, exact_row(sums, 0), exact_row(sums, 1), exact_row(sums, 2), exact_row(sums, 3))
@@ -190,7 +189,6 @@ def _raise_at_once(lanes, w, push, full, bulges) -> None:
 
 @kernel()
 def _keep_bulge(lanes, push, pair, lane, order) -> None:
-    """Store the force of a lane's pair for `find_peaks`."""
     i, stiffness = lanes.bulges[0], lanes.stiffness[lane]
     for k in range(order + 1):
         lanes.bulge[k, i] = stiffness * push[k, lane]

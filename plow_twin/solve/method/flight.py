@@ -32,7 +32,6 @@ def amplitudes(p, one, j):
 
 @kernel()
 def _smallest_gap(p, state) -> float:
-    """Return the smallest gap of all pairs in m."""
     y, nearest = state.y, np.inf
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:

@@ -363,7 +363,6 @@ def _grow(p, w, rubbed, k, alpha, beta) -> None:
 
 @kernel(fast=True, inline="code")
 def _wear(p, state, w, k, alpha, beta, om, dc, ds, dx, dy, sliding, running_in) -> None:
-    """Write order k + 1 of the increase of each pad's wear depth, from force, sliding and running-in."""
     if sliding is not None:
         _slide(p, w, k, om, dc, ds, dx, dy)
         if running_in is not None:
@@ -498,8 +497,7 @@ def expand(
     stick,
     support,
 ):
-    """Write the series of state, penetration, rate and force up to order `limit` to `w`. Return the order of the
-    series.
+    """Write the series of state, penetration, rate and force up to order `limit` to `w`. Return their order.
 
     If `penetrating` is false, no pair penetrates, and the contacts are omitted. The series ends early if its terms are
     negligible at `sigma_limit`, the largest sigma of interest.

@@ -1,5 +1,4 @@
-"""Rest under small harmonic loads: proof that the motion of a head that is held by its contacts stays below the
-tolerance.
+"""Rest under small harmonic loads: proof that the motion of a head in contact stays below the tolerance.
 
 Near its equilibrium, the head satisfies e'' + C e' + K e = r. Here e is its distance from the linear response to the
 harmonic loads, with the angle times the radius of gyration as third coordinate, and r is the remainder of the
