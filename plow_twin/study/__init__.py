@@ -1,4 +1,5 @@
-"""Offline studies of many runs: sweeps of a scene, calibration to figures or recordings, analysis of recordings.
+"""Offline studies of many runs: sweeps of a scene, calibration, and analysis of recordings.
 
-matplotlib, pyarrow, jinja2 and distributed (extras `study` and `dask`) are imported where they are used.
+The optional packages matplotlib, pyarrow, jinja2 and distributed (extras `study` and `dask`) are imported where they
+are used.
 """

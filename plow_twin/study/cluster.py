@@ -1,4 +1,4 @@
-"""A Dask cluster: connection to its scheduler, and results in the order of their arrival."""
+"""Connection to a Dask cluster, whose results are returned in order of arrival."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 CONNECT_TIMEOUT_S = 20.0
-#: Longest time that a cluster may be without a worker [s].
+#: Longest time [s] that the cluster may have no worker.
 WORKER_TIMEOUT_S = 300.0
-#: Interval of the checks for a worker while no result arrives [s].
+#: Interval [s] of the checks for workers while no result arrives.
 _LOOK_S: Final = 2.0
 
 
@@ -29,7 +29,9 @@ def connect(address: str) -> Client:
 
 
 def completed(client: Client, futures: Iterable[Future[Any]]) -> Iterator[Future[Any]]:
-    """Yield futures as they end, or raise a `StudyError` after `WORKER_TIMEOUT_S` without a worker."""
+    """Yield futures in order of completion, or raise a `StudyError` if the cluster has no worker for
+    `WORKER_TIMEOUT_S`.
+    """
     from distributed import as_completed
 
     waiting: set[Any] = set(futures)

@@ -1,15 +1,17 @@
-"""Parameters of a scene, each a number or a word, named by paths such as `contact.stiffness`, `head.com_offset_m[0]`.
+"""Parameters of a scene, named by paths such as `contact.stiffness` and `head.com_offset_m[0]`.
 
-A load is given by its name: `loads.fx1.phase_rad`. Four paths are settings of a study, not fields of a scene:
+A parameter is a number or a word. The path of a parameter of a load contains the name of the load:
+`loads.fx1.phase_rad`. Four paths are settings of a study and not fields of a scene:
 
-    loads.<name>.sign       sign of the load's force (of its first component that is not zero); -1 reverses the force
-    loads.<name>.arm_sign   the same for the force's point of action
+    loads.<name>.sign       sign of the first non-zero component of the load's force; -1 reverses the force
+    loads.<name>.arm_sign   sign of the first non-zero coordinate of the point of action; -1 reverses both coordinates
     loads.<name>.scale      factor of the load's force and free moment
     clearance.scale         factor of both clearances: 1 for a total, 2 for a published clearance per side
 
-These settings are applied after all other paths. `frame.labels` takes one of eight words: `bottom_right_ccw` means that
-corner a is at the bottom right, and that b, c, d follow counter-clockwise. Setting `contact.damping` removes a
-restitution, and the reverse. Setting a path of `friction` switches friction on.
+These four settings are applied after all other parameters. The path `frame.labels` takes one of eight words. For
+example, `bottom_right_ccw` puts corner a at the bottom right, with b, c and d counter-clockwise from a. Setting
+`contact.damping` removes a restitution, and setting a restitution removes a damping. Setting a path of `friction`
+switches friction on.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ Value = float | str
 WORDS: Final = ("contact.law", "head.rotation", "frame.labels")
 _CORNERS_CCW: Final = ("bottom_right", "top_right", "top_left", "bottom_left")
 _DERIVED: Final = ("sign", "arm_sign", "scale")
-#: Start of a study that varies friction, if the scene has none.
+#: Friction of a scene without friction, at the start of a study that varies the friction.
 _NO_FRICTION: Final = Friction(0.0)
 _INDEX: Final = re.compile(r"(.+)\[(\d+)\]")
 
@@ -79,7 +81,7 @@ def check_path(scene: Scene, path: str) -> str:
 
 
 def nearest_of(path: str, known: Iterable[str]) -> str:
-    """Return a hint with the nearest known paths, empty if none is near."""
+    """Return a hint with the most similar known paths, or an empty text if no path is similar."""
     near = get_close_matches(path, known, n=3, cutoff=0.6)
     return f"; nearest: {', '.join(near)}" if near else ""
 
@@ -103,7 +105,9 @@ def parameter_of(scene: Scene, path: str) -> Value | None:
 
 
 def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
-    """Return the scene with new values. A number that is set loses its mark.
+    """Return the scene with new values. The mark of each changed number is removed.
+
+    See `plow_twin.model.scene` for marks, which state where a number comes from.
 
     Raises
     ------
@@ -140,7 +144,7 @@ def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
 
 
 def _label_words() -> dict[str, dict[str, str]]:
-    """Return the eight assignments of letters to corners by their words such as `bottom_right_ccw`."""
+    """Return the eight assignments of letters to corners, each named by a word such as `bottom_right_ccw`."""
     words = {}
     for turn, corners in (("ccw", _CORNERS_CCW), ("cw", _CORNERS_CCW[::-1])):
         for first in range(4):
@@ -150,7 +154,7 @@ def _label_words() -> dict[str, dict[str, str]]:
 
 
 def check_word(path: str, word: str) -> str:
-    """Return the word if it is a value of the path, one of `WORDS`; otherwise raise a `StudyError`."""
+    """Return the word if the path in `WORDS` can take it; otherwise raise a `StudyError`."""
     (rotation,) = (spec for spec in fields(Head) if spec.name == "rotation")
     words = {"contact.law": LAWS, "head.rotation": rotation.metadata["choices"], "frame.labels": _label_words()}[path]
     if word not in words:
@@ -210,13 +214,13 @@ def _vector(load: Any, field_name: str) -> tuple[float, ...]:
     if field_name == "arm_sign":
         return tuple(load.at_m)
     if isinstance(load, Table):
-        # a table has the sign of its largest force component
+        # the sign of a table is the sign of its largest force component
         return (float(load.wrench[:, :2].flat[abs(load.wrench[:, :2]).argmax()]),)
     return tuple(load.force_n)
 
 
 def _times(vector: tuple[float, ...], factor: float) -> tuple[float, ...]:
-    # +0 instead of -0, so that equal scenes have equal texts
+    # +0 instead of -0: two equal scenes then give equal files
     return tuple(factor * x if x != 0.0 else 0.0 for x in vector)
 
 

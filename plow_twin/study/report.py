@@ -1,4 +1,4 @@
-"""Files of a report: a self-contained HTML page, and tables as JSON and CSV."""
+"""Files of a report: a self-contained HTML page, and JSON and CSV files."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ if TYPE_CHECKING:
 
 
 def require(*modules: str) -> None:
-    """Raise `ModuleNotFoundError` if a module is missing, before work that may take minutes."""
+    """Raise `ModuleNotFoundError` if a module is missing, so that a long computation does not end without its report.
+    """
     for module in modules:
         import_module(module)
 
 
 def write_html(path: Path, template: str, context: Mapping[str, Any], package: str = "plow_twin.study") -> None:
-    """Fill `templates/<template>` of a package and write the page. The filter `image` embeds a PNG file."""
+    """Render the template `templates/<template>` of a package to an HTML file. The filter `image` embeds a PNG file."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -60,7 +61,7 @@ def percent(share: float | None) -> str:
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write plain values; numbers that are not finite become null."""
+    """Write a mapping as JSON. Numbers that are not finite become null."""
     text = json.dumps(_plain(document), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     write_whole(path, text.encode())
 
@@ -76,7 +77,7 @@ def _plain(value: Any) -> Any:
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows with equal keys as CSV."""
+    """Write rows, which have equal keys, as CSV."""
     with whole_file(path) as stream, io.TextIOWrapper(stream, encoding="utf-8", newline="") as text:
         writer = csv.DictWriter(text, fieldnames=list(rows[0]))
         writer.writeheader()

@@ -1,6 +1,6 @@
-"""A run as one self-contained HTML file with summary, picture, curves and tables.
+"""A run as one self-contained HTML file with a summary, a picture, curves and tables.
 
-The viewer of rerun is too large for the file (`docs/recording.md`).
+The file contains no rerun viewer, which would be too large (`docs/recording.md`).
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from plow_twin.view.run_curves import RunCurves
 
 Array = NDArray[np.float64]
 
-#: Largest number of rows of a table; further rows are only counted.
+#: Largest number of rows in a table. Of further rows, only the number is shown.
 _MOST_ROWS: Final = 200
 _PADS: Final = np.array([CLEARANCE_NAMES.index(name) for name in PAD_NAMES])
 _LOADS: Final = ("Fx", "Fy", "M")
 
 
 def write_run_page(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], int]:
-    """Write the page of a run; return the status and the losses of the recording, and the number of failed advances.
+    """Write the page of a run. Return the status of the recording, its losses, and the number of failed advances.
 
     Raises
     ------
     RecordingError
-        The file is not a recording, or has no row to draw.
+        The file is not a recording, or has no rows to draw.
     """
     reader = RunReader(path)
     curves = RunCurves.of(reader)
@@ -72,7 +72,7 @@ def _uplot(name: str) -> str:
 
 @dataclass
 class _Log:
-    """The events of a run as texts."""
+    """The events of a run as texts for the page."""
 
     samples: int = 0
     first_ns: int | None = None
@@ -83,7 +83,7 @@ class _Log:
 
     @classmethod
     def of(cls, reader: RunReader) -> _Log:
-        """Read a whole recording."""
+        """Collect the events of a whole recording."""
         log, alarms = cls(), reader.header.topic(ALARMS)
         for batch in reader.batches():
             stamps = batch.entries.samples()[0]
@@ -178,7 +178,6 @@ def _by_pad(recording: Recording) -> list[dict[str, str]]:
 
 
 def _plots(reader: RunReader, curves: RunCurves) -> list[dict[str, Any]]:
-    """Return the plots that have data."""
     alarms = alarms_of(reader.header.parameters).alarms
     force, clearance = alarms["force"].thresholds, alarms["clearance"].thresholds
     ways = ("horizontal", "vertical")
@@ -209,7 +208,10 @@ def _plots(reader: RunReader, curves: RunCurves) -> list[dict[str, Any]]:
 
 
 def _columns(rows: Envelope, chosen: list[tuple[int, int]]) -> list[list[float | None]]:
-    """Return times, and for each (column, side) the least (0) or largest (1) values; None ends a line."""
+    """Return a column of times, and a column of values for each item (column, side) of `chosen`.
+
+    Side 0 is the least value of an interval, side 1 the largest value. None interrupts a curve.
+    """
     times: Array | None = None
     columns: list[list[float | None]] = []
     order = np.zeros(0, np.int64)

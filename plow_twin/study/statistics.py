@@ -1,17 +1,20 @@
 """Statistics of a run, each named by a path.
 
     max.top_left_top          largest force of one pair
-    max.ccw.a                 largest force of corner a's pair that stops a counter-clockwise swing (cw: its other pair)
-    max.a   max.ccw   max     largest force over the pairs of a corner; over the pairs of a sense; over all pairs
-    contact_sets.ccw.ad       share of the sense's contact time in which exactly corners a and d carry force
-    contact_set_time.ccw.ad   this time in s
-    contact_points.ccw.2      share of the sense's contact time in which exactly two corners carry force
-    events   steps            number of contact changes; number of steps of the solver
+    max.ccw.a                 largest force of the pair at corner a that stops a counter-clockwise swing
+    max.a                     largest force of the two pairs at corner a
+    max.ccw                   largest force of the four pairs that stop a counter-clockwise swing
+    max                       largest force of all pairs
+    contact_sets.ccw.ad       share of the contact time of `ccw` in which exactly corners a and d carry force
+    contact_set_time.ccw.ad   time [s] in which exactly corners a and d carry force against a counter-clockwise swing
+    contact_points.ccw.2      share of the contact time of `ccw` in which exactly two corners carry force
+    events, steps             number of contact changes; number of steps of the solver
 
 Instead of `max` [N], a path may begin with `mean_in_contact` or `mean_over_time` [N], `impulse` [N s],
-`time_in_contact` [s], `makes` or `wear_depth` [m]. For several pairs, `max` and `wear_depth` are the largest value;
-impulses, times and touches are summed, and means are computed from the sums. A corner is named by its letter or by its
-own name such as `top_left`. In a set, letters stand side by side (`ad`), and names are joined by `+`.
+`time_in_contact` [s], `makes` or `wear_depth` [m]. For a group of pairs, `max` and `wear_depth` return the largest
+value. Impulses, times and touches are summed, and means are computed from the sums. The word `cw` selects the pairs
+that stop a clockwise swing. A corner is named by its letter or by its place, such as `top_left`. A set is written as
+letters (`ad`), or as places joined by `+`.
 """
 
 from __future__ import annotations
@@ -38,7 +41,7 @@ SENSES: Final = ("ccw", "cw")
 
 
 def _sum(array: Array, columns: list[int]) -> Array:
-    """Add columns one by one: the last bit of numpy's sum depends on the number of rows."""
+    """Add columns one by one, because the rounding of numpy's sum depends on the number of rows."""
     total = np.zeros(len(array))
     for column in columns:
         total = total + array[:, column]
@@ -66,7 +69,7 @@ UNITS: Final[Mapping[str, str]] = {
 
 
 def statistics_of(members: Ensemble, scenes: Sequence[Scene], paths: Sequence[str]) -> Array:
-    """Return statistics of runs, shape (m, paths), NaN for a failed run."""
+    """Return the statistics of m runs, shape (m, paths). The row of a failed run is NaN."""
     result = np.full((len(scenes), len(paths)), np.nan)
     names = [spec.name for spec in fields(Ensemble) if spec.name != "t"]
     groups: dict[tuple[tuple[str, str], ...], list[int]] = {}
@@ -98,9 +101,9 @@ def _statistics_of_scene(scene: Scene) -> Mapping[str, Statistic]:
 
 
 def statistic(scene: Scene, path: str) -> Statistic:
-    """Return the statistic of a path, or raise a `StudyError` with the nearest paths and the kinds."""
+    """Return the statistic at a path; raise a `StudyError` with the most similar paths if the path is unknown."""
     known = _statistics_of_scene(scene)
-    # the letters of a set may be in any order
+    # a user may write the letters of a set in any order
     head, _, last = path.rpartition(".")
     key = path if path in known else f"{head}.{''.join(sorted(last))}"
     if key not in known:
@@ -113,7 +116,7 @@ def statistic(scene: Scene, path: str) -> Statistic:
 
 
 def unit_of(path: str) -> str:
-    """Return the unit of a statistic."""
+    """Return the unit of a statistic, given its path."""
     return UNITS[path.partition(".")[0]]
 
 
@@ -123,7 +126,7 @@ def _labels(scene: Scene) -> list[str]:
 
 
 def _groups(scene: Scene) -> dict[str, list[int]]:
-    """Return groups of pairs by the end of a path: empty for all pairs, or e.g. `.ccw`, `.ccw.a`."""
+    """Return the pairs of each group. The key is the end of a path: empty for all pairs, or e.g. `.ccw`, `.ccw.a`."""
     ccw = [pair for pair in range(8) if STOPS_COUNTER_CLOCKWISE[pair]]
     cw = [pair for pair in range(8) if not STOPS_COUNTER_CLOCKWISE[pair]]
     groups: dict[str, list[int]] = {"": list(range(8)), ".ccw": ccw, ".cw": cw}

@@ -1,9 +1,9 @@
 """The folder of a sweep.
 
-    sweep.json          the arguments, and the number of members in a chunk
-    chunks/00007.npz    status and statistics of the members of one chunk, and the build that computed them
+    sweep.json          the arguments of the sweep, and the number of members in a chunk
+    chunks/00007.npz    the status and statistics of the members of one chunk, and the build that computed the chunk
 
-Each chunk is written whole or not at all, so a killed run loses only its unfinished chunk.
+A chunk is written atomically, so a killed run loses only its unfinished chunk.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from plow_twin.study.sweep.table import Sweep, Table
 Array = NDArray[np.float64]
 
 FORMAT: Final = 1
-#: Name of a chunk, or of the incomplete chunk of a killed process.
+#: Name of a chunk, or of the temporary file of a chunk that a killed process left behind.
 _CHUNK_NAME: Final = re.compile(r"\d{5,}\.npz|\.\d{5,}\.npz\.\d+")
 
 
 class Store:
-    """The chunks of one sweep in a folder, which is made if it does not exist.
+    """The stored chunks of one sweep, in a folder that is created if necessary.
 
-    A chunk has `chunk` members; a sweep in the folder keeps its own number. `fresh` discards a sweep in the folder.
+    A chunk has `chunk` members. If the folder already contains the sweep, the stored number of members per chunk is
+    used. `fresh` deletes a sweep in the folder.
 
     Raises
     ------
     StudyError
-        The folder contains another sweep (the error names the difference), an unreadable sweep, or chunks without
-        `sweep.json`.
+        The folder contains a sweep with other arguments, an unreadable sweep, or chunks without `sweep.json`.
     """
 
     def __init__(self, folder: Path, sweep: Sweep, chunk: int, fresh: bool = False) -> None:
@@ -76,16 +76,16 @@ class Store:
 
     @property
     def chunks(self) -> list[range]:
-        """Members of each chunk."""
+        """The indices of the members of each chunk."""
         size = self.sweep.size
         return [range(begin, min(begin + self.chunk, size)) for begin in range(0, size, self.chunk)]
 
     def missing(self) -> list[int]:
-        """Return the numbers of the chunks that are missing or damaged."""
+        """Return the indices of the chunks that are missing or damaged."""
         return [index for index in range(len(self.chunks)) if self.read(index) is None]
 
     def read(self, index: int) -> tuple[Array, str] | None:
-        """Return table and build of a chunk, or None if the chunk is missing or damaged."""
+        """Return the table and the build of a chunk, or None if the chunk is missing or damaged."""
         try:
             with self._path(index).open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 table, build = np.asarray(archive["table"], float), str(archive["build"])
@@ -95,7 +95,7 @@ class Store:
         return (table, build) if table.shape == shape else None
 
     def write(self, index: int, table: Array, build: str) -> None:
-        """Store a chunk."""
+        """Store a chunk, with its table, shape (members, 1 + statistics), and the fingerprint of its build."""
         buffer = BytesIO()
         np.savez(buffer, table=table, build=np.array(build))
         write_whole(self._path(index), buffer.getvalue(), sync=True)

@@ -1,4 +1,4 @@
-"""Parameters and statistics in words with their units, for pictures."""
+"""Names of parameters and statistics, with units, for pictures."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Final
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.study.statistics import unit_of
 
-#: Unit in pictures and its factor from SI, by the end of a parameter's name; the first end that fits counts.
+#: Unit in pictures, and its factor from SI, by the suffix of a parameter's name. The first matching suffix is used.
 _ENDS: Final = {
     "_kg_m2": ("kg m²", 1.0),
     "_kg": ("kg", 1.0),
@@ -43,7 +43,7 @@ _SENSES: Final = {"ccw": "counter-clockwise", "cw": "clockwise"}
 
 
 def parameter_words(path: str) -> tuple[str, float]:
-    """Return a parameter in words with its unit, and the factor from SI to this unit."""
+    """Return the name of a parameter with a unit for pictures, and the factor from SI to this unit."""
     if path == "contact.stiffness":
         return "contact stiffness [MN/mⁿ]", 1e-6
     plain, index = re.fullmatch(r"(.*?)(\[\d+\])?", path).groups()  # type: ignore[union-attr]
@@ -56,7 +56,7 @@ def parameter_words(path: str) -> tuple[str, float]:
 
 
 def statistic_words(path: str) -> tuple[str, float]:
-    """Return a statistic in words with its unit, and the factor from SI to this unit."""
+    """Return the name of a statistic with a unit for pictures, and the factor from SI to this unit."""
     kind, *places = path.split(".")
     unit, factor = _SCALED.get(unit_of(path), (unit_of(path), 1.0))
     words = [_STATISTICS[kind]]

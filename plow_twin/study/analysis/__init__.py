@@ -1,1 +1,1 @@
-"""Analysis of recordings: predictions compared with measurements, loads of the contacts, and other scenes."""
+"""Analysis of recordings: comparison of predictions with measurements, and loads of the contacts."""

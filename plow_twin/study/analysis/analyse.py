@@ -1,7 +1,7 @@
 """Analysis of one recording: the motion is computed under the recorded load and compared with the measurements.
 
 The load comes from the journal of a run, or from a mapped topic of another recording. A *stretch* is the motion between
-two resets. Signals are compared over the longest stretch, contacts are counted over all.
+two resets. Signals are compared over the longest stretch. Contacts are counted over all stretches.
 """
 
 from __future__ import annotations
@@ -50,40 +50,40 @@ _COLUMNS: Final = (
     *(f"force_{name}" for name in PAIR_NAMES),
     *(f"gap_{name}" for name in PAIR_NAMES),
 )
-#: Tolerance of the motion, for a recording of another program.
+#: Tolerance of the solver for a recording of another program, which states no tolerance.
 _TOLERANCE: Final = 1e-9
-#: A measured stamp that is older than the newest stamp by more than this time [ns] shows that the clock of the
-#: measurement stepped back.
+#: Clock step [ns]. If a measured stamp is older than the newest stamp by more than this time, the clock of the
+#: measurement has stepped back.
 _STEP_NS: Final = 1_000_000_000
-#: Largest measured value in any unit; the squares of larger values may overflow.
+#: Largest absolute value of a measurement, in any unit, that is used; the squares of larger values may overflow.
 _LARGEST: Final = 1e15
 _OF_THE_RUN: Final = "of the run"
 _MAP: Final = "map_"
-#: Parameter that only runs made by an analysis have.
+#: Name of a parameter in the header of the runs that an analysis writes, and of no other run.
 MAPPED_LOAD: Final = f"{_MAP}excitation"
-#: Function that gets the share of the work done, 0..1.
+#: Callback that receives the share of the work done, 0..1.
 OnProgress = Callable[[float], object]
 
 
 @dataclass
 class Prediction:
-    """The motion for one scene, and the loads of its contacts."""
+    """The motion of one scene under the recorded load, and the loads of its contacts."""
 
     name: str
     scene: Scene
     loads: LoadTotals
     longest: Thinned = field(default_factory=lambda: Thinned(len(_COLUMNS)))
     present: Thinned = field(default_factory=lambda: Thinned(len(_COLUMNS)))
-    #: number of resets so far, which is the index of the present stretch
+    #: Number of resets so far, which is the index of the present stretch.
     resets: int = 0
-    #: first and last stamp [ns] of each stretch
+    #: First and last stamp [ns] of each stretch.
     spans: dict[int, tuple[int, int]] = field(default_factory=dict)
     _longest_number: int = 0
-    #: clearances of all stretches, with the columns `CLEARANCE_NAMES`
+    #: Clearances of all stretches, with the columns `CLEARANCE_NAMES`.
     clearance: Thinned = field(default_factory=lambda: Thinned(len(CLEARANCE_NAMES)))
 
     def walked(self, part: Walked) -> None:
-        """Add a batch."""
+        """Add a batch of computed rows."""
         self.loads.add(part)
         rows, slow = part.rows, part.published.slow
         first, _ = self.spans.get(self.resets, (int(part.stamp_ns[0]), 0))
@@ -92,7 +92,7 @@ class Prediction:
         self.clearance.add(slow["stamp_ns"], slow["clearance"])
 
     def is_inside(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
-        """Return for each measured value whether its stamp is within the time of the load."""
+        """Return for each measured value whether its stamp lies in a stretch of the load."""
         stamps = signal.series()[0]
         if not self.spans:
             return np.ones(len(stamps), np.bool_)
@@ -100,12 +100,12 @@ class Prediction:
         return np.asarray(np.any(inside, axis=0))
 
     def outside(self, signal: ThinnedSignal) -> int:
-        """Return the number of values of a signal outside the time of the load."""
+        """Return the number of values of a signal whose stamps lie in no stretch of the load."""
         inside = self.is_inside(signal)
         return round(signal.came * (1.0 - float(inside.mean()))) if len(inside) else 0
 
     def restart(self) -> None:
-        """Begin a new stretch after a reset; its stamps may be earlier than those of the last stretch."""
+        """Begin a new stretch after a reset. Its stamps may be earlier than those of the previous stretch."""
         self.loads.restart()
         self._longest_number = self.longest_number
         self.longest, self.present = self._longer(), Thinned(len(_COLUMNS))
@@ -119,8 +119,8 @@ class Prediction:
     def is_of_longest(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
         """Return for each measured value whether it belongs to the longest stretch.
 
-        A value belongs to the stretch that contains its stamp. After a step back of the clock, several stretches may
-        contain it; then the value belongs to the stretch in which it arrived.
+        A value belongs to the stretch that contains its stamp. After the clock has stepped back, several stretches may
+        contain the stamp; then the value belongs to the stretch in which it arrived.
         """
         at, _ = signal.series()
         if len(self.spans) < 2:
@@ -138,30 +138,30 @@ class Prediction:
         return self.present if self.present.rows > self.longest.rows else self.longest
 
     def series(self) -> tuple[NDArray[np.int64], dict[str, Array]]:
-        """Return stamps and columns of the longest stretch."""
+        """Return the stamps [ns] and the columns of the longest stretch."""
         stamps, columns = self._longer().series()
         return stamps, {name: columns[:, place] for place, name in enumerate(_COLUMNS)} if len(stamps) else {}
 
     @property
     def stride(self) -> int:
-        """Number n such that every n-th row of the longest stretch is kept."""
+        """The number n if only every n-th row of the longest stretch is stored."""
         return self._longer().stride
 
 
 @dataclass
 class Measured:
-    """Measured values by signal, in order of arrival."""
+    """Measured values of each signal, in order of arrival."""
 
     signals: dict[str, ThinnedSignal] = field(default_factory=dict)
-    #: stretch and stamp [ns] of the latest message by role
+    #: Stretch of the latest message of each role, and its newest stamp [ns] in this stretch.
     _latest: dict[str, tuple[int, int]] = field(default_factory=dict)
     implausible: int = 0
 
     def add(self, role: str, stamp_ns: int, numbers: Mapping[str, float], stretch: int = 0) -> None:
-        """Add the finite numbers of a message to a stretch."""
+        """Add the finite numbers of a message to the signals."""
         before, newest = self._latest.get(role, (0, stamp_ns))
         back = newest - stamp_ns > _STEP_NS
-        # the clock of the measurement may step back before that of the load and so begin the stretch earlier
+        # the clock of the measurement may step back before the clock of the load does: a new stretch then begins here
         stretch = max(stretch, before + back)
         self._latest[role] = stretch, stamp_ns if back else max(newest, stamp_ns)
         prefix = {"forces": "force_", "gaps": "gap_"}.get(role, "")
@@ -174,7 +174,7 @@ class Measured:
 
 @dataclass
 class Analysis:
-    """The analysis of a recording."""
+    """The result of an analysis of one recording."""
 
     path: Path
     kind: str
@@ -183,27 +183,27 @@ class Analysis:
     input: dict[str, int]
     losses: dict[str, int]
     unknown_types: dict[str, str]
-    #: times without samples, in which the load is interpolated linearly
+    #: Times without samples; during these times, the load is interpolated linearly.
     silences: Silences
     wall_s: float = 0.0
-    #: folders inside the recording that are empty or are recordings of their own
+    #: Folders inside the recording that were not analysed, because they are empty or are separate recordings.
     left_out: tuple[Path, ...] = ()
 
     @property
     def lossy(self) -> bool:
-        """Whether any data could not be read or used."""
+        """True if some data could not be read or used."""
         return bool(self.lost)
 
     @property
     def lost(self) -> dict[str, int]:
-        """Counts of lost data, including signals that lie entirely outside the time of the load."""
+        """Counts of lost data. A signal counts as lost if all its stamps lie outside the time of the load."""
         counts = ((self.predictions[0].outside(signal), signal.came) for signal in self.measured.signals.values())
         outside = sum(count for count, came in counts if count == came)
         found = {"measured_implausible": self.measured.implausible, "measured_outside_the_load": outside}
         return self.losses | {name: count for name, count in found.items() if count}
 
     def comparisons(self, prediction: Prediction) -> dict[str, Comparison]:
-        """Return the comparison of each measured signal with the prediction of one scene."""
+        """Compare each measured signal with the prediction of one scene."""
         stamps, columns = prediction.series()
         if not len(stamps):
             return {}
@@ -221,7 +221,7 @@ class Analysis:
         return found
 
     def facts(self) -> dict[str, Any]:
-        """Return all facts for JSON: the first prediction at the top level, the others under `with`."""
+        """Return the whole result for JSON: the first prediction at the top level, further predictions under `with`."""
         first, *others = self.predictions
         return {
             "run": str(self.path),
@@ -256,7 +256,7 @@ class Analysis:
         return facts if confusion is None else facts | {"contact_set_confusion": confusion}
 
     def _confusion(self, prediction: Prediction) -> dict[str, dict[str, int]] | None:
-        """Return by pair the counts of predicted against measured contact; None without measured forces."""
+        """Return for each pair how often contact was predicted and measured, or None without measured forces."""
         stamps, columns = prediction.series()
         found = {}
         for name in PAIR_NAMES:
@@ -299,19 +299,19 @@ def analyse(
     scene
         Scene file or preset; by default the scene of a run, or `scene.yaml` beside another recording.
     mapping, units
-        YAML file that maps topics to roles, and units by name (fx, x, ..., t) that replace those of the file.
+        YAML file that maps topics to roles, and a unit for each name (fx, x, ..., t) whose unit in the file is wrong.
     others
-        Further scenes for predictions.
+        Further scenes, for each of which the motion is predicted too.
     out
-        Folder in which a run named `run` is made from a recording of another program.
+        Folder in which a recording of another program is converted to a run named `run`.
     tail, on_caught_up
-        With a `Tail`, a run is read while it is still being written. `on_caught_up` gets the analysis so far each time
-        when everything written has been read.
+        A `Tail` reads a run while it is still being written. Whenever all data written so far have been read,
+        `on_caught_up` receives the intermediate result.
 
     Raises
     ------
     RecordingError, SceneError
-        The recording, the mapping or a scene cannot be used, or (`UnitError`) a unit seems wrong.
+        The recording, the mapping or a scene cannot be used, or a unit seems wrong (`UnitError`).
     """
     begin = time.perf_counter()
     if not path.exists():
@@ -413,7 +413,7 @@ def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measu
                 measured.add(name, *found)
         unknown |= source.losses.unknown_types
         for name, count in source.losses.counts.items():
-            # the run itself counts the other losses of its folder
+            # the reader of the run already counts all other losses in its folder
             if count and (name == "undecodable" or number >= len(places)):
                 unused[name] += count
     return measured, unknown, unused

@@ -1,4 +1,4 @@
-"""Loads of the contacts, summed batch by batch: impacts, forces, duty, cycles, energy, and forces along the face."""
+"""Loads of the contacts, summed batch by batch: impacts, forces, contact times, load cycles, and dissipated energy."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ _IN_MEMORY: Final = 2**20
 
 @dataclass
 class Pass:
-    """One pass along the face, from one reversal of the travel to the next.
+    """A motion along the face in one direction, from one reversal of the travel to the next.
 
-    Times are in s since the first stamp, positions along the face in m, energy in J.
+    Times are in s since the first stamp, positions along the face in m, energies in J.
     """
 
     start_s: float
@@ -43,7 +43,7 @@ class Pass:
 
 
 class Series:
-    """A series of any length. Beyond `_IN_MEMORY`, it is kept on the disk."""
+    """A series of any length, which is stored in memory up to `_IN_MEMORY` and on the disk beyond."""
 
     def __init__(self) -> None:
         self._file = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115 (goes with this object)
@@ -51,13 +51,13 @@ class Series:
         self.low, self.high, self.last = math.inf, -math.inf, math.nan
 
     def __iter__(self) -> Iterator[float]:
-        """Yield the numbers; no number may be added meanwhile."""
+        """Yield the numbers. No number may be added during the iteration."""
         self._file.seek(0)
         while block := self._file.read(_IN_MEMORY):
             yield from np.frombuffer(block).tolist()
 
     def add(self, values: Array) -> None:
-        """Add numbers, at least one, at the end."""
+        """Append at least one number, shape (n,)."""
         self._file.seek(0, 2)
         self._file.write(values.astype(np.float64).tobytes())
         self.low, self.high = min(self.low, float(values.min())), max(self.high, float(values.max()))
@@ -66,7 +66,7 @@ class Series:
 
 @dataclass
 class LoadTotals:
-    """Sums over a run."""
+    """Sums over all rows of a run."""
 
     scene: Scene
     duration_s: float = 0.0
@@ -77,27 +77,27 @@ class LoadTotals:
     contact_loss_j: float = 0.0
     sets: Counter[int] = field(default_factory=Counter)
     passes: list[Pass] = field(default_factory=list)
-    #: largest force by pass and piece of the face
+    #: Largest force [N], by index of the pass and of the piece of the face.
     face: dict[tuple[int, int], float] = field(default_factory=dict)
-    #: wear depth that the pads have gained [m], by direction of travel (0 forward, 1 backward)
+    #: Wear depth [m] that the pads have gained, by direction of travel (0 forward, 1 backward).
     pad_wear: Array = field(default_factory=lambda: np.zeros((2, PAIR_COUNT)))
-    #: wear depth of the slide at each pair [m], by direction and piece of the face
+    #: Wear depth [m] of the slide at each pair, by direction of travel and piece of the face.
     slide_wear: dict[tuple[int, int], Array] = field(default_factory=dict)
     _first_ns: int | None = None
-    #: stamp [ns], load, pose, rates and penetrations of the last row
+    #: Stamp [ns], load, pose, velocities and penetrations of the last row.
     _last: tuple[int, Array, Array, Array, Array] | None = None
-    #: wear depth of the pads after the last row [m]
+    #: Wear depth [m] of the pads after the last row.
     _worn: Array | None = None
     _place_m: float = 0.0
     _direction: float = 0.0
     _reversals: list[Series] = field(default_factory=lambda: [Series() for _ in range(PAIR_COUNT)])
 
     def restart(self) -> None:
-        """Continue after a reset; the interval across the reset does not count."""
+        """Continue after a reset. The interval across the reset is not counted."""
         self._last = self._worn = None
 
     def add(self, walked: Walked) -> None:
-        """Add a batch of advances."""
+        """Add a batch of computed rows."""
         self.scene = walked.scene
         rows, stamps = walked.rows, walked.stamp_ns
         self._first_ns = int(stamps[0]) if self._first_ns is None else self._first_ns
@@ -115,7 +115,7 @@ class LoadTotals:
             self.sets[int(mask)] += int(count)
         for pair, kept in enumerate(self._reversals):
             turning = reversals(rows.peak[:, pair])
-            if turning.any() or kept.last != 0.0:  # during a long time without contact, one zero is kept
+            if turning.any() or kept.last != 0.0:  # one zero is enough for a long time without contact
                 kept.add(turning)
         loss = self._contact_loss(walked, steps)
         self.contact_loss_j += float(loss.sum())
@@ -124,9 +124,10 @@ class LoadTotals:
         self._last = (int(stamps[-1]), *(column[-1].copy() for column in last))
 
     def _contact_loss(self, walked: Walked, steps: Array) -> Array:
-        """Return the energy [J] that contacts dissipate between rows: work of the load minus energy gained.
+        """Return the energy [J] that the contacts dissipate between rows: the work of the load minus the gain in
+        energy.
 
-        The work of the load between two rows is their mean load times the displacement.
+        The work of the load between two rows is the mean load of the two rows times the displacement.
         """
         now = walked.wrench, walked.rows.q, walked.rows.v, walked.rows.penetration
         first = (column[0] for column in now) if self._last is None else self._last[1:]
@@ -136,10 +137,9 @@ class LoadTotals:
         return np.where(steps > 0.0, work - gain, 0.0)
 
     def _energy(self, q: Array, v: Array, penetration: Array) -> Array:
-        """Return kinetic energy, potential energy in gravity, and elastic energy of the contacts [J]."""
         head, gravity = self.scene.head, self.scene.gravity
         theta, omega = q[:, 2], v[:, 2]
-        # from the centre of the cavity to the centre of mass, in world axes
+        # vector from the centre of the cavity to the centre of mass, in world axes
         along = np.cos(theta) * head.com_offset_m[0] - np.sin(theta) * head.com_offset_m[1]
         up = np.sin(theta) * head.com_offset_m[0] + np.cos(theta) * head.com_offset_m[1]
         speed_2 = (v[:, 0] - omega * up) ** 2 + (v[:, 1] + omega * along) ** 2
@@ -173,9 +173,10 @@ class LoadTotals:
         self._worn = walked.rows.wear_depth[-1].copy()
 
     def _wear(self, depth: Array, speed: float, pieces: NDArray[np.int64]) -> None:
-        """Add the wear of the pads and of the pieces of the slide that they pass.
+        """Add the wear of the pads, and the wear of the pieces of the slide that the pads pass.
 
-        A pad wears over the whole distance travelled, a place of the slide only while the length of a pad passes it.
+        A pad wears over the whole distance travelled. A point of the slide wears only while the length of a pad passes
+        it.
         """
         wear = self.scene.wear
         if wear is None or wear.coefficient_m2_n == 0.0:
@@ -191,7 +192,7 @@ class LoadTotals:
             self.slide_wear[key] = self.slide_wear.get(key, 0.0) + share * gained[pieces == piece].sum(axis=0)
 
     def wear_facts(self) -> dict[str, Any] | None:
-        """Return the wear for JSON, depths in m; None without wear."""
+        """Return the wear depths [m] for JSON, or None without wear."""
         if not self.pad_wear.any():
             return None
         pads = {
@@ -202,13 +203,14 @@ class LoadTotals:
         if self.slide_wear:
             pieces = {piece for _, piece in self.slide_wear}
             total = np.sum(list(self.slide_wear.values()), axis=0) / len(pieces)
-            # mean over the face: the wear of the pads times a pad's length over the face's length
+            # the mean over the face equals the wear of the pads times the length of a pad, divided by the length of the
+            # face
             out["slide_mean_m"] = dict(zip(PAIR_NAMES, total.tolist(), strict=True))
             out["slide_pieces"] = len(pieces)
         return out
 
     def cycles(self) -> dict[str, list[dict[str, float]]]:
-        """Return rainflow counts of each pair's force (ASTM E1049): upper end [N] and count of each bin."""
+        """Return the rainflow counts (ASTM E1049) of each pair's force: upper end [N] and count of each bin."""
         import rainflow
 
         found = {}
@@ -219,7 +221,7 @@ class LoadTotals:
         return found
 
     def facts(self) -> dict[str, Any]:
-        """Return the sums for JSON."""
+        """Return all sums for JSON."""
         total = max(1, self.sets.total())
         return {
             "duration_s": self.duration_s,

@@ -1,4 +1,4 @@
-"""Analysis of many recordings on several cores or on a Dask cluster; no result is lost when a worker dies."""
+"""Analysis of many recordings on several cores or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from plow_twin.model.law_modules import load_laws, loaded_laws
 from plow_twin.study.analysis.task import RunTask, run_task
 from plow_twin.study.cluster import completed, connect
 
-#: Function that gets the share of the recordings done, 0..1.
+#: Callback that receives the share of the recordings done, 0..1.
 OnProgress = Callable[[float], object]
 _OnDone = Callable[[int, dict[str, Any]], object]
 
@@ -24,11 +24,10 @@ _OnDone = Callable[[int, dict[str, Any]], object]
 def run_many(
     tasks: Sequence[RunTask], *, workers: int, dask: str | None = None, on_progress: OnProgress = lambda share: None
 ) -> list[dict[str, Any]]:
-    """Return the facts of each task, or an `error` if the task failed. Tasks with stored facts do not run again.
+    """Return the result of each task, or a mapping with the key `error` if the task failed.
 
-    The tasks run in `workers` processes, or on the Dask cluster with the scheduler at `dask`, whose workers must have
-    access to the same files.
-
+    A task with a stored result does not run again. The tasks run in `workers` processes, or on the Dask cluster with
+    the scheduler at `dask`. The workers of the cluster must have access to the same files.
     Raises
     ------
     StudyError
@@ -51,7 +50,8 @@ def run_many(
 def _here(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> None:
     while waiting:
         left = _round(tasks, waiting, workers, done)
-        if len(left) == len(waiting):  # a task has killed its worker; to find this task, the first tasks run one by one
+        # a task has killed its worker: the first tasks run one at a time until this task is found
+        if len(left) == len(waiting):
             left, first = left[workers:], left[:workers]
             for number in first:
                 if _round(tasks, [number], 1, done):
@@ -60,7 +60,7 @@ def _here(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnD
 
 
 def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> list[int]:
-    """Run the waiting tasks once; return the tasks that a dying worker left unfinished."""
+    """Run the waiting tasks once. Return the tasks that are unfinished because their worker died."""
     left = []
     others = active_children()
     pool = ProcessPoolExecutor(min(workers, len(waiting)), get_context("spawn"), _begin, (loaded_laws(),))
@@ -86,7 +86,7 @@ def _begin(laws: tuple[str, ...]) -> None:
 
 
 def _belong_to_the_caller() -> None:
-    """Leave interrupts to the caller, and end this process when the caller ends."""
+    """Ignore interrupts, which the calling process handles, and end this process when the calling process ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
     assert parent is not None

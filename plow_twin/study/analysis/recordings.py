@@ -1,4 +1,4 @@
-"""The recordings at the paths that a user gives, each once."""
+"""Search for the recordings at the paths that a user gives, without repetitions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _holds(folder: Path, kinds: Sequence[str] = _KINDS) -> bool:
 
 
 def _is_recording(folder: Path, results: Sequence[Path]) -> bool:
-    """Return whether a folder is one recording: it has the parts of a recording, or files but no folder with a run."""
+    """Return whether a folder is one recording: it contains parts of a recording, or files but no folder with a run."""
     if not _holds(folder):
         return False
     if (folder / "metadata.yaml").is_file() or any(folder.glob(f"{glob.escape(folder.name)}_*")):
@@ -33,7 +33,8 @@ def _is_recording(folder: Path, results: Sequence[Path]) -> bool:
 
 
 def left_out(path: Path, results: Sequence[Path] = ()) -> list[Path]:
-    """Return the items that `expand` leaves out: empty folders, tables beside runs, and runs inside other runs."""
+    """Return the items in a folder that `expand` omits: empty folders, tables beside runs, and runs inside other runs.
+    """
     if not path.is_dir():
         return []
     folders = [item for item in sorted(path.iterdir()) if item.is_dir()]
@@ -44,10 +45,9 @@ def left_out(path: Path, results: Sequence[Path] = ()) -> list[Path]:
 
 
 def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
-    """Return the recordings at some paths and in the folders among them.
+    """Return the recordings at the given paths, and those directly inside the given folders.
 
-    `results` are folders with results of an earlier analysis, which are not recordings.
-
+    The folders `results` contain results of an earlier analysis and are not recordings.
     Raises
     ------
     RecordingError
@@ -61,10 +61,10 @@ def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
         inside = [
             item
             for item in sorted(path.iterdir())
-            # a recording with missing parts counts too; its analysis names the missing parts
+            # a recording with missing parts is included; its analysis names the missing parts
             if item.suffix in (".mcap", ".db3") or _holds(item) or (item / "metadata.yaml").is_file()
         ]
-        # a table beside recordings is assumed to be a result of an analysis
+        # a table beside recordings is probably a result of an analysis
         if not inside and any(path.glob(f"*{SUFFIX}")):
             inside = [path]
         if not inside:
@@ -74,7 +74,7 @@ def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
 
 
 def counted_once(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
-    """Return the recordings without repetitions of a path or a run, and a sentence for each repetition."""
+    """Return the recordings without repetitions, and a sentence for each repetition of a path or a run."""
     kept: dict[object, Path] = {}
     left: list[str] = []
     for path in paths:
@@ -90,7 +90,9 @@ def counted_once(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
 
 
 def _identity(path: Path) -> object:
-    """Return the random id and the part number of a run, or the path of another recording."""
+    """Return a key that is equal for two copies of a recording: the random id and part number of a run, or else the
+    path.
+    """
     try:
         header = read_header(mcap_path(path))
     except (RecordingError, OSError):  # the analysis reports the error

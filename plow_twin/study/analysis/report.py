@@ -1,4 +1,4 @@
-"""The result of an analysis as files: `report.html`, `analysis.json` and Parquet tables."""
+"""The files of an analysis: `report.html`, `analysis.json` and Parquet tables."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LEFT_OUT: Final = "left out: no recording"
 
 
 def write_report(found: Analysis, out: Path) -> None:
-    """Write all files of an analysis into the folder `out`; a disk error names the file."""
+    """Write all files of an analysis into the folder `out`. An error of the disk names the file."""
     with naming(out):
         out.mkdir(parents=True, exist_ok=True)
         facts = found.facts()
@@ -123,7 +123,8 @@ def _picture(found: Analysis) -> str:
 
 
 def write_table_of_runs(rows: list[dict[str, Any]], out: Path, left_out: Sequence[Path] = ()) -> None:
-    """Write `runs.parquet`: a row for each recording, and for each folder left out a row with the reason."""
+    """Write `runs.parquet`, with a row for each recording, and a row with the reason for each folder that was left out.
+    """
     flat = []
     for facts in [*rows, *({"run": str(path), "error": LEFT_OUT} for path in left_out)]:
         lost = sum(facts["lost"].values()) if "lost" in facts else None

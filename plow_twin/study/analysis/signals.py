@@ -1,4 +1,4 @@
-"""Comparison of a predicted and a measured signal: bias, RMS, correlation, lag and coherence."""
+"""Comparison of a predicted signal with a measured signal: bias, RMS, correlation, lag and coherence."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Largest lag [s]; a longer lag resembles a shift by a period of the load.
+#: Largest lag [s] of the search. Larger lags come close to a period of the load, at which signals are similar again.
 LARGEST_LAG_S: Final = 1.0
 _FEWEST: Final = 8
 _MOST_POINTS: Final = 400_000
@@ -19,29 +19,32 @@ _MOST_POINTS: Final = 400_000
 
 @dataclass(frozen=True)
 class Comparison:
-    """Comparison of a signal: predicted minus measured."""
+    """Result of a comparison. Differences are predicted minus measured."""
 
     n: int
-    #: mean and root mean square of the difference at equal stamps
+    #: Mean and root mean square of the difference at equal stamps.
     bias: float
     rms: float
-    #: Pearson's correlation at equal stamps; None if a signal does not change
+    #: Pearson's correlation at equal stamps, or None if a signal is constant.
     correlation: float | None
-    #: lag of the measurement behind the prediction at which the correlation is largest [s]
+    #: Lag [s] of the measurement behind the prediction with the largest correlation.
     lag_s: float | None
-    #: standard deviation of the difference at this lag
+    #: Standard deviation of the difference at the lag `lag_s`.
     rms_aligned: float | None
-    #: magnitude-squared coherence at the strongest frequency of the prediction
+    #: Magnitude-squared coherence at the strongest frequency of the prediction.
     coherence: float | None
 
 
 def signal_unit(name: str) -> str:
-    """Return the unit of a signal."""
+    """Return the unit of a signal, given its name."""
     return "N" if name.startswith("force_") else "rad" if name == "theta" else "m"
 
 
 def compare(t: Array, predicted: Array, t_measured: Array, measured: Array) -> Comparison | None:
-    """Compare a prediction (n,) at rising times t with measured values (m,); None for too few values."""
+    """Compare a prediction, shape (n,), at increasing times `t` with measured values, shape (m,).
+
+    The result is None if there are too few values.
+    """
     inside = (t_measured >= t[0]) & (t_measured <= t[-1]) & np.isfinite(measured) if len(t) else np.zeros(0, bool)
     if inside.sum() < _FEWEST:
         return None
@@ -66,25 +69,24 @@ def _correlation(one: Array, other: Array) -> float | None:
         return None
     one, other = one - one.mean(), other - other.mean()
     size = math.sqrt(float(one @ one) * float(other @ other))
-    # rounding could give more than 1
+    # rounding errors could give a magnitude above 1
     return min(1.0, max(-1.0, float(one @ other) / size)) if size > 1e-300 else None
 
 
 def _at(times: Array, t: Array, predicted: Array) -> Array:
-    """Return the prediction at some times, NaN outside its own time."""
+    """Interpolate the prediction at the given times; it is NaN outside the time range of the prediction."""
     return np.interp(times, t, predicted, left=math.nan, right=math.nan)
 
 
 def _step(times: Array, span: float) -> float:
-    """Return the step of the grid [s]."""
     return max(float(np.median(np.diff(np.unique(times)))), span / _MOST_POINTS, 1e-6)
 
 
 def _correlations(longer: Array, shorter: Array) -> Array:
     """Return Pearson's correlation of a series with each equally long piece of a longer series.
 
-    The longer series has NaN outside one contiguous part. The result is -1 for a piece with too few numbers of this
-    part.
+    The longer series is finite in one contiguous part and NaN outside. The result is -1 for a piece with too few finite
+    numbers.
     """
     from scipy.signal import correlate
 
@@ -106,14 +108,14 @@ def _correlations(longer: Array, shorter: Array) -> Array:
     square_one = sums(one**2, low + begin, high + begin) - count * mean_one**2
     square_other = sums(other**2, low, high) - count * mean_other**2
     product = correlate(one, other, mode="valid", method="fft") - count * mean_one * mean_other
-    # the deviations of a constant piece from its mean are rounding errors, so it has no correlation
+    # in a constant piece, the deviations from the mean are rounding errors, so no correlation is defined
     enough = (high - low >= _FEWEST) & (square_one > 1e-12 * (one @ one)) & (square_other > 1e-12 * (other @ other))
     size = np.sqrt(np.where(enough, square_one * square_other, 1.0))
     return np.where(enough, product / size, -1.0)
 
 
 def _lag(t: Array, predicted: Array, times: Array, values: Array) -> float | None:
-    """Return the lag with the largest correlation, searched on a grid and then refined."""
+    """Return the lag [s] with the largest correlation, searched on a grid and then refined."""
     from scipy.optimize import minimize_scalar
 
     span = float(times[-1] - times[0])

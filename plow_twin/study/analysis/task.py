@@ -1,4 +1,4 @@
-"""One analysis with its files, as a task that another process can run."""
+"""One analysis with its files, as a task that can run in another process."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from plow_twin.scene_file.presets import scene_path
 from plow_twin.study.analysis.analyse import MAPPED_LOAD, OnProgress, analyse
 from plow_twin.study.analysis.report import write_report
 
-#: File with the inputs of an analysis, written last: only a complete analysis has it.
+#: File with the inputs of an analysis. It is written last, so that it exists only if the analysis is complete.
 _ASKED: Final = "asked.json"
 _FILES: Final = (_ASKED, "analysis.json", "report.html", "measured.parquet")
-#: Names of the tables; those of further scenes end in a number.
+#: Names of the tables. The names of tables of further scenes end in a number.
 _TABLE: Final = re.compile(r"(predicted|clearance|face|slide_wear)(_\d+)?\.parquet")
 
 
 def names_apart(paths: Sequence[Path]) -> list[str]:
-    """Return for each recording the shortest end of its path that distinguishes it from the others."""
+    """Return for each recording the shortest end of its path that differs from the ends of all other paths."""
     whole = [path.absolute() for path in paths]
     stems = Counter(path if path.is_dir() else path.with_suffix("") for path in whole)
     parts = [
@@ -51,30 +51,30 @@ class RunTask(Protocol):
 
     @property
     def path(self) -> Path:
-        """The recording."""
+        """Path of the recording."""
 
     def stored(self) -> dict[str, Any] | None:
-        """Return the facts if the same work was done before, otherwise None."""
+        """Return the stored result of an earlier, identical task, or None."""
 
     def run(self) -> dict[str, Any]:
-        """Return the facts."""
+        """Do the work and return its result."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """One analysis."""
+    """Analysis of one recording."""
 
     path: Path
     scene: Path | None
     mapping: Path | None
     others: tuple[Path, ...]
     out: Path | None
-    #: items in the folder of the recording that are not analysed
+    #: Items in the folder of the recording that are not analysed.
     left_out: tuple[Path, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
 
     def stored(self) -> dict[str, Any] | None:
-        """Return the facts of an earlier, complete analysis of the same inputs, otherwise None."""
+        """Return the result of an earlier, complete analysis of the same inputs, or None."""
         if self.out is None:
             return None
         try:
@@ -85,7 +85,7 @@ class Task:
         return {**facts, "lossy": bool(facts["lost"])} if asked == self._asked() else None
 
     def clear(self, inputs: Sequence[Path] = ()) -> None:
-        """Remove the files of an earlier analysis, but not a run that a twin has recorded.
+        """Remove the files of an earlier analysis. A run that a twin has recorded is not removed.
 
         Raises
         ------
@@ -105,7 +105,7 @@ class Task:
         self._keep(self._old(), inputs)
 
     def _old(self) -> list[Path]:
-        """Return the files of an earlier analysis, first the one that marks it as complete."""
+        """Return the files of an earlier analysis; the first file is the file that marks the analysis as complete."""
         if self.out is None or not self.out.is_dir():
             return []
         found = sorted(path for path in self.out.iterdir() if path.name in _FILES or _TABLE.fullmatch(path.name))
@@ -125,9 +125,9 @@ class Task:
         return [self.path, *(path for path in (self.scene, self.mapping, *self.others) if path is not None)]
 
     def run(self, on_progress: OnProgress = lambda share: None) -> dict[str, Any]:
-        """Return the facts of the analysis and write its files, or raise a `PlowTwinError`."""
+        """Do the analysis, write its files and return its result, or raise a `PlowTwinError`."""
         self.clear()
-        asked = self._asked()  # before the analysis, because files may change while it runs
+        asked = self._asked()  # the files may change during the analysis
         found = analyse(
             self.path,
             scene=self.scene,
@@ -144,13 +144,13 @@ class Task:
         return {**found.facts(), "lossy": found.lossy}
 
     def _asked(self) -> dict[str, Any]:
-        """Return the inputs on which the result depends: recording, files beside it, scenes, mapping and units."""
+        """Return the inputs that determine the result: the recording, files beside it, scenes, mapping and units."""
         folder = self.path if self.path.is_dir() else self.path.parent
         parts = [*sorted(folder.glob("*.mcap")), *beside_folders(folder)]
         beside = folder / "scene.yaml" if self.scene is None else None
         return {
             "run": _state(self.path, self.out),
-            # the other parts, and folders beside a part, may have measurements
+            # the other parts, and folders beside a part, may contain measurements
             "parts": [] if self.path.is_dir() else [_state(path, self.out) for path in parts],
             "scene": _scene_state(self.scene),
             "scene_beside": _scene_state(beside) if beside is not None and beside.is_file() else None,
@@ -166,19 +166,19 @@ def _is_ours(file: Path) -> bool:
         return True
     if not re.fullmatch(r"run_\d+\.mcap", file.name):
         return False
-    if file.stat().st_size == 0:  # the process was killed before the first byte
+    if file.stat().st_size == 0:  # the process was killed before it wrote the first byte
         return True
     try:
         header = read_header(file)
         if header is None and next(iter(ChunkReader(file)), None) is None:
-            return True  # the process was killed before the header
+            return True  # the process was killed before it wrote the header
     except RecordingError:
         return False
     return header is not None and MAPPED_LOAD in header.parameters
 
 
 def _state(path: Path, out: Path | None) -> list[Any]:
-    """Return names, sizes and times of a file, or of the files in a folder except the results in `out`."""
+    """Return the names, sizes and times of a file, or of all files in a folder except the results in `out`."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
     if out is not None and out.resolve().is_relative_to(path.resolve()):
         results = out.resolve()
@@ -193,7 +193,7 @@ def _is_result(file: Path, out: Path) -> bool:
 
 
 def _scene_state(scene: Path | None) -> list[str] | None:
-    """Return the name of a scene and the digest of its contents."""
+    """Return the name of a scene and a hash of its contents."""
     if scene is None:
         return None
     try:
@@ -204,7 +204,7 @@ def _scene_state(scene: Path | None) -> list[str] | None:
 
 
 def run_task(task: RunTask) -> dict[str, Any]:
-    """Return the facts of one task, or `error` if it failed."""
+    """Return the result of a task, or a mapping with the key `error` if the task failed."""
     try:
         return task.run()
     except PlowTwinError as error:

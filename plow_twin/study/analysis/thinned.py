@@ -1,4 +1,4 @@
-"""Series in bounded memory: a series that is too long keeps every 2nd row, then every 4th, and so on."""
+"""Series in bounded memory. Of a long series, only every 2nd row is stored, then only every 4th row, and so on."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Largest number of kept rows: 150 MB of a prediction, 16 MB of a measured signal.
+#: Largest number of stored rows: 150 MB for a prediction, 16 MB for a measured signal.
 MOST_ROWS: Final = 1_000_000
 
 
 class Thinned:
-    """Rows of several columns with their stamps. Of `rows` received, one in `stride` is kept."""
+    """Rows of several columns with their stamps. Of the received rows, every `stride`-th row is stored."""
 
     def __init__(self, columns: int) -> None:
         self._stamps: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
@@ -24,7 +24,7 @@ class Thinned:
         self.stride = 1
 
     def add(self, stamp_ns: NDArray[np.int64], values: Array) -> None:
-        """Add rows, shapes (n,) and (n, columns)."""
+        """Add stamps [ns], shape (n,), and rows, shape (n, columns)."""
         chosen = slice(-self.rows % self.stride, None, self.stride)
         self._stamps.append(stamp_ns[chosen].copy())
         self._values.append(values[chosen].copy())
@@ -36,20 +36,19 @@ class Thinned:
             self._kept, self.stride = len(self._stamps[0]), 2 * self.stride
 
     def series(self) -> tuple[NDArray[np.int64], Array]:
-        """Return the stamps [ns] and the kept rows, shapes (m,) and (m, columns)."""
+        """Return the stamps [ns], shape (m,), and the stored rows, shape (m, columns)."""
         self._stamps, self._values = [np.concatenate(self._stamps)], [np.concatenate(self._values)]
         return self._stamps[0], self._values[0]
 
 
 class ThinnedSignal:
-    """Single values with their stamps and the number of the stretch in which each arrived."""
+    """Single values, each with its stamp and the number of the stretch in which it arrived."""
 
     def __init__(self) -> None:
         self._stamps, self._values, self._stretches = array("q"), array("d"), array("I")
         self._came, self._stride = 0, 1
 
     def add(self, stamp_ns: int, value: float, stretch: int = 0) -> None:
-        """Add a value."""
         if self._came % self._stride == 0:
             self._stamps.append(stamp_ns)
             self._values.append(value)
@@ -61,13 +60,13 @@ class ThinnedSignal:
 
     @property
     def came(self) -> int:
-        """Number of values received, kept or not."""
+        """Number of values received, including the values that are not stored."""
         return self._came
 
     def series(self) -> tuple[NDArray[np.int64], Array]:
-        """Return the stamps [ns] and the kept values, shape (m,) each."""
+        """Return the stamps [ns] and the stored values, shape (m,) each."""
         return np.array(self._stamps, np.int64), np.array(self._values)
 
     def stretches(self) -> NDArray[np.int64]:
-        """Return the stretch of each kept value, shape (m,)."""
+        """Return the stretch of each stored value, shape (m,)."""
         return np.array(self._stretches, np.int64)

@@ -1,1 +1,1 @@
-"""Fit of a scene's unknown parameters to published figures or to a recording."""
+"""Fit of the unknown parameters of a scene to published figures or to a recording."""

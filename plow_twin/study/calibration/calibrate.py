@@ -1,11 +1,19 @@
-"""Fit of a scene's unknowns to an objective by independent starts, each of which searches globally, then locally.
+"""Fit of the unknown parameters of a scene by global and local minimisation of an objective.
 
-A start has three stages. (1) `screen` random points of the unit cube are evaluated; the best of them are the first
-population of (2) a differential evolution (Storn and Price, J. Global Optim. 11 (1997) 341; scipy), in which each
-generation is one ensemble of runs. (3) The best point is polished in the unknowns that have a range, by least squares
-(trust region reflective, scipy) with a finite-difference Jacobian from one ensemble. For residuals with kinks, the
-simplex of Nelder and Mead follows. Every start has its own random generator, so a seed gives the same bits with any
-number of threads.
+The fit consists of independent starts. Each start has three stages:
+
+1. The objective is evaluated at `screen` random points of the unit cube. 2. The best of these points are the first
+population of a differential evolution (scipy). Each generation is one
+   ensemble of runs.
+3. The best point is improved by least squares in all unknowns that have a range (trust region reflective, scipy). One
+   ensemble gives the finite-difference Jacobian. A Nelder-Mead simplex follows if `Search.simplex` is positive, because
+   least squares may stop at a kink of the residuals.
+
+Every start has its own random generator. A seed therefore gives bit-identical results with any number of threads.
+
+References
+----------
+Storn, Price (1997), Differential evolution, J. Global Optim. 11, 341.
 """
 
 from __future__ import annotations
@@ -21,26 +29,28 @@ from plow_twin.study.calibration.unknowns import Space
 from plow_twin.study.parameters import Value
 
 Array = NDArray[np.float64]
-#: Function that gets the share of the work done, 0..1, and the best objective so far.
+#: Callback that receives the share of the work done, 0..1, and the smallest objective so far.
 OnProgress = Callable[[float, float], object]
 
 
 @dataclass(frozen=True)
 class Search:
-    """Effort of one start: numbers of screened points, members, generations and simplex evaluations."""
+    """Effort of one start: numbers of screened points, population members, generations and simplex evaluations."""
 
     screen: int = 200
     population: int = 30
     generations: int = 40
     simplex: int = 0
-    #: spread of the population's objectives, relative to their mean, at which the evolution ends
+    #: The evolution ends when the standard deviation of the population's objectives, relative to their mean, is below
+    #: this number.
     spread: float = 1e-3
     step: float = 1e-6
 
 
 @dataclass(frozen=True)
 class Start:
-    """Result of a start: point in the cube, values of the unknowns, objective before and after polishing."""
+    """Result of a start: its point in the cube, the values of the unknowns, and the objective before and after stage 3.
+    """
 
     number: int
     point: Array
@@ -52,12 +62,12 @@ class Start:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The result of a calibration; the best start comes first."""
+    """Result of a calibration. The starts are sorted by objective, the best start first."""
 
     starts: tuple[Start, ...]
     seed: int
     runs: int
-    #: the last populations, whose points may fit almost as well as the best point
+    #: The final populations of all starts, which show other points that fit almost as well.
     population: Array = field(repr=False)
     population_objective: Array = field(repr=False)
 
@@ -79,8 +89,8 @@ def calibrate(
 ) -> Calibration:
     """Minimise the objective over the space from independent random starts.
 
-    `first` is a point for the first population of the first start, such as the given scene. `on_progress` is called
-    after every generation.
+    The first population of the first start contains the point `first`, for example the point of the given scene.
+    `on_progress` is called after every generation.
     """
     search = search or Search()
     done: list[Start] = []
@@ -96,7 +106,7 @@ def calibrate(
         points, values = _evolve(space, objective, rng, search, known, report)
         point, best = _polish(space, objective, points[np.argmin(values)], search)
         populations.append((points, values))
-        # polishing may not have improved the best point
+        # least squares may end at a larger objective than its start
         if values.min() < best:
             point, best = points[np.argmin(values)], float(values.min())
         point = space.settled(point)
@@ -130,7 +140,7 @@ def _evolve(
     cut, generation = float(values.max()), [0]
 
     def evaluate(columns: Array) -> Array:
-        # a trial that is worse than the whole population is never accepted
+        # the evolution never accepts a trial that is worse than the whole population
         return _sums(objective.residuals(space.values_of(np.atleast_2d(columns.T)), cut))
 
     def after(intermediate_result: object) -> None:
@@ -146,7 +156,7 @@ def _evolve(
 
 
 def _screened(space: Space, objective: Objective, points: Array, keep: int) -> Array:
-    """Return the objective of every point; only points that can be among the best `keep` are run to the end."""
+    """Return the objective of every point. A run may stop early if its point cannot be among the best `keep` points."""
     batch = max(keep, 64)
     values = np.zeros(0)
     for begin in range(0, len(points), batch):
@@ -157,7 +167,7 @@ def _screened(space: Space, objective: Objective, points: Array, keep: int) -> A
 
 
 def _polish(space: Space, objective: Objective, point: Array, search: Search) -> tuple[Array, float]:
-    """Improve a point in its continuous unknowns; return the new point and its objective."""
+    """Improve a point in the unknowns that have a range. Return the new point and its objective."""
     from scipy.optimize import least_squares, minimize
 
     free = space.continuous
@@ -188,9 +198,9 @@ def _polish(space: Space, objective: Objective, point: Array, search: Search) ->
 
 
 def jacobian(space: Space, objective: Objective, point: Array, step: float) -> Array:
-    """Return the Jacobian of the residuals in the unit cube, shape (r, n); columns of choices are zero.
+    """Return the Jacobian of the residuals in the unit cube, shape (r, n). The columns of choices are zero.
 
-    The differences are central, but one-sided at the walls of the cube.
+    Differences are central in the interior of the cube and one-sided at its faces.
     """
     free = space.continuous
     moved = np.repeat(point[None], 2 * free.size, axis=0)
@@ -211,5 +221,5 @@ def objective_of(objective: Objective, values: Mapping[str, Value]) -> float:
 
 
 def _sums(residuals: Array) -> Array:
-    """Return the objective of each row of residuals, the sum of their squares."""
+    """Return the sum of squares of each row of residuals."""
     return np.asarray((residuals**2).sum(axis=1))

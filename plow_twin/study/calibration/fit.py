@@ -1,4 +1,4 @@
-"""Results of a calibration as tables and files: the fitted scene, the targets, and the uniqueness of the fit."""
+"""Results of a calibration: the fitted scene, the comparison with the targets, and the uniqueness of the fit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _NOT_NUMBERS: Final = ("sign", "scale", "labels", "law", "rotation")
 
 @dataclass(frozen=True)
 class TargetRow:
-    """One target at the best fit."""
+    """A target and the statistics of the best fit."""
 
     name: str
     kind: str
@@ -39,9 +39,9 @@ class TargetRow:
 
 
 def fitted_scene(scene: Scene, values: Mapping[str, Value], source: str) -> Scene:
-    """Return the scene with the fitted values; every number that they change is marked as reconstructed.
+    """Return the scene with the fitted values. Every number that the fit has changed is marked as reconstructed.
 
-    A number whose sign alone has changed keeps the source of its size.
+    If only the sign of a number has changed, the source of its magnitude is kept in the mark.
     """
     fit = with_parameters(scene, values)
     marks = dict(fit.marks)
@@ -76,7 +76,7 @@ def _number_at(scene: Scene, key: str) -> Any:
 
 
 def target_rows(objective: TargetObjective, values: Mapping[str, Value]) -> list[TargetRow]:
-    """Return every target with the values of the candidate."""
+    """Return a row for every target, with the statistics of the candidate `values`."""
     numbers, paths = objective.table(values)
     settings = list(objective.targets.settings)
     rows = []
@@ -96,7 +96,7 @@ def target_rows(objective: TargetObjective, values: Mapping[str, Value]) -> list
 
 @dataclass(frozen=True)
 class Fit:
-    """The whole result of a calibration."""
+    """All results of a calibration."""
 
     scene: Scene
     calibration: Calibration
@@ -104,7 +104,7 @@ class Fit:
     source: str
     identifiability: Identifiability
     clusters: list[Cluster]
-    #: objective of the given scene, or None outside the ranges of the unknowns
+    #: Objective of the given scene, or None if the scene lies outside the ranges of the unknowns.
     before: float | None
     targets: list[TargetRow]
 
@@ -126,7 +126,7 @@ class Fit:
 
 
 def write_fit(fit: Fit, space: Space, arguments: Mapping[str, Any], folder: Path) -> None:
-    """Write fit.yaml (the fitted scene) and calibration.json (all other results)."""
+    """Write the fitted scene to `fit.yaml` and all other results to `calibration.json`."""
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / "fit.yaml", dump_scene(fit.scene).encode(), sync=True)
     content = json.dumps(fit.plain(space, arguments), indent=1).encode()

@@ -1,4 +1,4 @@
-"""Objectives of a calibration: the residuals of candidates, from targets or from a recorded motion.
+"""Objectives of a calibration: residuals from published figures, or from a recorded motion.
 
 A *candidate* is a set of values of the unknowns.
 """
@@ -29,19 +29,19 @@ Values = Mapping[str, Value]
 class Objective(Protocol):
     """A sum of squares to be minimised."""
 
-    #: number of simulation runs so far
+    #: Number of simulated runs so far.
     runs: int
 
     def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:
         """Return the weighted residuals of m candidates, shape (m, r).
 
-        A candidate need not be evaluated to the end if its objective surely exceeds `cut`.
+        The evaluation of a candidate may stop early if its objective certainly exceeds `cut`.
         """
 
 
 @dataclass
 class TargetObjective:
-    """Residuals of targets (`plow_twin.study.calibration.targets`)."""
+    """Differences from targets; `plow_twin.study.calibration.targets` defines the residuals."""
 
     scene: Scene
     targets: TargetSet
@@ -49,11 +49,12 @@ class TargetObjective:
     runs: int = 0
 
     def __post_init__(self) -> None:
-        # a candidate without marks is made in a third of the time
+        # without marks, a candidate is made in a third of the time
         self.scene = replace(self.scene, marks={})
 
     def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:
-        """Return residual times sqrt(weight) of every candidate and target, shape (m, targets)."""
+        """Return the residual times the square root of the weight, for every candidate and target, shape (m, targets).
+        """
         targets, settings = self.targets.targets, self.targets.settings
         paths = sorted({path for target in targets for path in target.paths})
         table = np.full((len(candidates), len(settings), len(paths)), np.nan)
@@ -66,12 +67,12 @@ class TargetObjective:
         return self._rows(table, paths, missing=FAILED_RESIDUAL)
 
     def unweighted(self, candidate: Values) -> Array:
-        """Return the residual of every target for one candidate, shape (targets,)."""
+        """Return the unweighted residual of every target for one candidate, shape (targets,)."""
         weights = np.sqrt([target.weight for target in self.targets.targets])
         return np.asarray(self.residuals([candidate])[0] / np.where(weights > 0.0, weights, 1.0))
 
     def table(self, candidate: Values) -> tuple[Array, list[str]]:
-        """Return the statistics of one candidate, shape (settings, paths), and their paths."""
+        """Return the statistics of one candidate, shape (settings, paths), and the paths."""
         paths = sorted({path for target in self.targets.targets for path in target.paths})
         table = np.full((1, len(self.targets.settings), len(paths)), np.nan)
         self._fill(table, [candidate], np.arange(1), list(range(len(self.targets.settings))), paths)
@@ -111,10 +112,11 @@ class TargetObjective:
 
 @dataclass
 class RecordingObjective:
-    """Distance from a recorded motion, (q - q recorded) / clearance at every row.
+    """Difference from a recorded motion: (q - recorded q) / clearance for every row and coordinate.
 
-    Angles are multiplied by the half diagonal, and rows divided by the square root of their number. The objective is
-    thus the mean square error of x, y and theta together, relative to the clearance of the scene before the fit.
+    Differences of the angle are multiplied by half the diagonal. Residuals are divided by the square root of their
+    number. The objective is thus a mean square error of x, y and theta, relative to the clearance of the scene before
+    the fit.
     """
 
     scene: Scene
@@ -127,7 +129,7 @@ class RecordingObjective:
         self.scene = replace(self.scene, marks={})
 
     def motion(self, candidate: Values) -> Array:
-        """Return the poses of a candidate at the recorded times, shape (n, 3)."""
+        """Return the simulated poses of a candidate at the recorded times, shape (n, 3)."""
         scene, recording = with_parameters(self.scene, candidate), self.recording
         members = simulate_many([scene], float(recording.t[-1]), recording.output_dt, self.tol, self.workers)
         return np.asarray(recording.sampled(members)[0])

@@ -1,4 +1,4 @@
-"""Picture of a calibration: fitted motion or figures, and near-optimal values of each unknown within its range."""
+"""Pictures of a calibration: the fit to a motion or to targets, and the near-optimal values of the unknowns."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from plow_twin.view.figures import signed, write_png
 from plow_twin.view.fitted import FittedPicture, FittedValue
 from plow_twin.view.fitted_file import write_fit_picture
 
-#: Largest residual in a picture; those of failed runs are larger.
+#: Largest absolute residual on the axis; larger residuals are drawn at this value.
 _MOST: Final = 5.0
 
 
 def draw_motion(fit: Fit, space: Space, objective: RecordingObjective, title: str, path: Path) -> None:
-    """Draw the recorded and the fitted motion as a PNG, or as a file for rerun if the suffix is .rrd."""
+    """Draw the recorded and the fitted motion as PNG, or as a rerun file if the suffix is .rrd."""
     recording = objective.recording
     model = objective.motion(fit.calibration.best.values)
     values = [_value(unknown, fit) for unknown in space.unknowns if not unknown.choices]
@@ -58,7 +58,7 @@ def _notes(fit: Fit, space: Space) -> list[str]:
 
 
 def draw_targets(fit: Fit, space: Space, title: str, path: Path) -> None:
-    """Draw the residual of each target as a PNG; the colour shows whether the target is met."""
+    """Draw the residual of each target as PNG. The colour shows whether the target is met."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 1.8 + 0.24 * len(fit.targets)), layout="constrained")

@@ -1,4 +1,4 @@
-"""A recording of the head's pose to which a scene is fitted."""
+"""A recording of the head's pose, to which a scene can be fitted."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from plow_twin.study.parameters import StudyError
 Array = NDArray[np.float64]
 
 COLUMNS: Final = ("t", "x", "y", "theta")
-#: Largest unpacked size of an archive [B].
+#: Largest size [B] of the unpacked data of an archive.
 _LARGEST_ARCHIVE: Final = 2**28
 #: Largest number of rows of a simulated motion.
 _MOST_ROWS: Final = 20_000
@@ -29,19 +29,20 @@ _MOST_ROWS: Final = 20_000
 
 @dataclass(frozen=True)
 class PoseRecording:
-    """Recorded motion: times t [s], shape (n,), on the clock of the scene, and q, shape (n, 3), with x, y [m], theta
-    [rad].
+    """Recorded motion of the head.
+
+    `t` are the times [s] on the clock of the scene, shape (n,). `q` are the poses x, y [m], theta [rad], shape (n, 3).
     """
 
     t: Array
     q: Array
     source: str = ""
-    #: the recorded load, which replaces the loads of the scene
+    #: The recorded load, which replaces the loads of the scene.
     load: Table | None = None
 
     @property
     def output_dt(self) -> float:
-        """Interval of the simulated rows in s: that of the recording, but at most 0.01 s and at least t_end / 20000."""
+        """Interval [s] of the simulated rows: the recorded interval, limited to the range t_end / 20000 to 0.01 s."""
         end = float(self.t[-1])
         step = float(np.median(np.diff(self.t))) if len(self.t) > 1 else end
         return max(min(step, 0.01), end / _MOST_ROWS)
@@ -64,7 +65,9 @@ class PoseRecording:
 
 
 def load_poses(path: Path) -> PoseRecording:
-    """Read t, x, y, theta from .csv, .parquet or .npz (also t and q, shape (n, 3)), or from an .mcap of this package.
+    """Read the columns t, x, y, theta from a .csv, .parquet or .npz file, or the poses of a run from an .mcap file.
+
+    An .npz file may contain `q`, shape (n, 3), instead of the three columns.
 
     Raises
     ------
@@ -114,7 +117,7 @@ def _read_npz(path: Path) -> tuple[Array, Array, None]:
 
 
 def _read_mcap(path: Path) -> tuple[Array, Array, Table | None]:
-    """Read the poses that the node published (`head_state`), and the load samples that it used."""
+    """Read the poses that the node published (`head_state`), and the load samples that the node used."""
     recording = read_recording(path)
     (stamps, poses), (sampled, wrench) = recording["head_state"].numpy(), recording["excitation"].numpy()
     origin = recording.header.origin_ns

@@ -1,16 +1,18 @@
 """Targets of a calibration: published figures, orders and trends, read from YAML.
 
-Each target gives one residual r of a candidate, 0 if it is met exactly:
+Each target gives one residual r of a candidate. A target that is met exactly has r = 0:
 
-    value              r = (s - value) / (tolerance |value|)                       met: |r| <= 1
-    at_least, at_most  r = max(0, shortfall) / scale                               met: r = 0
-    above              r = max(0, largest of the others - s) / (tolerance |largest|)          met: r = 0
-    trend              r = (steps the wrong way + shortfall of the rise or fall) / (tolerance mean)   met: r = 0
+    value              r = (s - value) / (tolerance |value|)                            met if |r| <= 1
+    at_least           r = max(0, at_least - s) / scale                                 met if r = 0
+    at_most            r = max(0, s - at_most) / scale                                  met if r = 0
+    above              r = max(0, largest - s) / (tolerance |largest|)                  met if r = 0
+    trend              r = (sum of wrong steps + missing change) / (tolerance mean)     met if r = 0
 
-Here s is the statistic of the run with the parameters in the target's `set`, or the smallest if the target names
-several. A trend is judged over a sequence of runs along one parameter. For `rises_then_falls` the turning point with
-the smallest violation counts; rise and fall must each be at least `margin` times the mean. The objective is the sum of
-weight times r^2.
+Here s is the target's statistic, or the smallest statistic if the target names several. It is taken from the run with
+the parameters `set` of the target. In `above`, `largest` is the largest of the statistics with which s is compared. A
+trend is judged over a sequence of runs along one parameter: wrong steps go against the trend, and the required change
+is `margin` times the mean. In `rises_then_falls`, rise and fall must each reach the required change. The turning point
+is the point with the smallest violation. The objective is the sum of weight times r^2.
 """
 
 from __future__ import annotations
@@ -33,13 +35,13 @@ from plow_twin.study.statistics import statistic
 Array = NDArray[np.float64]
 
 TRENDS: Final = ("rises", "falls", "rises_then_falls")
-#: Residual of a target whose run failed or was omitted.
+#: Residual of a target whose run failed or was skipped.
 FAILED_RESIDUAL: Final = 10.0
 
 
 @dataclass(frozen=True)
 class Target:
-    """A target; the docstring of the module explains each kind."""
+    """A target. The docstring of the module defines the kinds of targets."""
 
     name: str
     kind: str
@@ -57,11 +59,13 @@ class Target:
 
     @property
     def paths(self) -> tuple[str, ...]:
-        """Statistics that the target needs from each of its runs."""
+        """The statistics that the target needs from each of its runs."""
         return (*self.statistics, *self.others)
 
     def residual(self, table: Array) -> Array:
-        """Return r of m candidates; `table` has shape (m, settings, paths)."""
+        """Return the residuals r of m candidates, shape (m,), given their statistics `table`, shape (m, settings,
+        paths).
+        """
         mine = table[:, :, : len(self.statistics)].min(axis=2)
         if self.kind == "trend":
             return self._trend(mine)
@@ -87,25 +91,25 @@ class Target:
         return np.asarray(wrong / (self.tolerance * mean))
 
     def met(self, residual: float) -> bool:
-        """Return whether the target is met at this residual."""
+        """Return whether a target with this residual is met."""
         return abs(residual) <= 1.0 if self.kind == "value" else residual <= 1e-9
 
 
 def _wrong_way(s: Array, least: Array) -> Array:
-    """Return the sum of the downward steps of a sequence that should rise, plus the shortfall of its rise."""
+    """Return a measure of the violation of a rise: the sum of all downward steps, plus the missing part of the rise."""
     down = np.maximum(0.0, -np.diff(s, axis=1)).sum(axis=1)
     return np.asarray(down + np.maximum(0.0, least - (s[:, -1] - s[:, 0])))
 
 
 @dataclass(frozen=True)
 class TargetSet:
-    """Targets and the runs that they need."""
+    """A set of targets, and the parameters of the runs that the targets need."""
 
     targets: tuple[Target, ...]
     t_end_s: float
     tol: float = 1e-6
     source: str = ""
-    #: unknowns that the file proposes, as on the command line
+    #: Unknowns that the file proposes, in the syntax of the command line.
     unknowns: tuple[str, ...] = ()
     settings: tuple[Mapping[str, Value], ...] = field(init=False)
 
@@ -113,13 +117,13 @@ class TargetSet:
         unique: list[Mapping[str, Value]] = []
         for target in self.targets:
             unique += [setting for setting in target.settings if setting not in unique]
-        # the setting that most targets use comes first: a candidate that fails there needs no further runs
+        # the setting of most targets comes first, because a candidate that fails there needs no further runs
         uses = [sum(setting in target.settings for target in self.targets) for setting in unique]
         order = sorted(range(len(unique)), key=lambda index: -uses[index])
         object.__setattr__(self, "settings", tuple(unique[index] for index in order))
 
     def without(self, patterns: Sequence[str]) -> TargetSet:
-        """Return the set without the targets whose names match a pattern such as `max at*`.
+        """Return the set without the targets whose names match one of the patterns, such as `max at*`.
 
         Raises
         ------
@@ -178,7 +182,7 @@ _FILE: Final = mapping(
 
 
 def load_targets(path: Path, scene: Scene) -> TargetSet:
-    """Read a target file, or raise a `StudyError` that lists every problem."""
+    """Read a target file, or raise a `StudyError` that lists all problems of the file."""
     raw, found = read_yaml(path, "target", "version, t_end, targets")
     problems = [str(problem) for problem in found or validate(raw, _FILE, "targets")]
     items = raw.get("targets") if isinstance(raw, dict) and not found else None

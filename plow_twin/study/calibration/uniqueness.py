@@ -1,4 +1,4 @@
-"""How well a fit is determined: singular values of the Jacobian, and points that fit almost as well."""
+"""Uniqueness of a fit: singular values of the Jacobian, and clusters of points that fit almost as well."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ from plow_twin.study.parameters import Value
 Array = NDArray[np.float64]
 
 _STEP: Final = 1e-5
-#: Largest difference of an unknown within a cluster, as a share of its range.
+#: Largest difference of an unknown between two members of a cluster, as a share of the range of the unknown.
 _DISTANCE: Final = 0.1
 
 
 @dataclass(frozen=True)
 class Identifiability:
-    """Singular values of dr/dz at the optimum, with residuals r and places z (0..1) of the unknowns with a range.
+    """Singular values of dr/dz at the optimum, where r are the residuals and z the places of the unknowns with a range.
 
-    `weakest` is the singular vector of the smallest value, the combination of unknowns that the data determine least.
+    `weakest` is the singular vector of the smallest singular value: the combination of unknowns that the data determine
+    least.
     """
 
     paths: tuple[str, ...]
@@ -34,17 +35,17 @@ class Identifiability:
 
 @dataclass(frozen=True)
 class Cluster:
-    """Near-optimal points that agree in every choice and are close together in the other unknowns."""
+    """A group of near-optimal points with equal choices and similar values of the other unknowns."""
 
     members: int
     objective: float
     values: dict[str, Value]
-    #: smallest and largest value of each unknown among the members
+    #: Smallest and largest value of each unknown among the members.
     spread: dict[str, tuple[float, float]]
 
 
 def identifiability(space: Space, objective: Objective, point: Array) -> Identifiability:
-    """Return the singular values of the Jacobian at a point."""
+    """Compute the singular values of the Jacobian at a point, shape (n,), of the unit cube."""
     free = space.continuous
     paths = tuple(space.unknowns[index].path for index in free)
     if free.size == 0:
@@ -58,7 +59,7 @@ def identifiability(space: Space, objective: Objective, point: Array) -> Identif
 
 
 def near_optimal(space: Space, found: Calibration, excess: float) -> list[Cluster]:
-    """Cluster all found points whose objective exceeds the best by at most `excess`; the best cluster comes first."""
+    """Cluster all found points whose objective is at most `excess` above the best. The best cluster comes first."""
     points = np.concatenate([[start.point for start in found.starts], found.population])
     values = np.concatenate([[start.objective for start in found.starts], found.population_objective])
     keep = values <= found.best.objective + excess
@@ -77,7 +78,7 @@ def near_optimal(space: Space, found: Calibration, excess: float) -> list[Cluste
 
 
 def _linked(points: Array, rows: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Return the rows of each cluster by complete linkage."""
+    """Return the rows of each cluster, found by complete linkage."""
     from scipy.cluster.hierarchy import fcluster, linkage
 
     if len(rows) == 1:

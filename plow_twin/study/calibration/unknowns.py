@@ -1,6 +1,6 @@
 """Unknowns of a calibration: the map between the unit cube and the values of parameters.
 
-A *place* is a coordinate 0..1 of the cube.
+A *place* is a coordinate 0..1 in the cube.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Unknown:
-    """A number from `low` to `high` (uniform in the logarithm if `log`), or one of `choices`."""
+    """An unknown: a number from `low` to `high`, or one of `choices`. With `log`, the logarithm is distributed
+    uniformly.
+    """
 
     path: str
     low: float = 0.0
@@ -45,7 +47,9 @@ class Unknown:
         return float(self.low + (self.high - self.low) * place)
 
     def place(self, value: Value) -> float:
-        """Return the place of a value; each choice has an equal share of 0..1 and is placed in its middle."""
+        """Return the place of a value. Each choice has an equal share of 0..1, and its place is the middle of the
+        share.
+        """
         if self.choices:
             return (self.choices.index(value) + 0.5) / len(self.choices)
         number = float(value)
@@ -58,7 +62,8 @@ class Unknown:
 
 
 def parse_unknown(text: str, scene: Scene) -> Unknown:
-    """Read `PATH=LOW:HIGH[:log]`, `PATH=CHOICE,CHOICE..` or, for a sign, `PATH`; raise a `StudyError` for others."""
+    """Parse `PATH=LOW:HIGH[:log]`, `PATH=CHOICE,CHOICE..`, or `PATH` alone for a sign; raise a `StudyError` otherwise.
+    """
     path, equals, rest = text.partition("=")
     check_path(scene, path)
     if not equals:
@@ -93,7 +98,7 @@ def _number(path: str, text: str) -> float:
 
 @dataclass(frozen=True)
 class Space:
-    """The cube of the places of all unknowns."""
+    """The unit cube, with one dimension for each unknown."""
 
     unknowns: tuple[Unknown, ...]
 
@@ -113,15 +118,15 @@ class Space:
         return np.array([i for i, unknown in enumerate(self.unknowns) if not unknown.choices], dtype=np.int64)
 
     def values(self, point: Array) -> dict[str, Value]:
-        """Return the values of a point, shape (n,)."""
+        """Return the values of the unknowns at a point, shape (n,)."""
         return {u.path: u.value(float(place)) for u, place in zip(self.unknowns, point, strict=True)}
 
     def values_of(self, points: Array) -> list[dict[str, Value]]:
-        """Return the values of points, shape (m, n)."""
+        """Return the values of the unknowns at m points, shape (m, n)."""
         return [self.values(point) for point in points]
 
     def point(self, scene: Scene) -> Array | None:
-        """Return the point of a scene, or None if a value is outside the range of its unknown."""
+        """Return the point of a scene, or None if one of its values is outside the range of the unknown."""
         places = []
         for unknown in self.unknowns:
             value = parameter_of(scene, unknown.path)
@@ -133,7 +138,7 @@ class Space:
         return np.array(places)
 
     def settled(self, point: Array) -> Array:
-        """Return the point with each choice in the middle of its share."""
+        """Return the point with the place of each choice in the middle of its share."""
         places = zip(self.unknowns, point, strict=True)
         return np.array([u.place(u.value(float(x))) if u.choices else float(x) for u, x in places])
 

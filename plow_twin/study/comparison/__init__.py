@@ -1,1 +1,1 @@
-"""Comparison of runs: quantities of contacts in time windows, and statistically significant changes."""
+"""Comparison of runs: contact forces, impacts and wear in time windows, and the significance of their changes."""

@@ -1,4 +1,4 @@
-"""Comparison of groups of windows: distributions, changes with intervals, and the effect of the load."""
+"""Statistical comparison of two groups of windows, with and without the effect of the load."""
 
 from __future__ import annotations
 
@@ -12,36 +12,39 @@ from scipy.stats import t as student
 
 Array = NDArray[np.float64]
 
-#: Number of bootstrap draws. The share of draws below the 2.5 % point then has a standard error of 0.5 %.
+#: Number of bootstrap draws. Each end of a 95 % interval then has a standard error of 0.5 % in its probability of 2.5
+#: %.
 _DRAWS: Final = 1000
 FEWEST: Final = 8
-#: Smallest variation of the load within groups, relative to its mean, that shows how a quantity depends on the load.
+#: Smallest standard deviation of the load within the groups, relative to the mean load. Below this value, the effect of
+#: the load is not estimated.
 _LEAST_VARIATION: Final = 0.01
-#: Loads that differ by less than this share are treated as equal.
+#: Relative difference below which two mean loads are treated as equal.
 _EQUAL_LOAD: Final = 0.01
-#: The loads of two groups must overlap between these percentiles [%]: a slope is valid only near the loads that gave
-#: it.
+#: Percentiles [%] between which the loads of two groups must overlap. The estimated effect of the load is valid only
+#: near the loads from which it was estimated.
 _USUAL: Final = (5.0, 95.0)
 _LEVEL: Final = 0.05
-#: Windows drawn at once, which limits the memory.
+#: Number of windows drawn at once, which limits the memory.
 _AT_ONCE: Final = 2**21
-#: Relative difference that rounding can cause.
+#: Largest relative difference that is attributed to rounding errors.
 _ROUNDING: Final = 1e-12
-#: Largest distance between the starts of neighbouring windows, in window lengths.
+#: Largest distance between the starts of two windows, in window lengths, for which the windows are neighbours.
 _NEXT: Final = 1.5
 
 
 @dataclass(frozen=True)
 class Change:
-    """Change of a mean from one group to another, relative to the first mean.
+    """Change of a mean from one group of windows to another, relative to the mean of the first group.
 
-    `share` has the 95 % interval from `low` to `high`. `chance` is the probability that such a change occurs by chance.
-    It is adjusted for the number of cells, which are judged together (Benjamini and Hochberg); a *cell* is a quantity
-    of a pair, or a clearance. Of the cells with a probability below 0.05, about one in twenty has not changed.
+    `low` and `high` are the ends of the 95 % interval of `share`. `chance` is the probability that such a change occurs
+    by chance. The probabilities of all cells of a comparison are adjusted together by the method of Benjamini and
+    Hochberg. A *cell* is one quantity of one pair, or one clearance. Among the cells with an adjusted probability below
+    0.05, about one in twenty has not changed.
 
-    The numbers `machine`, `machine_low`, `machine_high` and `machine_chance` are the same for the change at equal load.
-    They are None if the loads of the groups do not overlap, or vary too little to show how the quantity depends on
-    them.
+    `machine`, `machine_low`, `machine_high` and `machine_chance` describe the change at equal load in the same way. The
+    four fields are None if the loads of the two groups do not overlap, or if the load varies too little within the
+    groups.
     """
 
     share: float
@@ -64,17 +67,17 @@ class Change:
 
 
 def points(values: Array) -> dict[str, float]:
-    """Return mean, 5 %, 50 % and 95 % points of values, shape (n,)."""
+    """Return the mean and the 5 %, 50 % and 95 % points of values, shape (n,)."""
     p05, p50, p95 = np.percentile(values, (5.0, 50.0, 95.0)).tolist()
     return {"mean": float(values.mean()), "p05": p05, "p50": p50, "p95": p95}
 
 
 def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
-    """Return the load of each window, of the window before and of the window after, shape (n, 3).
+    """Return the loads of each window, of the window before and of the window after, shape (n, 3).
 
-    The load may change within a window, and the motion of the head still depends on the earlier load. The effect of a
-    lasting change of the load is therefore the sum of the slopes by all three loads. A missing neighbour has the load
-    of the window itself.
+    The motion in a window also depends on the load in the neighbouring windows. The effect of a lasting change of the
+    load is therefore the sum of the slopes with respect to all three loads. A missing neighbour is replaced by the
+    window itself.
     """
     steps = np.diff(start_ns)
     joined = (steps > 0) & (steps < _NEXT * np.median(steps)) if len(steps) else steps > 0
@@ -84,17 +87,16 @@ def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
 
 
 class Drawn:
-    """Means and covariances of a group of windows: row 0 for all windows, every other row for a bootstrap draw.
+    """Means and covariances of a group of windows. Row 0 is for all windows, each further row for one bootstrap draw.
 
-    `values`, shape (n, k), are quantities of n windows. `load`, shape (n,) or (n, m), has the load of each window in
-    its first column.
+    `values`, shape (n, k), are the quantities of n windows. The first column of `load`, shape (n,) or (n, m), is the
+    load of each window.
     """
 
     def __init__(self, values: Array, load: Array, random: np.random.Generator, draws: int = _DRAWS) -> None:
         load = load.reshape(len(load), -1)
-        #: number of windows
         self.size, width = load.shape
-        #: limits of the usual loads
+        #: Lower and upper limit of the usual loads.
         self.usual = np.percentile(load[:, 0], _USUAL)
         whole = np.hstack((load, values))
         usual = whole.mean(axis=0)
@@ -111,19 +113,18 @@ class Drawn:
             means.append(weights @ centred)
             products.append(np.stack([weights @ (centred[:, [one]] * centred) for one in range(width)], axis=1))
         offset = np.concatenate(means)
-        #: means of the quantities, shape (draws + 1, k), and of the loads, shape (draws + 1, m)
+        #: Means of the quantities, shape (draws + 1, k), and of the loads, shape (draws + 1, m).
         self.mean, self.load = (usual + offset)[:, width:], (usual + offset)[:, :width]
         second = np.concatenate([part.reshape(-1, width, whole.shape[1]) for part in products])
-        #: covariance of the loads with each other and with the quantities, shape (draws + 1, m, m + k)
+        #: Covariances of the loads with all loads and quantities, shape (draws + 1, m, m + k).
         self.within = second - offset[:, :width, None] * offset[:, None, :]
 
 
 def changes(before: Drawn, after: Drawn) -> list[Change | None]:
-    """Return the change of each quantity between two groups of windows, None if there are too few windows.
+    """Return the change of each quantity between two groups of windows, or None if a group has too few windows.
 
-    The means are compared by a bootstrap over windows. For the comparison at equal load, the part of a change that
-    follows from the load is subtracted (analysis of covariance). The slopes come from the variation of the load within
-    the groups.
+    The means are compared by a bootstrap over windows. The comparison at equal load subtracts the part of a change that
+    the load causes (analysis of covariance). The effect of the load is estimated from its variation within the groups.
 
     References
     ----------
@@ -149,9 +150,10 @@ def changes(before: Drawn, after: Drawn) -> list[Change | None]:
 
 
 def _tested(differences: Array, mean: Array, fewest: int) -> tuple[Array, Array, Array, Array]:
-    """Return share, low, high and adjusted chance of each column; row 0 has values, the other rows draws.
+    """Return share, low, high and adjusted probability of each column. Row 0 contains values, all other rows draws.
 
-    Student's t distribution has the degrees of freedom of the smaller group, so the probabilities are rather too large.
+    Student's t distribution has the degrees of freedom of the smaller group, so that the probabilities are rather too
+    large.
     """
     drawn = np.divide(differences, mean, out=np.full_like(mean, np.nan), where=mean > 0.0)
     low, high = np.nanpercentile(drawn[1:], (2.5, 97.5), axis=0)
@@ -169,7 +171,7 @@ def _apart(before: Drawn, after: Drawn) -> bool:
 
 
 def _at_equal_load(before: Drawn, after: Drawn) -> Array:
-    """Return the differences of the means at the load of the first group, NaN if the load hardly varies."""
+    """Return the differences of the means at the load of the first group, or NaN if the load hardly varies."""
     usual, difference = before.load[:, 0], after.load - before.load
     changed = np.abs(difference[:, 0]) >= _EQUAL_LOAD * usual
     width, size = difference.shape[1], before.size + after.size

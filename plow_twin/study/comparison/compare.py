@@ -1,4 +1,4 @@
-"""The comparison of runs: `compare` groups windows by run, day or shift, and compares each group with the first."""
+"""Comparison of runs: windows are grouped by run, day or shift, and each group is compared with the first group."""
 
 from __future__ import annotations
 
@@ -17,31 +17,32 @@ from plow_twin.record.recording import read_recording
 from plow_twin.study.comparison.change import Change, Drawn, changes, points, with_neighbours
 from plow_twin.study.comparison.windows import FULL, QUANTITIES, Windows, windows_of
 
-#: Smallest stamp [ns] that counts as a date; 1e18 ns is in the year 2001.
+#: Smallest stamp [ns] that is treated as a date. Smaller stamps, before the year 2001, count from the start of a
+#: device.
 _DATES_NS: Final = 10**18
 SHIFTS: Final = (time(6), time(14), time(22))
 
-#: Function of a run's name and a window's stamp [ns] that returns the group of the window.
+#: Function of a run's name and a window's stamp [ns]. It returns the group of the window.
 Label = Callable[[str, int], str]
 
 
 @dataclass
 class Comparison:
-    """Groups of windows in order of first appearance, and the change from the first group to every other group."""
+    """Groups of windows in order of first appearance, and the changes from the first group to every other group."""
 
     groups: dict[str, Windows]
-    #: names of the runs with windows in a group
+    #: Names of the runs with windows in each group.
     runs: dict[str, list[str]]
-    #: changes by group (except the first), pair and quantity; None if there are too few windows
+    #: Changes by group, pair and quantity, without the first group; None if a group has too few windows.
     changes: dict[str, dict[str, dict[str, Change | None]]] = field(default_factory=dict)
-    #: changes by group (except the first) and axis
+    #: Changes of the clearance by group and axis, without the first group.
     clearance_changes: dict[str, dict[str, Change | None]] = field(default_factory=dict)
     scenes: list[str] = field(default_factory=list)
-    #: reasons to doubt the comparison
+    #: Reasons to doubt the comparison.
     notes: list[str] = field(default_factory=list)
 
     def facts(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
+        """Return all results as plain values for JSON."""
         return {
             "groups": {
                 name: {
@@ -80,14 +81,14 @@ def _facts(changes: Mapping[str, Change | None]) -> dict[str, Any]:
 
 
 def by_run(name: str, stamp_ns: int) -> str:
-    """Group by run."""
+    """Return the name of the run as the group of a window."""
     return name
 
 
 def by_time(kind: str, shifts: Sequence[time] = SHIFTS, zone: tzinfo = UTC) -> Label:
-    """Return a function that labels a window with its day or its shift (`kind`) in a time zone.
+    """Return a function that groups windows by day or by shift (`kind`) in a time zone.
 
-    Shifts begin at the times `shifts`. The function raises a `RecordingError` if a stamp is not a date.
+    `shifts` are the times at which shifts begin. The function raises a `RecordingError` if a stamp is not a date.
     """
     begins = sorted(shifts)
 
@@ -98,7 +99,7 @@ def by_time(kind: str, shifts: Sequence[time] = SHIFTS, zone: tzinfo = UTC) -> L
         if kind == "day":
             return at.strftime("%Y-%m-%d")
         before = [begin for begin in begins if begin <= at.time()]
-        if not before:  # before the first shift of a day, the last shift of the day before still runs
+        if not before:  # before the first shift of a day, the last shift of the previous day continues
             return f"{(at - timedelta(days=1)).strftime('%Y-%m-%d')} {begins[-1].strftime('%H:%M')}"
         return f"{at.strftime('%Y-%m-%d')} {before[-1].strftime('%H:%M')}"
 
@@ -111,10 +112,10 @@ def compare(
     seed: int = 0,
     scenes: Mapping[str, tuple[str, str]] = MappingProxyType({}),
 ) -> Comparison:
-    """Return the windows of runs in groups, and the change from the first group to every other group.
+    """Compare the first group of windows with every other group.
 
-    `runs` are names and windows in order of time, `scenes` name and contents of each run's scene. `seed` is that of the
-    bootstrap draws.
+    `runs` are the names and windows of the runs in order of time. `scenes` contains the name and the contents of the
+    scene of each run. `seed` is the seed of the bootstrap draws.
 
     Raises
     ------
@@ -158,7 +159,7 @@ def compare(
 
 
 def _cells(windows: Windows) -> np.ndarray[Any, Any]:
-    """Return the quantities of each pair, then the clearances, shape (n, cells)."""
+    """Return the quantities of all pairs and the clearances as columns, shape (n, cells)."""
     by_pair = np.stack([windows.pairs[name] for name in QUANTITIES], axis=2)
     return np.hstack((by_pair.reshape(len(by_pair), -1), windows.clearance))
 
@@ -168,12 +169,12 @@ def _overlapping(windows: Windows, others: Windows) -> np.ndarray[Any, Any]:
         return np.zeros(len(windows.start_ns), bool)
     order = np.argsort(others.start_ns)
     (begins, ends), (starts, stops) = (
-        # begin and end of the part that surely has messages
+        # begin and end of the part of a window that certainly contains messages
         ((part.start_ns + (1.0 - FULL) * part.length_ns), (part.start_ns + FULL * part.length_ns))
         for part in (windows, others)
     )
     starts, stops = starts[order], stops[order]
-    before = np.searchsorted(starts, ends) - 1  # the last of the others that begins before a window ends
+    before = np.searchsorted(starts, ends) - 1  # the last of the others that begins before the end of each window
     return np.asarray((before >= 0) & (stops[before] > begins))
 
 
@@ -194,7 +195,7 @@ def _scenes_apart(scenes: Mapping[str, tuple[str, str]]) -> list[str]:
 
 @dataclass(frozen=True)
 class WindowsTask:
-    """The windows of one run, as a `RunTask`."""
+    """Computation of the windows of one run, as a `RunTask`."""
 
     path: Path
     window_s: float | None = None
@@ -204,7 +205,9 @@ class WindowsTask:
         return None
 
     def run(self) -> dict[str, Any]:
-        """Return `windows`, the losses of the run (`lost`), and name and contents of its scene (`scene`)."""
+        """Return the windows of the run (`windows`), its losses (`lost`), and the name and contents of its scene
+        (`scene`).
+        """
         recording = read_recording(self.path)
         windows = windows_of(recording, self.window_s)
         scene = Path(str(recording.header.parameters.get("scene", ""))).name

@@ -1,4 +1,4 @@
-"""A comparison as files: a self-contained HTML page, `compare.json`, and the windows as Parquet."""
+"""Files of a comparison: a self-contained HTML page, `compare.json`, and the windows as Parquet."""
 
 from __future__ import annotations
 
@@ -20,12 +20,9 @@ from plow_twin.view.section import PAIR_COLORS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: `_MOST_BOXES`: largest number of groups drawn as boxes
-#: `_MOST_LABELS`: largest number of names on the axis
-#: `_WIDEST`: names with longer lines are drawn slanted
-_MOST_BOXES: Final = 6
-_MOST_LABELS: Final = 12
-_WIDEST: Final = 10
+_MOST_BOXES: Final = 6  # largest number of groups for which box plots are drawn
+_MOST_LABELS: Final = 12  # largest number of labels on an axis
+_WIDEST: Final = 10  # length of a label's longest line above which labels are slanted
 
 
 def write_comparison(found: Comparison, lost: dict[str, Any], out: Path) -> None:
@@ -70,7 +67,8 @@ def _figure(found: Comparison) -> Figure:
 
 
 def _lines(axis: Any, found: Comparison) -> None:
-    """Draw median and 95 % point of each pair's peaks as lines, because many boxes would overlap."""
+    """Draw the median and the 95 % point of each pair's peaks as lines, because box plots of many groups would overlap.
+    """
     peaks = [windows.pairs["peak"] / 1e3 for windows in found.groups.values()]
     places = np.arange(len(peaks))
     median, high = (np.array([np.percentile(values, point, axis=0) for values in peaks]) for point in (50.0, 95.0))
@@ -79,7 +77,7 @@ def _lines(axis: Any, found: Comparison) -> None:
         axis.plot(places, median[:, pair], color=color, label=name)
         axis.plot(places, high[:, pair], color=color, ls=":", lw=1.0)
     shown = places[:: 1 + len(places) // _MOST_LABELS]
-    # the time of a shift is written below its date
+    # a line break puts the time of a shift below its date
     names = [list(found.groups)[place].replace(" ", "\n") for place in shown]
     slanted = max(len(line) for name in names for line in name.split("\n")) > _WIDEST
     axis.set_xticks(shown, names, rotation=30 if slanted else 0, ha="right" if slanted else "center", fontsize=8)
@@ -97,7 +95,7 @@ def _title(found: Comparison) -> str:
 
 
 def _write_windows(found: Comparison, path: Path) -> None:
-    """Write a row group for each group of windows, so that memory holds a copy of only one group."""
+    """Write one row group for each group of windows, so that at most one group is copied in memory."""
     import pyarrow as pa
     import pyarrow.parquet
 

@@ -29,11 +29,11 @@ QUANTITIES: Final[Mapping[str, str]] = {
     "dissipation": "W",
     "wear": "m/h",
 }
-#: Length of the start of a run in which the period of the load is searched [s].
+#: Length [s] of the part at the start of a run in which the period of the load is searched.
 _PERIOD_SPAN_S: Final = 60.0
 _NO_PERIOD_S: Final = 10.0
 #: Smallest number of messages in a window, relative to a full window. Windows with fewer messages, at the end of a run
-#: or at a gap, are left out. Sample rates whose ratio is at least this number count as equal.
+#: or at a gap, are left out. Two sample rates are treated as equal if their ratio is at least this number.
 FULL: Final = 0.9
 _PADS: Final = np.array([CLEARANCE_NAMES.index(name) for name in PAD_NAMES])
 _TOTALS: Final = np.array([CLEARANCE_NAMES.index(name) for name in ("horizontal", "vertical")])
@@ -44,19 +44,19 @@ class Windows:
     """The n windows of a run."""
 
     start_ns: Indexes
-    #: an array, shape (n, 8), for each of `QUANTITIES`
+    #: Values of each of the `QUANTITIES`, shape (n, 8).
     pairs: dict[str, Array]
-    #: root mean square of the force [N] and of the moment [N m] of the load, shape (n, 2)
+    #: Root mean squares of the force [N] and of the moment [N m] of the load, shape (n, 2).
     load: Array
-    clearance: Array  # horizontal, vertical [m], shape (n, 2)
+    clearance: Array  # horizontal and vertical [m], shape (n, 2)
     length_ns: Indexes
-    #: sample rate of the load [Hz], shape (n,)
+    #: Sample rate of the load [Hz], shape (n,).
     rate_hz: Array
-    #: number of windows left out because samples are missing
+    #: Number of windows that were left out because samples are missing.
     silent: int = 0
 
     def chosen(self, which: NDArray[np.bool_]) -> Windows:
-        """Return the windows selected by a mask, shape (n,); no copy is made if all are."""
+        """Return the windows selected by a mask, shape (n,), without a copy if all windows are selected."""
         if which.all():
             return self
         return Windows(
@@ -70,7 +70,7 @@ class Windows:
 
     @classmethod
     def joined(cls, parts: Sequence[Windows]) -> Windows:
-        """Return the joined windows of several runs; a single run is not copied."""
+        """Concatenate the windows of several runs. The windows of a single run are not copied."""
         if len(parts) == 1:
             return parts[0]
         return cls(
@@ -85,13 +85,13 @@ class Windows:
 
 @dataclass
 class _Sums:
-    """Sums over the messages of each window, by the number of the window."""
+    """Sums over the messages of each window. The key of `rows` is the number of the window."""
 
     width: int
     rows: dict[int, Array] = field(default_factory=dict)
 
     def add(self, window: Indexes, values: Array, reduce: Any = np.add) -> None:
-        """Add values, shape (n, width), to the windows numbered `window`, shape (n,), which never decreases."""
+        """Add values, shape (n, width), to the windows numbered `window`, shape (n,), in non-decreasing order."""
         if not len(window):
             return
         first = np.flatnonzero(np.r_[True, np.diff(window) != 0])
@@ -99,19 +99,21 @@ class _Sums:
             self.rows[number] = reduce(self.rows[number], value) if number in self.rows else value
 
     def of(self, numbers: list[int]) -> Array:
-        """Return the sums of the windows `numbers`, zero for a window without values."""
+        """Return the sums of the windows `numbers`, shape (len(numbers), width); a window without values has the sum 0.
+        """
         return np.array([self.rows.get(number, np.zeros(self.width)) for number in numbers]).reshape(-1, self.width)
 
 
 def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
-    """Return the windows of a run of plow_twin whose outputs were recorded.
+    """Return the windows of a run of plow_twin.
 
-    A window is `window_s` long; by default it is the period of the load, or 10 s without a period.
+    The outputs of the run must have been recorded. A window is `window_s` long. The default length is the period of the
+    load, or 10 s if the load has no period.
 
     Raises
     ------
     RecordingError
-        The recording is not a run of plow_twin, has no outputs, or lacks samples in each window.
+        The recording is not a run of plow_twin, has no outputs, or has missing samples in every window.
     """
     sums = _RunSums(round(1e9 * (window_s or _load_period(recording))), RunTime(recording.header.parameters).silences)
     for found in recording.batches("excitation", "contact_forces", "contact_peaks", "clearance"):
@@ -135,7 +137,7 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
 
 
 class _RunSums:
-    """Sums over a run by window, to which the messages of each topic are added batch by batch."""
+    """Sums for each window of a run. The messages of each topic are added batch by batch."""
 
     def __init__(self, window_ns: int, silences: Silences) -> None:
         self._window_ns, self._silences = window_ns, silences
@@ -143,11 +145,11 @@ class _RunSums:
         self.messages, self.clearance, self._clearance_count = _Sums(1), _Sums(2), _Sums(1)
         self._load, self._peak, self._moved = _Sums(3), _Sums(PAIR_COUNT), _Sums(2 * PAIR_COUNT)
         self._contact = _Sums(2 * PAIR_COUNT + 1)
-        #: first and last wear depth of the pads
+        #: First and last wear depth of the pads in each window.
         self._pads: dict[int, tuple[Array, Array]] = {}
-        #: cumulative number of impacts of each pair in the last message
+        #: Cumulative number of impacts of each pair in the newest message.
         self._impacts: Array | None = None
-        #: stamp and values of the last message of forces
+        #: Stamp and values of the newest message of contact forces.
         self._newest: tuple[Indexes, Array] | None = None
 
     def add(self, name: str, part: Batched) -> None:
@@ -190,7 +192,11 @@ class _RunSums:
         self._contact.add(ends, np.hstack((work, in_contact[len(in_contact) - count :], np.ones((count, 1)))))
 
     def silent(self) -> set[int]:
-        """Return the windows that a silence touches: the message after a silence describes the whole silence."""
+        """Return the windows that overlap a time without samples.
+
+        The first message after such a time contains the peaks and sums of the whole time. Its window is therefore
+        included.
+        """
         known, silent = np.array(sorted(self.messages.rows)), set[int]()
         for begin, end in self._silent_ns:
             first = np.searchsorted(known, begin // self._window_ns)
@@ -199,7 +205,7 @@ class _RunSums:
         return silent
 
     def windows(self, numbers: list[int], silent: int) -> Windows:
-        """Return the windows `numbers`."""
+        """Return the windows `numbers`; `silent` is the number of windows that were left out."""
         seconds = self._window_ns * 1e-9
         sums, touched, squares = self._moved.of(numbers), self._contact.of(numbers), self._load.of(numbers)
         pads = [self._pads.get(number, (0.0, np.zeros(PAIR_COUNT))) for number in numbers]
@@ -222,20 +228,21 @@ class _RunSums:
 
 
 def _between(sums: _Sums, count: _Sums, numbers: list[int]) -> Array:
-    """Return the means of windows, interpolated for a window without a message."""
+    """Return the means of windows. The mean of a window without a message is interpolated."""
     known = sorted(sums.rows)
     means = sums.of(known) / count.of(known)
     return np.column_stack([np.interp(numbers, known, column) for column in means.T])
 
 
 def _risen(part: Batched, window: Indexes) -> tuple[Batched, Indexes]:
-    """Return the rows sorted by stamp: late samples and clock steps can bring older stamps later."""
+    """Sort rows by stamp. After late samples or clock steps, older stamps can follow newer stamps."""
     order = np.argsort(part.stamp_ns, kind="stable")
     return Batched(part.stamp_ns[order], part.values[order]), window[order]
 
 
 def _powers(part: Batched, newest: tuple[Indexes, Array] | None) -> tuple[Indexes, Array, Array]:
-    """Return stamps, power into each contact [W] and whether it has force, from the row `newest` on."""
+    """Return stamps, the power into each contact [W], and whether the contact carries force. Begin at the row `newest`.
+    """
     stamps, values = part.stamp_ns, part.values
     if newest is not None and newest[0][0] < stamps[0]:
         stamps, values = np.concatenate((newest[0], stamps)), np.concatenate((newest[1], values))

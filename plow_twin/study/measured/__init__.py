@@ -1,6 +1,6 @@
-"""Comparison of the contact model with published measurements: impacts of an ellipse, drops of a square.
+"""Comparison of the contact model with published measurements: impacts of an ellipse, and drops of a square.
 
-Data: Fazeli and others, in DAIRLab/ImpactModeling (BSD-3-Clause); `docs/measured.md`.
+The data are from Fazeli and others, in DAIRLab/ImpactModeling (BSD-3-Clause); see `docs/measured.md`.
 """
 
 from plow_twin.study.measured.ellipse import impact

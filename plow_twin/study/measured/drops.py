@@ -1,4 +1,4 @@
-"""Measured drops of the square: end of the first flight, bounces, and comparison with the predicted bands."""
+"""Measured drops of the square: the first flight, the bounces, and the comparison with the predicted bands."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from plow_twin.study.measured.square import LEAST_ROWS, RATE_HZ, bands
 
 Array = NDArray[np.float64]
 
-#: Half the side of the square [m].
+#: Half the side length of the square [m].
 _HALF: Final = 0.03
-#: Criteria of an impact: free-fall acceleration and smallest deviation from it [m/s^2], smallest angular acceleration
-#: [rad/s^2], largest gap [m].
+#: Criteria of an impact: free-fall acceleration [m/s^2], smallest deviation from this acceleration [m/s^2], smallest
+#: angular acceleration [rad/s^2], and largest gap [m].
 _FALL, _JERK, _TWIST, _NEAR = 9.0, 9.0, 300.0, 0.03
-#: Smallest rise between two bounces [m].
+#: Smallest rise [m] between two bounces.
 _RISE: Final = 0.003
 
 
@@ -26,16 +26,16 @@ _RISE: Final = 0.003
 class Drops:
     """Measured drops of the square."""
 
-    #: x, z [m] and unwrapped theta [rad] at 250 Hz, shape (n, rows, 3)
+    #: Poses x, z [m] and unwrapped theta [rad] at 250 Hz, shape (n, rows, 3).
     pose: Array
-    #: number of rows before the first impact, shape (n,)
+    #: Number of rows before the first impact, shape (n,).
     flight_rows: NDArray[np.intp]
-    #: rows of the lowest points of each drop, between rises of 3 mm
+    #: Rows of the bounces of each drop: the lowest points between rises of at least 3 mm.
     bounces: tuple[tuple[int, ...], ...]
 
     @classmethod
     def load(cls, path: Path) -> Drops:
-        """Read a file of drops (`benchmark/data/measured/square_drops.npz`)."""
+        """Read a file of drops such as `benchmark/data/measured/square_drops.npz`."""
         with np.load(path) as data:
             pose = data["pose"] * data["scale"]
         pose[:, :, 2] = np.unwrap(pose[:, :, 2], axis=1)
@@ -43,15 +43,16 @@ class Drops:
         return cls(pose, flights, tuple(_bounces(one[:, 1]) for one in pose))
 
     def usable(self) -> list[int]:
-        """Return the indices of the drops with at least two bounces and a flight that can be fitted."""
+        """Return the indices of the drops that have at least two bounces and a flight long enough for a fit."""
         return [i for i, given in enumerate(self.flight_rows) if given > LEAST_ROWS and len(self.bounces[i]) > 1]
 
     def until(self, index: int, bounce: int) -> int:
-        """Return the row of a bounce, counted from 0, or of the last bounce if there are fewer."""
+        """Return the row of a bounce, counted from 0. If the drop has fewer bounces, return the row of the last bounce.
+        """
         return self.bounces[index][min(bounce, len(self.bounces[index]) - 1)]
 
     def inside(self, index: int) -> NDArray[np.bool_]:
-        """Return whether x, z and theta are in the predicted 90 % bands up to the third bounce, shape (rows, 3)."""
+        """Return whether x, z and theta lie in the predicted 90 % bands up to the third bounce, shape (rows, 3)."""
         rows = self.until(index, 2) + 1
         points = bands(self.pose[index, : self.flight_rows[index]], rows)
         found: NDArray[np.bool_] = (self.pose[index, :rows] >= points[:, 0]) & (self.pose[index, :rows] <= points[:, 2])

@@ -1,4 +1,4 @@
-"""Single impacts of an ellipse on a flat surface, by the contact model of this project."""
+"""Single impacts of an ellipse on a flat surface, computed by the contact model of this package."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ from plow_twin.solve.point_impact import POINT, strike_points
 
 Array = NDArray[np.float64]
 
-#: Semi-axes and radius of gyration in m.
+#: Semi-axes of the ellipse [m], and its radius of gyration [m].
 SEMI_AXES: Final = (0.035, 0.025)
 GYRATION: Final = 0.0192
-#: Contact stiffness per mass in 1/s^2. It determines only how long an impact takes: position and arms are constant
-#: during the impact.
+#: Contact stiffness per mass [1/s^2]. It determines the duration of an impact but not its result, because position and
+#: arms are constant during the impact.
 _STIFFNESS: Final = 1e9
-#: Speed of approach in m/s to which restitutions refer, the middle of the measured speeds.
+#: Speed of approach [m/s] at which the restitution has its nominal value: the middle of the measured speeds.
 USUAL_SPEED: Final = 2.5
 _LEAST, _LARGEST = 0.05, 0.98
-#: Upper bound of rates in m/s or rad/s, which no measured body reaches.
+#: Upper bound of velocities [m/s] and angular velocities [rad/s]. No measured body is as fast.
 _FASTEST: Final = 1e4
-#: Gap in m at which a simulated impact starts, and time in s after which it is over: 13 half periods of the contact.
+#: Gap [m] at which a simulated impact starts, and time [s] after which it is certainly over (13 half periods of the
+#: contact).
 _GAP, _WHOLE = 1e-9, 40.0 / _STIFFNESS**0.5
 
 
@@ -37,35 +38,36 @@ _GAP, _WHOLE = 1e-9, 40.0 / _STIFFNESS**0.5
 class EllipseContact:
     """The parameters of an impact of the ellipse."""
 
-    #: key of `model.contact_laws.LAWS`
+    #: Key of `model.contact_laws.LAWS`.
     law: str = "exact_restitution"
     exponent: float = 1.0
-    #: restitution of an impact at 2.5 m/s without motion along the surface; for a law without a restitution, the
-    #: damping number lambda v0, or the damping C relative to the critical damping
+    #: Restitution of an impact at 2.5 m/s without motion along the surface. For a law without a restitution, the
+    #: damping number lambda v0, or the damping C relative to the critical damping.
     restitution: float = 0.703
-    #: exponent q of the factor (v / 2.5 m/s)^-q of the restitution at the speed of approach v
+    #: Exponent q of the factor (v / 2.5 m/s)^-q, by which the restitution depends on the speed of approach v.
     fall: float = 0.2523
-    #: decrease of the restitution with the speed of the centre of mass along the surface [s/m]
+    #: Decrease of the restitution with the speed of the centre of mass along the surface [s/m].
     fall_along: float = 0.2786
     friction: float = 0.1907
-    #: regularisation speed [m/s]; 0 for a tangential spring and damper
+    #: Regularisation speed of the friction [m/s]; 0 selects a tangential spring and damper instead.
     slip_speed: float = 0.0
-    #: ratio of tangential to normal stiffness
+    #: Ratio of tangential to normal stiffness.
     stick_stiffness: float = 1.584
-    #: tangential damping relative to the critical damping
+    #: Tangential damping relative to the critical damping.
     stick_damping: float = 0.1597
-    #: angle of the surface relative to the axes of the data [rad]
+    #: Angle [rad] of the surface relative to the axes of the data.
     tilt: float = -0.0131
 
 
-#: Contact fitted to the odd-numbered impacts.
+#: Parameters fitted to the odd-numbered impacts.
 ELLIPSE: Final = EllipseContact()
 
 
 def contact_arms(theta: Array) -> tuple[Array, Array]:
-    """Return the lowest point relative to the centre in m, along and away from the surface, shape (n,) each.
+    """Return the lowest point relative to the centre: its coordinates [m] along and away from the surface, shape (n,)
+    each.
 
-    `theta` is counter-clockwise, shape (n,).
+    `theta` is the counter-clockwise angle [rad], shape (n,).
     """
     a, b = SEMI_AXES
     c, s = np.cos(theta), np.sin(theta)
@@ -82,13 +84,13 @@ def impact(before: ArrayLike, contact: EllipseContact = ELLIPSE) -> Array:
         x, y [m], theta [rad], vx, vy [m/s], omega [rad/s] in the axes of the data: y points away from the surface, and
         a positive theta turns y towards x.
     contact : EllipseContact
-        Parameters of the contact; by default the fitted parameters.
+        Parameters of the contact. The default is the fitted contact `ELLIPSE`.
 
     Returns
     -------
     ndarray, shape (n, 6)
-        x, y, theta as before, and the velocities after the impact. A state whose lowest point does not approach the
-        surface is unchanged.
+        x, y and theta as before the impact, and the velocities after the impact. A state whose lowest point does not
+        approach the surface is returned unchanged.
 
     Raises
     ------
@@ -148,9 +150,9 @@ def _preset() -> Scene:
 
 
 def impact_scene(before: ArrayLike) -> Scene:
-    """Return the preset `measured_ellipse` with the ellipse a nanometre from the surface, before an impact.
+    """Return the preset `measured_ellipse` with the ellipse one nanometre above the surface, just before an impact.
 
-    `before`, shape (6,), is a row as for `impact`.
+    `before`, shape (6,), is one row of the argument of `impact`.
     """
     state = _states(np.asarray(before)[None])[0]
     along, up = (float(rate[0]) for rate in _to_surface(state[3:4], state[4:5], ELLIPSE.tilt))
@@ -163,13 +165,13 @@ def impact_scene(before: ArrayLike) -> Scene:
 
 
 def simulated_impact(before: ArrayLike) -> Array:
-    """Return the states after impacts, as `impact` does, by full simulations of the preset `measured_ellipse`."""
+    """Return the states after impacts, as `impact` does, but from simulations of the preset `measured_ellipse`."""
     states = _states(before)
     for state in states:
         scene = impact_scene(state)
         motion = simulate(scene, t_end=_WHOLE, output_dt=_WHOLE)
         (vx, vy, omega), theta = motion.v[-1], motion.q[-1, 2]
-        # the centre of mass is half a metre from the origin, so the small turn of the impact moves it too
+        # the centre of mass is half a metre from the origin, so the small rotation during the impact moves it too
         x, y = scene.head.com_offset_m
         c, s = np.cos(theta), np.sin(theta)
         state[3:5] = _to_surface(vx - omega * (s * x + c * y), vy + omega * (c * x - s * y), ELLIPSE.tilt)
@@ -178,7 +180,7 @@ def simulated_impact(before: ArrayLike) -> Array:
 
 
 def _numbers(contact: EllipseContact, speed: Array, along: Array, normal_arm: Array) -> tuple[Array, NDArray[np.void]]:
-    """Return the damping factor lambda [s/m] of each impact, and the parameters that they share."""
+    """Return the damping factors lambda [s/m], shape (n,), and all other parameters, which the impacts share."""
     law, wanted = LAWS[contact.law], contact.restitution
     e = np.clip(wanted * (speed / USUAL_SPEED) ** -contact.fall - contact.fall_along * np.abs(along), _LEAST, _LARGEST)
     viscous, damping = 0.0, np.zeros_like(speed)

@@ -1,7 +1,8 @@
 """Drops of a square block: a fit of the first flight, and bands of the motion that follows.
 
 A *touch* is one contact of a corner with the table. Restitution, friction and the point of action vary randomly from
-touch to touch, so the bands are quantiles of many random motions. A *marker* is the frame that the sensor tracks.
+touch to touch, so the bands are quantiles of many random motions. A *marker* is the coordinate frame on the block that
+the sensor tracks.
 """
 
 from __future__ import annotations
@@ -19,17 +20,16 @@ from plow_twin.solve.rounded_block import BLOCK, toss_blocks
 
 Array = NDArray[np.float64]
 
-#: Rate of the measured rows [Hz].
+#: Sample rate of the measured rows [Hz].
 RATE_HZ: Final = 250.0
 _DT: Final = 1.0 / RATE_HZ
 _NUMBERS: Final = 1000
-#: Number of touches with scatter of their own; later touches have the scatter of the last of them.
+#: Number of touches for which random numbers are drawn. Later touches use the numbers of the last of these touches.
 _TOUCHES: Final = 64
-#: Difference [rad] of an angle from the line through the three rows before it that shows an impact.
+#: Smallest deviation [rad] of an angle from the line through the three rows before that shows an impact.
 _TURN_IN_A_ROW: Final = 0.1
 LEAST_ROWS: Final = 4
-#: `_MOST_ROWS`: largest number of rows of the bands, 4 s; a block comes to rest within 1 s
-#: `_FASTEST`: a speed in m/s that no drop reaches
+# largest number of rows of the bands (4 s; a block comes to rest within 1 s), and a speed [m/s] that no drop reaches
 _MOST_ROWS, _FASTEST = 1000, 100.0
 
 #: Parameters of the block, fitted to the odd-numbered drops.
@@ -40,19 +40,20 @@ SQUARE: Final = np.array(
 
 @dataclass(frozen=True)
 class Marker:
-    """The tracked frame on the block.
+    """Place of the tracked coordinate frame on the block.
 
-    In 242 of 250 drops the block lies flat at rest, but its tracked angle is 33 mrad below that of a flat block. The
-    tracked height at rest depends on the side on which the block lies.
+    Two observations show that the frame is not at the centre of the block. In 242 of 250 drops the block lies flat at
+    rest, but the tracked angle is then -33 mrad. The tracked height at rest depends on the side on which the block
+    lies.
     """
 
-    #: measured angle minus true angle of the block [rad]
+    #: Measured angle minus true angle of the block [rad].
     turn: float = 0.0
-    #: vector from the centre of the block to the tracked point, in the axes of the block [m]
+    #: Vector [m] from the centre of the block to the tracked point, in the axes of the block.
     lever: tuple[float, float] = (0.0, 0.0)
 
     def state_of_block(self, measured: Array) -> Array:
-        """Return the states of a block, shape (..., 6), whose marker has the states `measured`."""
+        """Return the states of the block, shape (..., 6), given the states of its marker."""
         return self._moved(measured - [0.0, 0.0, self.turn, 0.0, 0.0, 0.0], -1.0)
 
     def measured(self, block: Array) -> Array:
@@ -74,25 +75,26 @@ class Marker:
         return moved
 
 
-#: Place of the tracked frame on the block, fitted to the odd-numbered drops.
+#: Place of the marker, fitted to the odd-numbered drops.
 MARKER: Final = Marker(-0.0308, (2.3e-4, 5.2e-4))
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """Standard deviations of the random part of the parameters, the fitted speeds and the measured rows."""
+    """Standard deviations of the random parts of the parameters, of the fitted speeds and of the measured rows."""
 
-    #: from touch to touch: restitution [1], logarithm of the friction, place along the table where the force acts [m]
+    #: Variation from touch to touch: restitution [1], logarithm of the friction, and place along the table where the
+    #: force acts [m].
     restitution: float = 0.065
     friction: float = 0.5
     shift: float = 1.5e-3
-    #: from drop to drop: height of the table [m], logarithm of the drag
+    #: Variation from drop to drop: height of the table [m], and logarithm of the drag.
     table: float = 3e-4
     drag: float = 0.2
-    #: errors of the fitted flight: speed [m/s], rate of turning [rad/s]
+    #: Errors of the fitted flight: speed [m/s], and angular velocity [rad/s].
     speed: float = 0.005
     spin: float = 0.05
-    #: errors of a measured row: place [m], angle [rad]
+    #: Errors of a measured row: place [m], and angle [rad].
     place: float = 6e-5
     angle: float = 1e-3
 
@@ -102,17 +104,16 @@ SCATTER: Final = Scatter()
 
 @cache
 def damping_numbers() -> Array:
-    """Return damping numbers D of `exact_restitution` for restitutions from 0 to 1, shape (1001,)."""
+    """Return the damping numbers D of `exact_restitution` for 1001 equally spaced restitutions 0..1, shape (1001,)."""
     law = LAWS["exact_restitution"]
     return np.array([law.damping_number(i / _NUMBERS) for i in range(_NUMBERS + 1)])
 
 
 def toss(initial: Array, n_rows: int, blocks: NDArray[np.void], scatter: Array | None = None) -> Array:
-    """Return the motions of blocks at 250 Hz, shape (m, n_rows, 6), from their states in the first row, shape (m,
-    6).
+    """Return the motions of m blocks at 250 Hz, shape (m, n_rows, 6), given their initial states, shape (m, 6).
 
-    A state has x, z [m], theta [rad] and their rates. `blocks` are of `solve.rounded_block.BLOCK`, shape (m,).
-    `scatter`, shape (m, touches, 3), is that of `toss_blocks`.
+    A state consists of x, z [m], theta [rad] and their rates. `blocks`, shape (m,), has the type
+    `solve.rounded_block.BLOCK`. `scatter`, shape (m, touches, 3), is the argument of `toss_blocks`.
     """
     rows = np.zeros((len(initial), n_rows, 6))
     rows[:, 0] = initial
@@ -125,18 +126,19 @@ def toss(initial: Array, n_rows: int, blocks: NDArray[np.void], scatter: Array |
 class Flight:
     """A fitted first flight."""
 
-    #: x, z, theta and their rates at the last row, shape (6,)
+    #: State x, z, theta and their rates at the last row, shape (6,).
     state: Array
-    #: covariance of place and rate at the last row, for each of x, z, theta, shape (3, 2, 2)
+    #: Covariance of value and rate at the last row, for each of x, z and theta, shape (3, 2, 2).
     covariance: Array
-    #: times of the rows relative to the last row [s], shape (k,); a lost row adds one interval
+    #: Times [s] of the rows relative to the last row, shape (k,). A lost row adds one interval.
     times: Array
 
 
 def fit_flight(first_flight: ArrayLike, block: NDArray[np.void] = SQUARE, scatter: Scatter = SCATTER) -> Flight:
-    """Fit a flight with drag to rows x, z [m], theta [rad] at 250 Hz before the first impact, shape (k, 3).
+    """Fit a flight with drag to the rows before the first impact, by robustly weighted least squares.
 
-    The weights are robust. Of `block`, gravity and drag are used; of `scatter`, the errors of a measured row.
+    `first_flight`, shape (k, 3), contains rows x, z [m], theta [rad] at 250 Hz. Gravity and drag are those of `block`.
+    The errors of a measured row are those of `scatter`.
 
     Raises
     ------
@@ -171,7 +173,10 @@ def fit_flight(first_flight: ArrayLike, block: NDArray[np.void] = SQUARE, scatte
 
 
 def _free_flight(block: NDArray[np.void], axis: int, times: Array) -> tuple[Array, Array]:
-    """Return the way at each time of a flight with drag: the part per rate at time 0, and the part of gravity."""
+    """Return the displacement at the times [s], shape (n,), of a flight with drag, as two parts of shape (n,).
+
+    The first part is the displacement per unit of rate at time 0. The second part is the displacement by gravity.
+    """
     drag = block["spin_drag" if axis == 2 else "drag"]
     way = (1.0 - np.exp(-drag * times)) / drag
     fall = -block["gravity"] / drag * (times - way) if axis == 1 else np.zeros_like(times)
@@ -179,7 +184,8 @@ def _free_flight(block: NDArray[np.void], axis: int, times: Array) -> tuple[Arra
 
 
 def _leaves_flight(rows: Array) -> bool:
-    """Return whether the last row follows an impact: it turns differently, or rises after a fall."""
+    """Return whether the last row follows an impact: its angle deviates from the line before, or it rises after a fall.
+    """
     t = np.arange(-3.0, 1.0)
     turn = float(np.polyval(np.polyfit(t[:3], rows[-4:-1, 2], 1), t[3]))
     return bool(
@@ -188,7 +194,10 @@ def _leaves_flight(rows: Array) -> bool:
 
 
 def _row_times(rows: Array, gravity: float) -> Array:
-    """Return the times of the rows in s, 0 at the last row; a doubled distance between rows shows a lost row."""
+    """Return the times [s] of the rows, shape (k,), with 0 at the last row.
+
+    A lost row doubles the distance between its neighbours and is counted as an interval.
+    """
     way = np.hypot(*np.diff(rows[:, :2], axis=0).T)
     steps = np.ones(len(way))
     for _ in range(3):
@@ -217,7 +226,7 @@ def _fit_line(way: Array, values: Array, noise: float) -> tuple[Array, Array]:
 def draw(
     flight: Flight, members: int, seed: int, block: NDArray[np.void], scatter: Scatter
 ) -> tuple[Array, NDArray[np.void], Array]:
-    """Draw initial states (m, 6), blocks (m,) and scatter of touches (m, touches, 3)."""
+    """Draw initial states, shape (m, 6), blocks, shape (m,), and random parts of the touches, shape (m, touches, 3)."""
     rng = np.random.default_rng(seed)
     states = np.tile(flight.state, (members, 1))
     for j, more in enumerate((scatter.speed, scatter.speed, scatter.spin)):
@@ -240,9 +249,9 @@ def ensemble(
     scatter: Scatter = SCATTER,
     marker: Marker = MARKER,
 ) -> Array:
-    """Return random marker motions x, z, theta that fit the first flight, shape (members, n_rows, 3).
+    """Return random motions x, z, theta of the marker that continue the first flight, shape (members, n_rows, 3).
 
-    The rows are counted from the first row of `first_flight`; other arguments are those of `fit_flight`.
+    The rows are counted from the first row of `first_flight`. See `fit_flight` for the remaining arguments.
     """
     flight = fit_flight(first_flight, block, scatter)
     given = len(flight.times)

@@ -1,1 +1,1 @@
-"""Statistics over a grid of two parameters."""
+"""Statistics of a motion as functions of one or two parameters."""

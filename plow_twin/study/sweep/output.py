@@ -1,4 +1,4 @@
-"""A sweep as a Parquet file and as a picture."""
+"""Output of a sweep as a Parquet file and as a picture."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 METADATA_KEY: Final = "plow_twin"
-#: Statistics that are whole numbers.
+#: Statistics that are integers.
 _COUNTS: Final = ("makes", "events", "steps")
 
 
 def write_parquet(table: Table, path: Path) -> None:
-    """Write one row for each member: parameters, status (0 if done), status in words, and statistics.
+    """Write one row for each member: parameters, status (0 if computed), status in words, and statistics.
 
-    The metadata key `plow_twin` holds JSON with the arguments (the scene as YAML), units, package version and builds.
+    The metadata key `plow_twin` contains a JSON text with the arguments, the units, the package version and the builds.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -45,7 +45,7 @@ def write_parquet(table: Table, path: Path) -> None:
         "package_version": package_version(),
         "builds": [json.loads(build) for build in table.builds],
     }
-    # sorted keys give the same bytes for the same table
+    # with sorted keys, equal tables give identical files
     arrow = pa.table(columns).replace_schema_metadata({METADATA_KEY: json.dumps(facts, sort_keys=True)})
     with whole_file(path) as stream:
         pq.write_table(arrow, stream)
@@ -79,7 +79,7 @@ def _curve(axes: Axes, table: Table, index: int) -> None:
 
     (axis,) = table.sweep.axes
     numbers, places = _scaled(table, index), _places(axis)
-    # no line joins words, because there are no values between them
+    # words have no values between them, so no line is drawn
     style = "none" if isinstance(axis.values[0], str) else "-"
     axes.plot(places, numbers, marker="o", markersize=3 if style == "-" else 6, linestyle=style)
     for member in table.failed:
@@ -125,7 +125,7 @@ def _places(axis: Axis) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def _edges(axis: Axis) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return the borders of the cells of a heat map, halfway between values (on a log axis between logarithms)."""
+    """Return the edges of the cells of a heat map, halfway between neighbouring values or their logarithms."""
     places = np.log(_places(axis)) if axis.log else _places(axis)
     if len(places) == 1:
         half = 0.5 * abs(places[0]) or 0.5

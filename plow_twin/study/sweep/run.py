@@ -16,11 +16,11 @@ from plow_twin.study.store import Store
 from plow_twin.study.sweep.table import Sweep, Table, run_members_of
 
 Array = NDArray[np.float64]
-OnProgress = Callable[[int], object]  # gets the number of finished members
+OnProgress = Callable[[int], object]  # Callback that receives the number of finished members.
 
 
 def run_here(store: Store, workers: int | None = None, on_progress: OnProgress = lambda count: None) -> Table:
-    """Compute and store the missing chunks with threads of this process; return the whole table."""
+    """Compute and store the missing chunks with threads of this process. Return the whole table."""
     chunks, missing = store.chunks, store.missing()
     done = store.sweep.size - sum(len(chunks[index]) for index in missing)
     build = _build()
@@ -36,10 +36,10 @@ def run_here(store: Store, workers: int | None = None, on_progress: OnProgress =
 
 
 def run_on_cluster(store: Store, address: str, on_progress: OnProgress = lambda count: None) -> Table:
-    """Compute the missing chunks on the Dask cluster at `address`; return the whole table.
+    """Compute the missing chunks on the Dask cluster at `address`. Return the whole table.
 
-    Each chunk is a task, whose result is stored as it arrives. The scheduler gives the tasks of a dead worker to
-    another.
+    Each chunk is one task, and its result is stored on arrival. If a worker dies, the scheduler assigns its tasks to
+    another worker.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def run_on_cluster(store: Store, address: str, on_progress: OnProgress = lambda 
             try:
                 table, build = future.result()
             except Exception as error:
-                # a worker can raise any error; the stored chunks serve the next call
+                # a worker can raise any error; the next call continues with the stored chunks
                 raise StudyError(f"dask: chunk {index}: {type(error).__name__}: {error}") from error
             store.write(index, table, build)
             done += len(chunks[index])
@@ -68,7 +68,7 @@ def run_on_cluster(store: Store, address: str, on_progress: OnProgress = lambda 
 
 
 def _task(sweep: Sweep, members: list[int]) -> tuple[Array, str]:
-    """Compute a chunk with a single thread, because each thread of a worker runs a task."""
+    """Compute a chunk with one thread, because each thread of a worker runs a task."""
     return run_members_of(sweep, members, workers=1), _build()
 
 

@@ -1,4 +1,4 @@
-"""A sweep: statistics of the motion while one or two parameters of a scene vary.
+"""A sweep: statistics of the motion for each value of one parameter, or each combination of two parameters.
 
 A *member* of a sweep is one run, with one value of each parameter.
 """
@@ -24,15 +24,15 @@ from plow_twin.study.statistics import statistic, statistics_of
 
 Array = NDArray[np.float64]
 
-#: Status of a member whose parameters make the scene unusable.
+#: Status of a member whose parameters give an unusable scene.
 UNUSABLE: Final = -1
-#: Largest number of members; the table and the list of chunks are kept in memory.
+#: Largest number of members, because the table and the list of chunks are kept in memory.
 _MOST_MEMBERS: Final = 1_000_000
 
 
 @dataclass(frozen=True)
 class Axis:
-    """A parameter and the values that it takes."""
+    """A parameter and its values."""
 
     path: str
     values: tuple[Value, ...]
@@ -40,7 +40,7 @@ class Axis:
 
 
 def parse_axis(text: str, scene: Scene) -> Axis:
-    """Read `PATH=LOW:HIGH:COUNT[:log]` or `PATH=VALUE,VALUE..`, or raise a `StudyError` that names the axis."""
+    """Parse `PATH=LOW:HIGH:COUNT[:log]` or `PATH=VALUE,VALUE..`, or raise a `StudyError` that names the axis."""
     path, _, rest = text.partition("=")
     check_path(scene, path)
     expected = f"{path}=LOW:HIGH:COUNT[:log] or {path}=VALUE,VALUE.."
@@ -73,7 +73,7 @@ def parse_axis(text: str, scene: Scene) -> Axis:
 
 @dataclass(frozen=True)
 class Sweep:
-    """The arguments of a sweep as plain data. `scene_yaml` needs no other file."""
+    """The arguments of a sweep as plain data. `scene_yaml` is self-contained: it refers to no other file."""
 
     scene_yaml: str
     axes: tuple[Axis, ...]
@@ -94,45 +94,45 @@ class Sweep:
             statistic(scene, name)
 
     def scene(self) -> Scene:
-        """Return the scene."""
+        """Return the scene, parsed from `scene_yaml`."""
         return loads_scene(self.scene_yaml)
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Number of values of each axis; the last axis varies fastest."""
+        """The number of values of each axis. The last axis varies fastest."""
         return tuple(len(axis.values) for axis in self.axes)
 
     @property
     def size(self) -> int:
-        """Number of members."""
+        """The number of members."""
         return math.prod(self.shape)
 
     def values(self, member: int) -> dict[str, Value]:
-        """Return the parameter values of a member by path."""
+        """Return the value of each parameter in a member, by path."""
         places = np.unravel_index(member, self.shape)
         return {axis.path: axis.values[int(place)] for axis, place in zip(self.axes, places, strict=True)}
 
     def arguments(self) -> dict[str, Any]:
-        """Return everything that determines the result, as plain data for JSON."""
+        """Return all arguments that determine the result, as plain data for JSON."""
         plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         return plain
 
 
 @dataclass(frozen=True)
 class Table:
-    """Results of a sweep: one row for each of m members."""
+    """Results of a sweep, with one row for each of m members."""
 
     sweep: Sweep
-    #: `plow_twin.solve.state.Status` or `UNUSABLE`, shape (m,)
+    #: Status of each member: `plow_twin.solve.state.Status` or `UNUSABLE`, shape (m,).
     status: NDArray[np.int64]
-    #: shape (m, statistics); NaN for a member whose status is not 0
+    #: Statistics, shape (m, statistics); NaN for a member whose status is not 0.
     numbers: Array
-    #: versions, processor and platform of each build that computed members
+    #: Versions, processor and platform of each build that computed members.
     builds: tuple[str, ...] = field(default=())
 
     @property
     def failed(self) -> list[int]:
-        """Indices of the members without a result."""
+        """The indices of the members without a result."""
         return [int(member) for member in np.flatnonzero(self.status)]
 
     def reason(self, member: int) -> str:
@@ -150,9 +150,9 @@ class Table:
 def run_members_of(
     sweep: Sweep, members: Sequence[int], workers: int | None = None, on_done: Callable[[int], None] | None = None
 ) -> Array:
-    """Compute the members with these indices; return status and statistics, shape (k, 1 + statistics).
+    """Compute the members with the given indices. Return status and statistics, shape (k, 1 + statistics).
 
-    A member has the same bits in any chunk, in any thread, and on any machine with the same build.
+    A member gives bit-identical results in any chunk, in any thread, and on any machine with the same build.
     """
     scene = replace(sweep.scene(), marks={})
     table = np.full((len(members), 1 + len(sweep.statistics)), np.nan)
