@@ -1,1 +1,1 @@
-"""The operator's screen: a page in the browser, served by a process of its own."""
+"""The operator's screen: a web page, served by a separate process."""

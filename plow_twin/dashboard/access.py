@@ -1,4 +1,4 @@
-"""Access to the screen: its address, its token, and the host names that it answers to."""
+"""Access to the operator's screen: its address, its token, and the host names under which it can be requested."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from urllib.parse import urlsplit
 from plow_twin.access import is_address, is_loopback, read_secret
 from plow_twin.errors import InputError, Problem
 
-#: Environment variable with the token, if there is no token file.
+#: Environment variable that contains the token if no token file is given.
 TOKEN_VARIABLE: Final = "PLOW_TWIN_DASHBOARD_TOKEN"
 _SHORTEST: Final = 16
 
 
 class DashboardError(InputError):
-    """The screen cannot be served as requested."""
+    """The screen cannot be served at the requested address."""
 
     def __init__(self, key: str, got: object, expected: str) -> None:
         super().__init__([Problem(key, got, expected)], "dashboard")
@@ -27,7 +27,8 @@ class DashboardError(InputError):
 
 @dataclass(frozen=True)
 class PageAccess:
-    """Address and token of the screen; without a token everybody on this machine may look and acknowledge."""
+    """Address and token of the screen. Without a token, all users of this machine can read it and acknowledge alarms.
+    """
 
     host: str
     port: int
@@ -35,9 +36,10 @@ class PageAccess:
 
     @classmethod
     def of(cls, listen: str, token_file: Path | None) -> PageAccess:
-        """Return the access for HOST:PORT, with the token in the first line of a file or in the environment.
+        """Return the access for HOST:PORT. The token is the first line of a file, or is taken from the environment.
 
-        Raises DashboardError if the address cannot be read, or other machines reach it and there is no token.
+        Raises `DashboardError` if the address cannot be parsed, or if other machines can reach the address and there is
+        no token.
         """
         try:
             parts = urlsplit(f"//{listen}")
@@ -55,14 +57,14 @@ class PageAccess:
         return cls(host, port, token)
 
     def admits(self, token: object) -> bool:
-        """Return whether a token is right, in a time that does not depend on the token."""
+        """Compare a token with the token of the screen, in a time that does not depend on the tokens."""
         given = token if isinstance(token, str) else ""
         return hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
 
     def answers_to(self, host: str) -> bool:
-        """Return whether the page answers to a name in `Host`.
+        """Return whether the screen can be requested under the name in the header `Host`.
 
-        Somebody else's name could point to this address to read the screen (DNS rebinding).
+        Other names are rejected: with DNS rebinding, a foreign page could use its own name to read the screen.
         """
         try:
             name = urlsplit(f"//{host}").hostname or ""
@@ -73,12 +75,12 @@ class PageAccess:
         return not is_loopback(self.host) and (is_address(name) or name in (socket.gethostname(), socket.getfqdn()))
 
     def is_own(self, origin: str | None, host: str) -> bool:
-        """Return whether a connection comes from the page itself, or from a program that is no browser."""
+        """Return whether a request comes from the page itself, or from a program that is not a browser."""
         return origin is None or urlsplit(origin).netloc.lower() == host.lower()
 
 
 def listening(access: PageAccess) -> socket.socket:
-    """Return a socket that listens; raise DashboardError if the address is in use or not this machine's."""
+    """Return a listening socket. Raise `DashboardError` if the address is in use or does not belong to this machine."""
     try:
         family, kind, _, _, address = socket.getaddrinfo(access.host, access.port, type=socket.SOCK_STREAM)[0]
         found = socket.socket(family, kind)

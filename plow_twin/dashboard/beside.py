@@ -1,4 +1,4 @@
-"""A process beside a twin, whose faults do not affect the twin."""
+"""A separate process beside a twin, whose failures do not affect the twin."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from typing import Any, Final, Self
 
 from plow_twin.dashboard.link import pair
 
-#: Longest time that the process may take to end [s].
+#: Longest time [s] in which the process must end on request.
 END_S: Final = 3.0
 
 
 class Beside:
     """A running process and the link to it, as a context manager that ends the process.
 
-    The arguments of the module are the descriptor of the link, then `descriptors`. The message `first` carries the
-    secrets, because other users can read a command line.
+    The command-line arguments of the module are the file descriptor of the link, followed by `descriptors`. Secrets are
+    in the message `first`, because other users can read the command line.
     """
 
     def __init__(self, module: str, first: dict[str, Any], descriptors: Sequence[int] = ()) -> None:
         self.link, theirs = pair()
         with theirs:
             numbers = (theirs.fileno(), *descriptors)
-            # in its own session, the process gets no Ctrl-C; it ends with the twin
+            # in its own session, the process does not receive Ctrl-C; `close` ends it
             self.process = subprocess.Popen(
                 [sys.executable, "-m", module, *map(str, numbers)],
                 stdin=subprocess.DEVNULL,

@@ -1,4 +1,4 @@
-"""State of the screen's server: the newest values, and the last hour."""
+"""State of the screen's server: the newest values, and the history of the last hour."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _EVENTS: Final = 200
 
 
 class Board:
-    """The newest values, each with the number of the update that brought it."""
+    """The newest values. Each value is stored with the number of the update that contained it."""
 
     def __init__(self) -> None:
         self.version = 0
@@ -25,7 +25,7 @@ class Board:
         self._history = History()
         self._not_taken = 0
         self._updated_s = time.monotonic()
-        #: set by the next update, and then replaced
+        #: Event that is set by the next update. Each update replaces it by a new event.
         self.news = asyncio.Event()
         self.pages = 0
 
@@ -46,12 +46,12 @@ class Board:
         self.tell()
 
     def tell(self) -> None:
-        """Wake the pages."""
+        """Wake all pages that wait for an update."""
         news, self.news = self.news, asyncio.Event()
         news.set()
 
     def since(self, version: int) -> dict[str, Any]:
-        """Return the values newer than update `version`, the last that a page has received; 0: all."""
+        """Return all values that are newer than the update `version`; with 0, return all values."""
         found: dict[str, Any] = {
             "version": self.version,
             "age": round(time.monotonic() - self._updated_s, 2),

@@ -1,6 +1,6 @@
-"""The feed of a process beside a twin, which sums up publications and sends the sums at a fixed rate.
+"""Feed of a process beside a twin: it collects publications and sends summaries at a fixed rate.
 
-The peaks and newest values of an update for which there is no room go into the next update.
+If an update does not fit in the buffer of the link, its peaks and newest values become part of the next update.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from plow_twin.stream.outputs import CLEARANCE_NAMES, Published
 Array = NDArray[np.float64]
 
 RATE_HZ: Final = 10.0
-#: Largest number of publications that wait to be summed up.
+#: Largest number of publications that wait to be summarised.
 _MOST: Final = 256
 _EVENTS: Final = 20
 _LONGEST: Final = 1000
-#: Largest number of operators' requests that are handled at once.
+#: Largest number of operator requests that are handled in one call.
 _MOST_ASKED: Final = 8
 _NO_LOAD: Final = np.full(3, np.nan)
-#: States of a measured clearance, repeated here because `estimate` is not imported.
+#: States of a clearance with a measured value. They are repeated here, so that `estimate` need not be imported.
 _KNOWN_STATES: Final = ("estimated", "rough")
 
 
 class Motion:
-    """The newest motion, and the extremes since the last `clear`."""
+    """The newest motion, and the extremes since the last call of `clear`."""
 
     def __init__(self) -> None:
-        #: stamp reached [ns]; 0: none yet
+        #: Stamp [ns] that the motion has reached; 0 before the first stamp.
         self.stamp_ns = 0
         self.pose = np.full(3, np.nan)
         self.penetration = np.full(PAIR_COUNT, np.nan)
         self.force = np.full(PAIR_COUNT, np.nan)
         self.clearance: Array | None = None
-        #: the newest estimate, until newer clearances are published
+        #: The newest estimate, until newer clearances are published.
         self.estimate: Mapping[str, str] = {}
         self.status: Mapping[str, str] = {}
         self.load = _NO_LOAD
@@ -52,7 +52,7 @@ class Motion:
     def clear(self) -> None:
         """Reset the extremes."""
         self.peak = np.zeros(PAIR_COUNT)
-        #: 5 % and 95 % points of the peaks, shape (2, 8), where they are known
+        #: 5 % and 95 % points of the peaks, shape (2, 8), or None if they are unknown.
         self.points: Array | None = None
         self.lowest = self.highest = self.load
         self.was_held = False
@@ -64,17 +64,17 @@ class Motion:
         self.highest = np.fmax(self.highest, np.fmax.reduce(wrench))
 
     def add_peaks(self, peak: Array) -> None:
-        """Add the largest forces since the previous row [N], shape (n, 8)."""
+        """Add the largest forces [N] since the previous row, shape (n, 8)."""
         self.peak = np.maximum(self.peak, peak.max(axis=0))
 
     def add_points(self, low: Array, high: Array) -> None:
-        """Add the 5 % and 95 % points [N] of the same forces, shape (n, 8) each."""
+        """Add the 5 % and 95 % points [N] of the largest forces, shape (n, 8) each."""
         points = np.stack((low.max(axis=0), high.max(axis=0)))
         self.points = points if self.points is None else np.maximum(self.points, points)
 
     def add_rows(self, waiting: list[Published]) -> None:
         """Add publications of a twin."""
-        # joining records takes numpy thirty times as long as joining columns
+        # numpy concatenates single columns thirty times faster than records
         rows = [published.rows for published in waiting]
         newest = rows[-1][-1]
         self.stamp_ns = int(newest["stamp_ns"])
@@ -89,7 +89,7 @@ class Motion:
             self.set_clearance(slow["clearance"][-1])
 
     def set_clearance(self, values: Array) -> None:
-        """Take the clearances of a publication [m], in the order of `CLEARANCE_NAMES`."""
+        """Set the clearances of a publication [m], in the order of `CLEARANCE_NAMES`."""
         self.clearance, self.estimate = values, {}
 
     def _clearances(self, values: Array) -> dict[str, float | None]:
@@ -122,7 +122,7 @@ class Motion:
 
 
 class Feed:
-    """Updates from a twin, or from a reader beside it, to the screen or a receiver of telemetry.
+    """Sender of updates from a twin, or from a reader beside it, to the screen or a receiver of telemetry.
 
     Parameters
     ----------
@@ -131,15 +131,16 @@ class Feed:
     facts
         Facts about the machine (`facts.facts_of`).
     answer
-        Carries out an operator's request (`acknowledge` or `mark`, with a text), and returns success and an answer.
+        Function that carries out an operator request: `acknowledge`, or `mark` with a text. It returns success and an
+        answer.
     load
-        Returns the load Fx, Fy [N], M [N m] at the newest publication, shape (3,).
+        Function that returns the load Fx, Fy [N], M [N m] at the newest publication, shape (3,).
     on_error
-        Called with the reason when the feed has ended.
+        Callback that receives the reason when the feed has ended.
     process, consequence
-        Name of the process, and what its end means for the user.
+        Name of the process, and the consequence of its end for the user.
     by_second
-        Whether to send an update for each second of stamps, even if samples arrive faster than in real time.
+        If True, an update is sent for each second of stamps, even if samples arrive faster than in real time.
     """
 
     def __init__(
@@ -166,11 +167,11 @@ class Feed:
         self._loads: list[Array] = []
         self.motion = Motion()
         self._second = 0
-        #: number of updates that the process took, and for which it had no room
+        #: Number of updates that were sent, and number of updates that did not fit in the buffer.
         self.taken = self.not_taken = 0
 
     def publication(self, published: Published) -> None:
-        """Add a publication of at least one row to the next update."""
+        """Add a publication with at least one row to the next update."""
         second = int(published.rows["stamp_ns"][-1]) // NS_PER_S
         if self._by_second and second != self._second and self._waiting:
             self.send()
@@ -182,24 +183,24 @@ class Feed:
             self._sum_up()
 
     def part(self, name: str, part: Part) -> None:
-        """Add a status, which replaces that of the same name."""
+        """Add a status. It replaces the previous status with the same name."""
         level, message, values = part
-        # a part of the diagnostics has the name of this topic; only it has the key `estimates`
+        # the diagnostics have a part with the name of this topic, which is recognised by its key `estimates`
         if name == "estimate" and "estimates" not in values:
-            self._sum_up()  # publications before the estimate
+            self._sum_up()  # publications before the estimate come first
             self.motion.estimate = values
         elif name == "status":
             self.motion.status = values
         self._parts[name] = level, message[:_LONGEST], {key: text[:_LONGEST] for key, text in values.items()}
 
     def event(self, kind: str, text: str, *, done: bool = True, stamp_ns: int | None = None) -> None:
-        """Add an event, by default at the stamp reached."""
+        """Add an event, by default at the newest stamp."""
         at_ns = self.motion.stamp_ns if stamp_ns is None else stamp_ns
         self._events.append({"t": at_ns * 1e-9, "kind": kind, "text": text[:_LONGEST], "done": done})
         del self._events[:-_EVENTS]
 
     def turn(self) -> None:
-        """Carry out operators' requests and send an update; to be called at the rate of the updates."""
+        """Handle operator requests and send an update. This method must be called at the rate of the updates."""
         self.hear()
         self.send()
         if self._link.broken and not self._ended:
@@ -207,7 +208,7 @@ class Feed:
             self._on_error(self._end)
 
     def hear(self) -> None:
-        """Carry out operators' requests, and read reports of the process."""
+        """Handle operator requests, and receive reports of the process."""
         for _ in range(_MOST_ASKED):
             asked = self._link.receive()
             if asked is None:
@@ -218,7 +219,7 @@ class Feed:
                 self._do(asked)
 
     def send(self) -> bool:
-        """Send an update; if there is no room, count it and return False."""
+        """Send an update. Return False, and count the update, if it does not fit in the buffer of the link."""
         self._sum_up()
         update: dict[str, Any] = {**self._news, "not_taken": self.not_taken}
         if self._parts:
@@ -257,7 +258,7 @@ def _joined(rows: list[NDArray[np.void]], name: str) -> NDArray[Any]:
 
 
 def part_of(message: Message) -> Part:
-    """Return a status or named numbers (of forces: the peaks) in the form of the page."""
+    """Convert a status or named numbers to the form of the page. Of contact forces, the peaks are used."""
     if isinstance(message, DiagnosticStatus):
         return message.level, message.message, dict(message.values)
     if not isinstance(message, JointState):

@@ -1,4 +1,4 @@
-"""The last hour of the screen: the extremes of each second of stamps."""
+"""History of the last hour for the screen: the extremes in each second of stamps."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from collections import deque
 from typing import Any, Final
 
 SPAN_S: Final = 3600
-#: The clearances of a second, in their order.
+#: Clearances of a second, in the order of the page.
 _CLEARANCES: Final = tuple(f"{name}{point}" for name in ("horizontal", "vertical") for point in ("", "/p05", "/p95"))
 
 
 class History:
-    """The kept seconds, each with the number of the update that changed it last, so that a page gets only newer ones.
+    """The seconds of the last hour. A page can request the seconds that have changed since its last update.
 
-    A second is a list: time [s], eight peaks, six extremes of load, six clearances, the hold flag, and where intervals
-    are known, the 5 % and 95 % points of the peaks.
+    A second is a list: time [s], eight peaks, six extremes of the load, six clearances, and the hold flag. If intervals
+    of the peaks are known, their 5 % and 95 % points follow.
     """
 
     def __init__(self) -> None:
@@ -22,7 +22,7 @@ class History:
         self._versions: deque[int] = deque()
 
     def add(self, motion: dict[str, Any], version: int) -> bool:
-        """Add the motion of an update; return whether the stamps stepped back, which clears the hour."""
+        """Add the motion of an update. If the stamps have stepped back, clear the history and return True."""
         second = int(motion["t"])
         stepped_back = bool(self._seconds) and second < self._seconds[-1][0]
         if stepped_back:
@@ -49,7 +49,7 @@ class History:
         return stepped_back
 
     def since(self, version: int) -> list[list[Any]]:
-        """Return the seconds that changed after the update `version`."""
+        """Return the seconds that have changed since the update `version`."""
         count = 0
         for found in reversed(self._versions):
             if found <= version:
@@ -59,7 +59,7 @@ class History:
 
 
 def _joined(before: list[Any], now: list[Any]) -> list[Any]:
-    """Merge a second with later values: the extremes of peaks and loads, the newest clearances."""
+    """Merge a second with later values: the extremes of peaks and loads, and the newest clearances."""
     largest = [_extreme(max, *pair) for pair in zip(before[1:9], now[1:9], strict=True)]
     lowest = [_extreme(min, *pair) for pair in zip(before[9:12], now[9:12], strict=True)]
     highest = [_extreme(max, *pair) for pair in zip(before[12:15], now[12:15], strict=True)]

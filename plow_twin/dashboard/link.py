@@ -1,4 +1,4 @@
-"""The link between a twin and a process beside it: whole, bounded messages in both directions, without waiting."""
+"""Link between a twin and a process beside it: messages of limited size in both directions, without blocking."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from contextlib import suppress
 from typing import Any, Final
 
 LONGEST: Final = 1 << 16
-#: Room for messages that wait for the other side [B].
+#: Size of the buffer for messages that wait for the other process [B].
 _ROOM: Final = 1 << 18
 
 
 class Link:
-    """One end of the link, a socket of type SOCK_SEQPACKET; each message is a JSON object."""
+    """One end of the link, a socket of type SOCK_SEQPACKET. Each message is a JSON object."""
 
     def __init__(self, end: socket.socket) -> None:
         end.setblocking(False)
@@ -23,11 +23,11 @@ class Link:
         self.broken = False
 
     def fileno(self) -> int:
-        """Return the descriptor, for `select`."""
+        """Return the file descriptor, for `select`."""
         return self._end.fileno()
 
     def send(self, message: dict[str, Any]) -> bool:
-        """Send a message; return False if there is no room or no receiver, or the message is too long."""
+        """Send a message. Return False if it is too long, if the buffer is full, or if there is no receiver."""
         data = json.dumps(message, separators=(",", ":")).encode()
         if self.broken or len(data) > LONGEST:
             return False
@@ -40,7 +40,7 @@ class Link:
             return False
 
     def receive(self) -> dict[str, Any] | None:
-        """Return the next message, or None."""
+        """Return the next message, or None if none has arrived."""
         if self.broken:
             return None
         try:
@@ -56,23 +56,23 @@ class Link:
         return found
 
     def close(self) -> None:
-        """Close this end, so that the other end finds the link broken."""
+        """Close this end. The other end then finds the link broken."""
         with suppress(OSError):
             self._end.close()
         self.broken = True
 
 
 def pair() -> tuple[Link, socket.socket]:
-    """Return this side's end and the socket for the other process."""
+    """Return the end of this process, and the socket for the other process."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     return Link(ours), theirs
 
 
 def number(value: float) -> float | None:
-    """Return a number for JSON, rounded to seven digits; None if it is not finite."""
+    """Round a number to seven digits for JSON. Return None if it is not finite."""
     return float(f"{value:.7g}") if math.isfinite(value) else None
 
 
 def numbers(values: Any) -> list[float | None]:
-    """Return the numbers of an array as by `number`."""
+    """Return the numbers of an array, each rounded by `number`."""
     return [number(value) for value in values.tolist()]

@@ -15,7 +15,7 @@ from plow_twin.record.alarms import ALARMS, alarms_message
 
 
 def open_screen(front: BridgeFront, access: PageAccess, source: str) -> Screen:
-    """Open the screen of a twin that does not run yet; raise the errors of `Screen`."""
+    """Open the screen of a twin that has not been started yet. The errors are those of `Screen`."""
     runtime = front.runtime
     services = Services(runtime, front.changed)
 

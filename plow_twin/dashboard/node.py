@@ -1,4 +1,4 @@
-"""The screen of a node: a process beside it reads its topics and calls its services."""
+"""The screen of a ROS node: a separate process subscribes to the topics of the node and calls its services."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ _SHOWN: Final = (
     "scene", "hardware_id", "excitation_source", "forecast_limits", "alarm_force", "alarm_clearance",
     "alarm_clearance_rate", "alarm_wear_rate", "alarm_residual", "alarm_duration",
 )  # fmt: skip
-#: Longest time that a service may take to answer [s].
+#: Longest time to wait for the answer of a service [s].
 _PATIENCE_S: Final = 5.0
-#: Queue depths of topics whose newest message is enough, and of which all messages are needed.
+#: Queue depths: of topics of which only the newest message is needed, and of topics of which all messages are needed.
 _NEWEST, _ALL = 1, 1000
 
 
 class NodeWatch:
-    """Listens to a node; raises DashboardError if it is `stopped` or does not find the node within `wait_s`."""
+    """Client of a node. Raises `DashboardError` if it does not find the node within `wait_s`, or is `stopped`."""
 
     def __init__(self, namespace: str, name: str, wait_s: float, stopped: Callable[[], bool]) -> None:
         self.node = WithoutEvents(
@@ -75,13 +75,14 @@ class NodeWatch:
             waited += 0.1
 
     def spin(self) -> None:
-        """Process messages, waiting a little for them."""
+        """Process messages, and wait up to 0.1 s for a message."""
         self._executor.spin_once(timeout_sec=0.1)
 
     def facts(self, scene: str | None) -> dict[str, Any]:
-        """Return the facts of the node; `scene` replaces its scene if it cannot be read here by its name.
+        """Return the facts of the node. `scene` replaces the scene of the node if its file cannot be read on this
+        machine.
 
-        Raises DashboardError if the node does not answer, and SceneError if the scene cannot be read.
+        Raises `DashboardError` if the node does not answer, and `SceneError` if the scene cannot be read.
         """
         answer = self._called(self._ask, GetParameters.Request(names=list(_SHOWN)))
         if answer is None:
@@ -93,7 +94,7 @@ class NodeWatch:
         return facts_of(found, parameters, f"node {self.name}")
 
     def listen(self, feed: Feed) -> None:
-        """Pass messages to a feed from now on."""
+        """Pass all further messages to a feed."""
         self.feed = feed
         best_effort = partial(QoSProfile, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._subscribe(JointState, "contact_forces", best_effort(depth=_NEWEST), self._forces)
@@ -111,7 +112,7 @@ class NodeWatch:
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._diagnostics, DIAGNOSTICS)
 
     def answer(self, action: str, text: str) -> tuple[bool, str]:
-        """Call the service for an operator's request."""
+        """Call the service for an operator request. Return success and the answer."""
         service = "acknowledge_alarms" if action == "acknowledge" else "mark"
         if service == "mark":
             value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=text)
@@ -120,7 +121,7 @@ class NodeWatch:
         return (False, f"no answer within {_PATIENCE_S:g} s") if answer is None else (answer.success, answer.message)
 
     def close(self) -> None:
-        """End the node of the screen."""
+        """Destroy the ROS node of the screen."""
         self._executor.remove_node(self.node)
         self.node.destroy_node()  # type: ignore[no-untyped-call]
 
@@ -130,7 +131,7 @@ class NodeWatch:
         return future.result() if future.done() else None
 
     def _subscribe(self, kind: type, topic: str, quality: QoSProfile, take: Callable[[Any], None]) -> None:
-        """Subscribe to an output, whose messages take the form of a recording."""
+        """Subscribe to an output. Its messages are decoded to the classes that recordings use."""
         message_type = plain.JointState.TYPE if kind is JointState else plain.DiagnosticStatus.TYPE
         message_type = plain.Odometry.TYPE if kind is Odometry else message_type
         self.node.create_subscription(kind, topic, lambda data: take(decode(data, message_type)), quality, raw=True)

@@ -1,4 +1,4 @@
-"""The screen of a recording, live while it is written; its last hour afterwards."""
+"""The screen of a recording. During recording, it shows the live run, and afterwards the last hour."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from plow_twin.stream.intake import NS_PER_S
 from plow_twin.stream.journal import Hold, Mark
 from plow_twin.stream.topics import Cadence, names_of
 
-#: Topics whose messages are decoded one by one.
+#: Topics with messages that are decoded one by one.
 _SLOW: Final = names_of(Cadence.ESTIMATE, Cadence.CHANGE)
-#: Wait of the feed for room [s], for which a live run has no time.
+#: Interval [s] between attempts to send an update. The feed of a live run drops the update instead of waiting.
 _WAIT_S: Final = 2e-3
 
 
 class RunFeed:
-    """Passes a recording to a feed, one second of its stamps at a time, unless it is `stopped`."""
+    """Feed of the screen from a recording, one second of stamps at a time, until `stopped` returns True."""
 
     def __init__(self, feed: Feed, header: RunHeader, stopped: Callable[[], bool]) -> None:
         self._feed, self._stopped = feed, stopped
@@ -43,7 +43,7 @@ class RunFeed:
         self._inputs = InputCounts(header.excitation_source)
 
     def add(self, batch: Batch) -> None:
-        """Pass a batch."""
+        """Add a batch of the recording."""
         rows = rows_by_topic(batch.outputs, self._topics, self._templates)
         stamps_ns, wrench = batch.entries.samples()
         held_ns = []
@@ -62,7 +62,7 @@ class RunFeed:
             self._feed.motion.was_held |= self._feed.motion.held
             while not (self._feed.send() or self._stopped()):
                 time.sleep(_WAIT_S)
-        self._say(batch)  # at the end, because an estimate replaces earlier clearances
+        self._say(batch)  # last, because an estimate replaces earlier clearances
 
     def _counted(self) -> dict[str, str]:
         others = self._inputs.facts()
@@ -107,12 +107,12 @@ def _within(rows: Rows, second: int) -> Rows:
 
 
 def pose_of(numbers: Array) -> Array:
-    """Return x, y [m], theta [rad] from the numbers of a `head_state` message."""
+    """Return x, y [m], theta [rad] of the numbers in a `head_state` message."""
     return np.array([numbers[0], numbers[1], 2.0 * np.arctan2(numbers[2], numbers[3])])
 
 
 def show_run(path: Path, access: PageAccess, stopped: Callable[[], bool], on_open: Callable[[Screen], object]) -> None:
-    """Show a recording until `stopped`, also while it is written; `on_open` is called with the screen."""
+    """Show a recording, which may still be written, until `stopped` returns True. `on_open` receives the screen."""
     reader = RunReader(path, Tail(stopped))
     header = reader.header
     with Screen(access, facts_of(header.scene(reader.path), header.parameters, str(path))) as screen:
@@ -121,7 +121,7 @@ def show_run(path: Path, access: PageAccess, stopped: Callable[[], bool], on_ope
         for batch in reader.batches():
             if len(batch.entries) or batch.outputs:
                 run.add(batch)
-            else:  # the feed waits for more to be recorded
+            else:  # all recorded data have been sent: wait for more
                 screen.feed.turn()
             if stopped() or screen.has_ended:
                 return

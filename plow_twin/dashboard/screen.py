@@ -1,4 +1,4 @@
-"""The screen beside a twin: its server as a process, and the feed to it."""
+"""The screen beside a twin: the process of its server, and the feed of this process."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from plow_twin.dashboard.feed import Array, Feed
 
 
 class Screen(Beside):
-    """A running server and its feed, as a context manager that ends the server; most arguments are those of `Feed`.
+    """A running server of the screen with its feed, as a context manager that ends the server.
 
-    Raises DashboardError if the address cannot be used, and ModuleNotFoundError if a library of the server is missing.
+    See `Feed` for most arguments. Raises `DashboardError` if the address cannot be used, and `ModuleNotFoundError` if a
+    library of the server is not installed.
     """
 
     def __init__(
@@ -38,5 +39,5 @@ class Screen(Beside):
 
     @property
     def has_ended(self) -> bool:
-        """Whether the server has ended."""
+        """True if the server has ended."""
         return self.link.broken

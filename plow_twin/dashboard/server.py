@@ -1,7 +1,7 @@
-"""The server of the screen, a process of its own: `python -m plow_twin.dashboard.server LINK SOCKET`.
+"""Server of the screen, run as a separate process: `python -m plow_twin.dashboard.server LINK SOCKET`.
 
-A page gets newer values once it has received the last update, so that a slow page gets fewer updates and no page waits
-for another.
+A page receives a new update only after it has received the previous one. A slow page therefore receives fewer updates,
+and pages do not wait for each other.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from plow_twin.dashboard.board import Board
 from plow_twin.dashboard.link import Link
 
 PAGE: Final = Path(__file__).with_name("page")
-#: Largest number of pages; a further page is refused.
+#: Largest number of open pages. Further pages are refused.
 MOST_PAGES: Final = 50
-#: Longest time for a page to receive an update or to send its token [s].
+#: Longest time for a page to receive an update, or to send its token [s].
 _PATIENCE_S: Final = 20.0
-#: Longest time without a message to a page, and shortest time between two requests of a page [s].
+#: Longest time between two messages to a page, and shortest time between two requests of a page [s].
 _WORD_S, _WISH_S = 1.0, 0.2
 _WISH: Final = 4096
-#: Increment of `nice`, which gives the twin priority.
+#: Increment of `nice`, so that the twin has priority.
 _NICE: Final = 10
-#: Reasons to close a page, as codes of the WebSocket protocol.
+#: Codes of the WebSocket protocol with which a page is closed.
 TOO_MANY, NO_TOKEN, ENDED = 1013, 4401, 1001
 _HEADERS: Final = {
     "Content-Security-Policy": "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -50,7 +50,7 @@ _HEADERS: Final = {
 
 
 class Guard:
-    """Refuses requests under foreign host names, and from pages of other sites."""
+    """Middleware that refuses requests under foreign host names, and requests from pages of other sites."""
 
     def __init__(self, app: ASGIApp, access: PageAccess) -> None:
         self._app, self._access = app, access
@@ -79,13 +79,13 @@ class Guard:
 
 
 class Pages:
-    """The pages that show a board; their requests go through a link."""
+    """The open pages that show a board. Their requests are sent through a link."""
 
     def __init__(self, board: Board, link: Link, access: PageAccess) -> None:
         self._board, self._link, self._access = board, link, access
 
     async def page(self, socket: WebSocket) -> None:
-        """Serve one page until it is closed."""
+        """Serve a page until it is closed."""
         await socket.accept()
         if self._board.pages >= MOST_PAGES:
             await socket.close(TOO_MANY, f"{MOST_PAGES} pages are open")
@@ -97,12 +97,12 @@ class Pages:
                 return
             await self._serve(socket)
         except (WebSocketDisconnect, TimeoutError, RuntimeError):
-            return  # the page has gone, or does not read
+            return  # the page has been closed, or does not read its messages
         finally:
             self._board.pages -= 1
 
     async def _is_admitted(self, socket: WebSocket) -> bool:
-        """Ask for the token; wait a second after a wrong one."""
+        """Receive the token of a page. After a wrong token, wait one second."""
         wish = await asyncio.wait_for(_wish(socket), _PATIENCE_S)
         if self._access.admits(wish.get("token")):
             return True
@@ -121,7 +121,7 @@ class Pages:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _send_updates(self, socket: WebSocket) -> None:
-        """Send newer values to the page; count the updates that it misses."""
+        """Send new values to the page, and count the updates that the page misses."""
         board, version, skipped = self._board, 0, 0
         while not self._link.broken:
             news = board.news
@@ -151,7 +151,7 @@ async def _wish(socket: WebSocket) -> dict[str, Any]:
 
 
 def application(board: Board, link: Link, access: PageAccess) -> ASGIApp:
-    """Return the application, which serves the page and its data."""
+    """Return the web application, which serves the page and its data."""
     pages = Pages(board, link, access)
     routes = [WebSocketRoute("/data", pages.page), Mount("/", StaticFiles(directory=PAGE, html=True))]
     return Guard(Starlette(routes=routes), access)
@@ -184,7 +184,7 @@ async def serve(link: Link, listening: socket.socket, access: PageAccess) -> Non
 
 
 def main() -> None:
-    """Serve on the two descriptors that are the arguments; the first message has address and token."""
+    """Serve on the two file descriptors in the arguments. The first message contains the address and the token."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
     end, listening = (socket.socket(fileno=int(number)) for number in sys.argv[1:3])

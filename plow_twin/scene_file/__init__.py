@@ -1,6 +1,6 @@
-"""Scene files: conversion from YAML to `Scene` and back.
+"""Scene files: conversion of YAML to a `Scene` and back.
 
-Numbers are read by the YAML 1.2 core schema: `9.6975e6` is a number, `on` is a text.
+Scalars follow the YAML 1.2 core schema: `9.6975e6` is a number, and `on` is a text.
 """
 
 from plow_twin.scene_file.reader import load_scene as load_scene

@@ -1,4 +1,4 @@
-"""Rows of CSV files, as spreadsheets of many countries write them, and of Parquet files."""
+"""Rows of CSV files in the formats of spreadsheets in many countries, and rows of Parquet files."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from typing import IO, Final
 from plow_twin.errors import ExcessError
 from plow_twin.scene_file.parquet_lines import SUFFIX, ParquetLines, is_parquet
 
-#: Longest row [characters].
+#: Length of the longest accepted row, in characters.
 LONGEST_ROW: Final = 2**20
-#: Largest number of columns. The export of a plant historian has some hundred columns.
+#: Largest number of columns. Exports of a plant historian have a few hundred columns.
 MOST_COLUMNS: Final = 10_000
 
 
 def open_csv(path: Path) -> IO[str]:
     """Open a CSV file as text without its byte order mark, or a Parquet file as lines of CSV.
 
-    The errors are `OSError`, and those of `check_text` and `ParquetLines`.
+    Raises `OSError`, and the errors of `check_text` and `ParquetLines`.
     """
     if is_parquet(path):
         return io.TextIOWrapper(io.BufferedReader(ParquetLines(path)), encoding="utf-8", errors="replace", newline="")
@@ -36,12 +36,14 @@ def open_csv(path: Path) -> IO[str]:
 
 
 def tables(folder: Path) -> list[Path]:
-    """Return the CSV and Parquet files of a folder, sorted by name; of two files with one name, only the CSV file."""
+    """Return the CSV and Parquet files of a folder, sorted by name. A Parquet file with the name of a CSV file is
+    omitted.
+    """
     found = {path.stem: path for ending in (SUFFIX, ".csv") for path in folder.glob(f"*{ending}")}
     return [found[name] for name in sorted(found)]
 
 
-#: First bytes of files that may be mistaken for CSV.
+#: First bytes of files that may be mistaken for CSV files.
 _OTHERS: Final = {
     b"\xff\xfe": "UTF-16 text",
     b"\xfe\xff": "UTF-16 text",
@@ -51,8 +53,8 @@ _OTHERS: Final = {
 
 
 def check_text(begin: bytes) -> None:
-    """Raise a `csv.Error` for a file that begins as UTF-16 (the "Unicode text" of spreadsheets), a workbook, or
-    compressed.
+    """Raise a `csv.Error` if the first bytes show UTF-16 text (the "Unicode text" of spreadsheets), a workbook or an
+    archive.
     """
     for first, kind in _OTHERS.items():
         if begin.startswith(first):
@@ -65,10 +67,10 @@ def delimiter_of(header: str) -> str:
 
 
 def csv_rows(stream: IO[str], comment: str = "") -> Iterator[tuple[int, list[str]]]:
-    """Yield line numbers and rows that are not empty, the header first.
+    """Yield the line number and the cells of each row that is not empty, beginning with the header.
 
-    The header determines the delimiter. With semicolons or tabs, decimal commas become points. Lines that begin with
-    `comment` are skipped.
+    The delimiter is that of the header. With semicolons or tabs, decimal commas are converted to points. Lines that
+    begin with `comment` are skipped.
 
     Raises
     ------

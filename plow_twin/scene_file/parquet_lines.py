@@ -1,4 +1,4 @@
-"""Parquet files as lines of CSV, for every reader of CSV."""
+"""Parquet files as lines of CSV, so that each reader of CSV files can read Parquet files too."""
 
 from __future__ import annotations
 
@@ -15,37 +15,39 @@ if TYPE_CHECKING:
 
 SUFFIX: Final = ".parquet"
 _ROWS: Final = 4096
-#: Largest number of rows per byte of a file. Compression lets a few bytes hold any number of rows.
+#: Largest number of rows per byte of a file. Without this limit, a few compressed bytes could contain any number of
+#: rows.
 _MOST_PER_BYTE: Final = 100
-#: Number of rows that a file of any size may have.
+#: Number of rows that is always accepted.
 _ALWAYS: Final = 1_000_000
-#: Largest unpacked column of a row group [B]. A whole column is held in memory; writers make row groups of 128 MB.
+#: Largest size [B] of an unpacked column in a row group, which must fit into memory. Most writers make row groups of
+#: 128 MB.
 _LARGEST_COLUMN: Final = 2**29
 #: Largest number of columns.
 _MOST_COLUMNS: Final = 10_000
-#: Longest text in the metadata [B].
+#: Longest text [B] in the metadata.
 _LONGEST_TEXT: Final = 2**24
 
 
 def is_parquet(path: Path) -> bool:
-    """Return whether the name of a file has the ending of Parquet."""
+    """Return whether the name of a file has the suffix of Parquet files."""
     return path.suffix.lower() == SUFFIX
 
 
 class ParquetLines(io.RawIOBase):
-    """A Parquet file, read as UTF-8 text: a line of names, then a line for each row.
+    """A Parquet file, read as UTF-8 text: a line with the names of the columns, then a line for each row.
 
-    Numbers keep all their digits. Times are written in UTC, times without a zone as they are. A cell without a value is
-    empty. Columns of lists, structures or bytes are left out.
+    Numbers are written without loss of digits. Times are written in UTC, and times without a zone unchanged. A missing
+    value gives an empty cell. Columns of lists, structures or bytes are omitted.
 
     Raises
     ------
     OSError
         The file cannot be opened.
     csv.Error
-        The file is not Parquet, or is damaged; reading raises this error too.
+        The file is not a Parquet file, or is damaged. Read methods raise this error too.
     ExcessError
-        The unpacked file would exceed the bounds of this module.
+        The unpacked file would exceed a limit of this module.
     """
 
     def __init__(self, path: Path) -> None:
@@ -94,7 +96,7 @@ class ParquetLines(io.RawIOBase):
         return True
 
     def readinto(self, buffer: Any) -> int:
-        """Copy the next bytes into a buffer; return their number, 0 at the end."""
+        """Copy the next bytes into a buffer. Return their number, which is 0 at the end."""
         while not self._rest:
             block = next(self._blocks, None)
             if block is None:
@@ -105,7 +107,7 @@ class ParquetLines(io.RawIOBase):
         return count
 
     def tell(self) -> int:
-        """Return the number of bytes read so far, estimated from the share of rows read."""
+        """Return an estimate of the number of bytes read so far, from the share of rows read."""
         return round(self._size * self._done / self._rows) if self._rows else self._size
 
     def close(self) -> None:
@@ -136,7 +138,7 @@ def _first_line(error: BaseException) -> str:
 
 
 def _is_plain(kind: pa.DataType) -> bool:
-    """Return whether values of a type can be written to a CSV cell."""
+    """Return whether a CSV cell can represent the values of a type."""
     import pyarrow as pa
 
     kind = kind.value_type if pa.types.is_dictionary(kind) else kind
@@ -146,7 +148,7 @@ def _is_plain(kind: pa.DataType) -> bool:
 
 
 def _as_text(batch: pa.RecordBatch) -> pa.RecordBatch:
-    """Return columns that CSV can hold: instants in UTC, durations in seconds, numbers exactly."""
+    """Convert columns for CSV: instants to UTC and durations to seconds. Numbers are unchanged."""
     import pyarrow as pa
 
     columns = []

@@ -1,4 +1,4 @@
-"""Paths of the files of `config/`, in the source tree or in share/plow_twin of the installation prefix."""
+"""Paths of the files of `config/`, in the source tree or in share/plow_twin of an installation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ PRESETS: Final = ("paper", "bench_kv", "bench_hc", "measured_square", "measured_
 
 
 def config_folder() -> Path:
-    """Return the folder of the package's configuration files.
+    """Return the folder with the configuration files of the package.
 
     Raises
     ------
@@ -19,7 +19,7 @@ def config_folder() -> Path:
     package = Path(__file__).resolve().parent.parent
     if (package.parent / "package.xml").is_file():
         return package.parent / "config"
-    # an installation has lib/pythonX.Y/site-packages/plow_twin, and share/ beside lib/
+    # an installation has the folders lib/pythonX.Y/site-packages/plow_twin and share
     unresolved = Path(__file__).absolute().parent.parent
     for prefix in (*package.parents, *unresolved.parents):
         folder = prefix / "share" / "plow_twin" / "config"
@@ -31,5 +31,5 @@ def config_folder() -> Path:
 
 
 def scene_path(name: str | Path) -> Path:
-    """Return the file of a preset (`PRESETS`); any other path is returned unchanged."""
+    """Return the file of a preset (`PRESETS`), or any other path unchanged."""
     return config_folder() / f"{name}.yaml" if str(name) in PRESETS else Path(name)

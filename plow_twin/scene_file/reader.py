@@ -31,7 +31,7 @@ from plow_twin.scene_file.validation import Schema, validate
 from plow_twin.scene_file.yaml_text import load_yaml, read_yaml
 
 _SECTIONS: Final = "the sections of a scene"
-#: Valid parts that stand in for parts with problems, so that the other parts can be checked against each other.
+#: Valid parts that replace parts with problems. A `Scene` can then be built to find conflicts between the other parts.
 _SOUND: Final[Mapping[str, Any]] = MappingProxyType(
     {
         "head": Head(1.0, 1.0),
@@ -48,7 +48,7 @@ def load_scene(path: str | Path) -> Scene:
     Parameters
     ----------
     path : str or Path
-        The YAML file, or the name of a preset such as paper. Load tables are looked up beside the file.
+        Path of a YAML file, or the name of a preset such as paper. Paths of load tables are relative to the file.
 
     Returns
     -------
@@ -57,7 +57,7 @@ def load_scene(path: str | Path) -> Scene:
     Raises
     ------
     SceneError
-        The file cannot be read or used; the error lists every problem.
+        The file cannot be read or used. The error lists all problems.
     """
     path = scene_path(path)
     if not (path.suffix or path.exists()):
@@ -74,14 +74,14 @@ def loads_scene(text: str, base: str | Path | None = ".", *, source: str = "scen
     text : str
         The scene as YAML.
     base : str or Path, optional
-        Folder to which the paths of load tables are relative. With None, tables in files are refused.
+        Folder to which the paths of load tables are relative. With None, load tables in files are rejected.
     source : str
         Name of the scene in messages.
 
     Raises
     ------
     SceneError
-        The scene cannot be used; the error lists every problem.
+        The scene cannot be used. The error lists all problems.
     """
     return _scene(*load_yaml(text, "scene", _SECTIONS), None if base is None else Path(base), source)
 
@@ -92,7 +92,7 @@ def _schema() -> Schema:
 
 
 def _scene(raw: Any, problems: list[Problem], base: Path | None, source: str) -> Scene:
-    """Return the scene of a document, or raise a `SceneError` with all problems."""
+    """Convert a document to a scene, or raise a `SceneError` that lists all problems."""
     if raw is None and problems:
         raise SceneError(problems, source)
     problems += validate(raw, _schema(), "scene")
@@ -110,7 +110,7 @@ def _scene(raw: Any, problems: list[Problem], base: Path | None, source: str) ->
 def _read_parts(
     raw: Mapping[str, Any], bad: set[str], marks: dict[str, Provenance], base: Path | None, problems: list[Problem]
 ) -> dict[str, Any]:
-    """Build the parts of a scene that have no problems."""
+    """Build the parts of a scene, except the parts with problems."""
     parts: dict[str, Any] = {}
     for key, part in SECTIONS.items():
         if key in raw and key not in bad:
@@ -128,7 +128,7 @@ def _read_parts(
 
 
 def _arguments(part: type, raw: Mapping[str, Any], path: str, marks: dict[str, Provenance]) -> dict[str, Any]:
-    """Return the keyword arguments of a dataclass, and put the marks of its numbers into `marks`."""
+    """Return the keyword arguments of a dataclass. The marks of its numbers are added to `marks`."""
     specs = {spec.name: spec for spec in fields(part)}
     return {
         key: _number(value, f"{path}.{key}", marks) if "unit" in specs[key].metadata else value
@@ -188,7 +188,7 @@ def _problems_across(parts: Mapping[str, Any]) -> tuple[Problem, ...]:
 
 
 def _as_written(problem: Problem, raw: Mapping[str, Any]) -> Problem:
-    """Return the problem with the key that the file has: there, the kind of a load precedes its numbers."""
+    """Return the problem with the key as it is in the file, where the kind of a load precedes its numbers."""
     head, _, rest = problem.key.partition("].")
     index = head.removeprefix("loads[")
     if index == head or not index.isdigit() or rest.startswith(("name", "at_m")):

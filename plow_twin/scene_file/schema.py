@@ -1,6 +1,6 @@
 """JSON Schema of the scene file, made from the dataclasses of `plow_twin.model.scene`.
 
-Numbers and lists of numbers are plain or `{value, mark, source}`. The samples of a table are plain.
+A number or a list of numbers may be replaced by a mapping `{value, mark, source}`. The samples of a table cannot.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from plow_twin.model.scene import (
 from plow_twin.scene_file.validation import Schema, choice, mapping
 
 LOAD_KINDS: Final[dict[str, type[Load]]] = {"harmonic": Harmonic, "constant": Constant, "table": Table}
-#: Columns of a load file unless `columns` names others: time, Fx, Fy, M.
+#: Default columns of a load file: time, Fx, Fy, M.
 TABLE_COLUMNS: Final = ("t", "fx", "fy", "m")
 
 _BOUNDS: Final = {"gt": "exclusiveMinimum", "ge": "minimum", "lt": "exclusiveMaximum", "le": "maximum"}
 
 
 def scene_schema() -> Schema:
-    """Return the JSON Schema (draft 2020-12) of scene file version 1."""
+    """Return the JSON Schema (draft 2020-12) of scene files of version 1."""
     described = {spec.name: spec for spec in fields(Scene)}
     names = {key: _name_list(described[key]) for key in ("locked", "pairs")}
     properties: Schema = {
@@ -135,7 +135,7 @@ def _load() -> Schema:
 
 
 def _table(plain: Schema) -> Schema:
-    """Return the schema of a table: a file with columns, or samples in the scene."""
+    """Return the schema of a load table: a file and its columns, or samples in the scene."""
     columns = {
         "type": "array",
         "items": {"type": "string", "description": "the name of a column"},

@@ -1,4 +1,4 @@
-"""Samples of a table load, from a CSV file or from the scene itself."""
+"""Samples of a load table, from a CSV file or from the scene file."""
 
 from __future__ import annotations
 
@@ -20,15 +20,16 @@ Samples = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def read_table(path: Path, columns: Sequence[str] | None = None, key: str = "file") -> Samples:
-    """Read times, shape (n,) [s], and wrenches, shape (n, 3) [N, N, N m], from a CSV file with a header line.
+    """Read times [s], shape (n,), and wrenches [N, N, N m], shape (n, 3), from a CSV file with a header line.
 
-    `columns` are the names of time, Fx, Fy and M, by default `t` (or `time`), `fx`, `fy`, `m`. Lines that start with
-    `#` are skipped. Messages call the file `key`.
+    `columns` are the names of the columns of time, Fx, Fy and M. The default names are `t` (or `time`), `fx`, `fy` and
+    `m`. Lines that start with `#` are skipped. `key` is the name of the file in error messages.
+
 
     Raises
     ------
     SceneError
-        The file, a column or a number is missing; the error lists every bad line.
+        The file, a column or a number is missing. The error lists all bad lines.
     """
     wanted = tuple(columns or TABLE_COLUMNS)
     try:
@@ -59,7 +60,7 @@ def _parse(rows: list[tuple[int, list[str]]], places: list[int], key: str) -> Sa
 
 
 def sample_table(t: list[Any], wrench: list[Any], key: str) -> Samples:
-    """Return the samples in a scene as arrays, or raise a `SceneError` that names each bad row."""
+    """Convert samples of a scene file to arrays, or raise a `SceneError` that names each bad row."""
     problems = [
         Problem(f"{key}.t[{index}]", value, "a number [s]") for index, value in enumerate(t) if not is_number(value)
     ]

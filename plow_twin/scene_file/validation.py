@@ -1,6 +1,7 @@
-"""Check of plain data against a JSON schema. A message names the key, the value got and the value expected.
+"""Validation of plain data with a JSON schema.
 
-The value expected is the `description` of a schema.
+An error message names the key, the actual value and the expected value. The expected value is the `description` in the
+schema.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ NUMBER: Final[Schema] = {"type": "number", "description": "a finite number"}
 
 
 def mapping(properties: Mapping[str, Schema], required: Sequence[str] = ()) -> Schema:
-    """Return the schema of a mapping that has no keys other than those of `properties`."""
+    """Return the schema of a mapping that has no keys other than the keys of `properties`."""
     return {
         "type": "object",
         "properties": dict(properties),
@@ -37,12 +38,12 @@ def mapping(properties: Mapping[str, Schema], required: Sequence[str] = ()) -> S
 
 
 def choice(choices: Sequence[str]) -> Schema:
-    """Return the schema of a text that is one of the choices."""
+    """Return the schema of a text that is one of `choices`."""
     return {"enum": list(choices), "description": f"one of {', '.join(choices)}"}
 
 
 class _Shown:
-    """Words that replace a value in a message."""
+    """Text that replaces a value in a message."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -51,18 +52,18 @@ class _Shown:
         return self.text
 
 
-#: The value of a missing key.
+#: Replacement for the value of a missing key.
 NOTHING: Final = _Shown("nothing")
-#: Longest value and longest name that are printed [characters].
+#: Largest length of a value or a name in a message, in characters.
 _LONGEST: Final = 200
-#: Largest number of problems listed. The search for the nearest known key takes time for each problem.
+#: Largest number of reported problems. For each problem, the search for the most similar known key takes time.
 MOST_PROBLEMS: Final = 50
 
 
 def validate(raw: Any, schema: Schema, name: str) -> list[Problem]:
-    """Return the problems of plain data in the order of the schema; messages call the whole data `name`."""
+    """Return the problems of plain data in the order of the schema. In messages, the name of the data is `name`."""
     problems = (problem for error in _validator(schema).iter_errors(raw) for problem in _explain(error, name))
-    # jsonschema reports a mapping once for each missing key, and `_explain` each time yields all missing keys
+    # jsonschema reports one error for each missing key, and `_explain` yields all missing keys for each error
     unique: dict[str, Problem] = {}
     for problem in islice(map(_brief, problems), 2 * MOST_PROBLEMS):
         unique[str(problem)] = problem
@@ -76,7 +77,7 @@ def _validator(schema: Schema) -> Validator:
 
 @cache
 def _validator_class() -> Callable[[Schema], Validator]:
-    """Return a validator for which NaN, infinity and integers beyond float64 are no numbers, and 1.0 is no integer."""
+    """Return a validator that rejects NaN, infinity and integers beyond float64 as numbers, and 1.0 as integer."""
     checker = Draft202012Validator.TYPE_CHECKER.redefine_many(
         {
             "number": lambda _, value: is_number(value),
@@ -108,14 +109,16 @@ def _explain(error: ValidationError, whole: str) -> Iterator[Problem]:
     elif error.validator == "anyOf":
         yield from _closest_branch(key or whole, error, whole)
     elif error.validator == "oneOf":
-        if isinstance(instance, dict):  # a value of another type is a problem of its own
+        if isinstance(instance, dict):  # for a value of another type, jsonschema reports a separate error
             yield Problem(key or whole, sorted(map(str, instance)), schema["description"])
     else:
         yield Problem(key or whole, instance, schema.get("description", error.message))
 
 
 def _closest_branch(key: str, error: ValidationError, whole: str) -> Iterator[Problem]:
-    """Yield the problems of the `anyOf` branch that fits the type of the value, or one problem of the key."""
+    """Yield the problems of the `anyOf` branch for the type of the value. If there is none, yield one problem of the
+    key.
+    """
     branches: dict[Any, list[ValidationError]] = {}
     for inner in error.context or ():
         branches.setdefault(inner.schema_path[0], []).append(inner)
@@ -128,13 +131,13 @@ def _closest_branch(key: str, error: ValidationError, whole: str) -> Iterator[Pr
 
 
 def _is_misfit(error: ValidationError) -> bool:
-    """Return whether an error shows that an `anyOf` branch is for values of another type or with other keys."""
+    """Return whether an error shows that an `anyOf` branch is for values of another type, or with other keys."""
     keys_alone = error.validator == "required" and "properties" not in cast(Schema, error.schema)
     return keys_alone or error.validator in ("type", "const", "enum")
 
 
 def _brief(problem: Problem) -> Problem:
-    """Return the problem with words in place of a value that is too long to print."""
+    """Replace a value that is too long to print by a description."""
     got = problem.got
     if isinstance(got, list | tuple | dict) and len(repr(got)) > _LONGEST:
         shown = _Shown(f"a {'mapping' if isinstance(got, dict) else 'list'} of {len(got)}")

@@ -1,4 +1,4 @@
-"""Writing of a `Scene` as the text of a scene file."""
+"""Conversion of a `Scene` to the text of a scene file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from plow_twin.scene_file.yaml_text import dump_yaml
 
 
 def dump_scene(scene: Scene) -> str:
-    """Return a scene as YAML text that needs no other file; reading the text gives an equal scene, bit for bit.
+    """Return a scene as self-contained YAML text. Reading the text gives a bit-identical scene.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ def dump_scene(scene: Scene) -> str:
     Returns
     -------
     str
-        The text, including tables and provenance marks.
+        The text. It includes tables and provenance marks.
     """
     raw: dict[str, Any] = {key: _plain(getattr(scene, key), key, scene.marks) for key in SECTIONS}
     raw["loads"] = [_plain_load(load, f"loads[{index}]", scene.marks) for index, load in enumerate(scene.loads)]
@@ -33,13 +33,12 @@ def dump_scene(scene: Scene) -> str:
     for key in OPTIONAL_PARTS:
         part = getattr(scene, key)
         raw[key] = "none" if part is None else _plain(part, key, scene.marks)
-    # the sections are written in the order of the scene's fields
     sections = {spec.name: raw[spec.name] for spec in fields(Scene) if spec.name in raw}
     return dump_yaml({"version": SCENE_VERSION, **sections})
 
 
 def _plain(part: Any, path: str, marks: Mapping[str, Provenance], without: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return a dataclass as plain lists, mappings and numbers with their provenance marks."""
+    """Return a dataclass as plain lists, mappings and numbers with provenance marks."""
     plain: dict[str, Any] = {}
     for spec in fields(part):
         value = getattr(part, spec.name)

@@ -1,7 +1,7 @@
-"""YAML of untrusted files, read within bounds, with numbers by the YAML 1.2 core schema and exact floats.
+"""Reader and writer of YAML. The reader limits size and nesting, because files may be malicious.
 
-The events of the parser are counted before a document is built, because libyaml recurses in C for nested collections,
-and a few lines of aliases can expand to any number of values.
+Scalars follow the YAML 1.2 core schema. The limits are checked on the events of the parser, before a document is built:
+libyaml recurses in C for nested collections, and a few lines with aliases can expand to any number of values.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ import yaml
 
 from plow_twin.errors import Problem
 
-try:  # libyaml is ten times as fast on recorded tables, but PyYAML may lack it
+try:  # libyaml is ten times faster for recorded tables, but PyYAML may be built without it
     from yaml import CSafeDumper as _Dumper
     from yaml import CSafeLoader as _Loader
 except ImportError:
     from yaml import SafeDumper as _Dumper  # type: ignore[assignment]
     from yaml import SafeLoader as _Loader  # type: ignore[assignment]
 
-#: Largest file [B]. A table of 200,000 rows fits; longer tables belong in CSV.
+#: Size [B] of the largest accepted file, enough for a table of 200,000 rows. Longer tables belong in CSV files.
 LARGEST_FILE: Final = 64 * 2**20
 MOST_VALUES: Final = 1_000_000
-#: Deepest nesting of collections; a scene has six levels.
+#: Largest nesting depth of collections. A scene has six levels.
 DEEPEST: Final = 20
-#: Largest number of keys of a document. The `metadata.yaml` of a recording of 1,000 parts has 20,000 keys.
+#: Largest number of keys of a document. The `metadata.yaml` of a recording with 1,000 parts has 20,000 keys.
 MOST_KEYS: Final = 50_000
-#: Largest number of values to which all aliases of a document expand.
+#: Largest number of values to which all aliases of a document may expand.
 MOST_REPEATED: Final = 50_000
 
 _FLOAT: Final = re.compile(r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan)$", re.I)
-# tag, pattern and possible first characters; the first line that matches decides
+# tag, pattern and possible first characters; the first matching pattern determines the type
 _CORE_SCHEMA: Final = (
     ("tag:yaml.org,2002:null", re.compile(r"^(?:~|null|Null|NULL|)$"), ["~", "n", "N", ""]),
     ("tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF")),
@@ -46,17 +46,17 @@ _CORE_SCHEMA: Final = (
 
 
 class SceneLoader(_Loader):
-    """Safe loader with the scalars of the YAML 1.2 core schema."""
+    """Safe loader for scalars of the YAML 1.2 core schema."""
 
-    # the table of PyYAML is that of YAML 1.1, in which 1e6 is a text, `on` a bool, 010 eight and 1:30 ninety
+    # PyYAML follows YAML 1.1, in which 1e6 is a text, `on` a bool, 010 the number 8, and 1:30 the number 90
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
 
 
 class SceneDumper(_Dumper):
-    """Safe dumper that quotes every text that YAML 1.1 or 1.2 would read as another type."""
+    """Safe dumper that quotes each text that YAML 1.1 or 1.2 would read as another type."""
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Write no aliases."""
+        """Return True, so that no aliases are written."""
         return True
 
 
@@ -67,8 +67,9 @@ SceneDumper.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.01
 
 
 def read_yaml(path: Path, name: str, sections: str) -> tuple[Any, list[Problem]]:
-    """Return the document and the problems of a YAML file, as `load_yaml` does, within `LARGEST_FILE` and
-    `MOST_VALUES`.
+    """Read a YAML file of at most `LARGEST_FILE` bytes and `MOST_VALUES` values. Return its document and its problems.
+
+    The remaining arguments are those of `load_yaml`.
     """
     try:
         with path.open("rb") as stream:
@@ -83,7 +84,7 @@ def read_yaml(path: Path, name: str, sections: str) -> tuple[Any, list[Problem]]
 
 
 def load_yaml(text: str, name: str, sections: str, *, most_values: float = math.inf) -> tuple[Any, list[Problem]]:
-    """Return a document (None if it is unreadable) and its problems; messages call the document `name`."""
+    """Return a document, or None if it is unreadable, and its problems. `name` is its name in messages."""
     try:
         excess = _excess(text, most_values)
         if excess is not None:
@@ -102,13 +103,13 @@ def load_yaml(text: str, name: str, sections: str, *, most_values: float = math.
         return None, [Problem(_place(mark) if mark else name, str(error.problem), "YAML")]
     except yaml.YAMLError as error:
         return None, [Problem(name, " ".join(str(error).split()), "YAML")]
-    except ValueError as error:  # Python refuses integers of thousands of digits
+    except ValueError as error:  # Python rejects integers with thousands of digits
         return None, [Problem(name, str(error), "numbers")]
 
 
 @dataclass
 class _Size:
-    """Size of a node and its children. An alias has the size of the node that it repeats."""
+    """Size of a node including its children. The size of an alias is the size of the repeated node."""
 
     values: int = 1
     keys: int = 0
@@ -116,12 +117,12 @@ class _Size:
 
 
 def _excess(text: str, most_values: float) -> Problem | None:
-    """Return the problem of a document whose events exceed a bound, or None; YAML errors are raised."""
+    """Return a problem if the events of a document exceed a limit, otherwise None. YAML errors are raised."""
     scalar = _Size()
     values = repeated = 0
-    sizes: dict[str, _Size | None] = {}  # size of each anchored node; None until the node ends
+    sizes: dict[str, _Size | None] = {}  # size of each node with an anchor; None until the node ends
     outer, is_mapping, anchor = _Size(), False, None
-    stack: list[tuple[_Size, bool, str | None]] = []  # size, kind and anchor of the outer collections
+    stack: list[tuple[_Size, bool, str | None]] = []  # size, kind and anchor of each enclosing collection
     event: Any
     for event in yaml.parse(text, SceneLoader):
         kind = type(event)
@@ -143,7 +144,7 @@ def _excess(text: str, most_values: float) -> Problem | None:
                 sizes[anchor] = outer
             outer, is_mapping, anchor = stack.pop()
         elif kind is yaml.AliasEvent:
-            known = sizes.get(event.anchor, scalar)  # the composer reports a missing anchor
+            known = sizes.get(event.anchor, scalar)  # the composer reports an alias without an anchor
             if known is None:
                 return Problem(_place(event.start_mark), "an alias to itself", "an alias to an earlier node")
             node = known
@@ -177,7 +178,7 @@ def _place(mark: Any) -> str:
 
 
 def dump_yaml(data: Any, *, flow: bool = True) -> str:
-    """Return plain data as YAML text. Floats are written by repr, so reading them gives the same bits.
+    """Return plain data as YAML text. Floats are written by repr, so that reading the text gives bit-identical numbers.
 
     With `flow`, collections of scalars are written in brackets.
     """
@@ -187,7 +188,7 @@ def dump_yaml(data: Any, *, flow: bool = True) -> str:
 
 def _repeated_keys(node: yaml.Node, path: str) -> Iterator[Problem]:
     if isinstance(node, yaml.SequenceNode):
-        # scalars have no keys; skipping them makes long tables fast
+        # scalars have no keys; the search in long tables is fast because it skips them
         for index, item in enumerate(node.value):
             if not isinstance(item, yaml.ScalarNode):
                 yield from _repeated_keys(item, f"{path}[{index}]")

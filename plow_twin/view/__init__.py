@@ -1,4 +1,4 @@
-"""Recordings as rerun files and pictures."""
+"""Pictures of recordings and of results: rerun files and PNG files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    """Import the viewer's library on first use, because a picture does not need it."""
+    """Import the rerun library on first use, because PNG files do not need it."""
     if name in ("ViewSummary", "to_rrd"):
         from plow_twin.view import rrd
 

@@ -1,7 +1,7 @@
-"""Sets of corners that carry force together, coloured by the rotation that they stop.
+"""Sets of corners that carry force at the same time, coloured by the direction of rotation that they stop.
 
-A pair of corner and wall stops either a counter-clockwise (ccw) or a clockwise (cw) rotation of the head. A set is a
-bit mask of pairs.
+Each pair of a corner and a wall stops either a counter-clockwise (ccw) or a clockwise (cw) rotation of the head. A set
+is a bit mask of pairs.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from plow_twin.view.columns import Array, Batches, Indexes, TimeAxis
 ENTITY: Final = "contact_set"
 FREE: Final = "free"
 Color = tuple[int, int, int]
-#: Colours of: no contact, contacts that stop a ccw rotation, contacts that stop a cw rotation, contacts of both kinds.
+#: Colours of four kinds of sets: no contact, contacts that stop a ccw rotation, contacts that stop a cw rotation,
+#: contacts of both kinds.
 _COLORS: Final[tuple[Color, ...]] = ((235, 235, 235), (86, 180, 233), (240, 160, 60), (204, 121, 167))
 _CCW_BITS: Final = int((STOPS_COUNTER_CLOCKWISE.astype(np.int64) << np.arange(PAIR_COUNT)).sum())
 
@@ -29,13 +30,15 @@ def set_color(mask: int) -> Color:
 
 
 def masks_of(force: Array) -> Indexes:
-    """Return the set of pairs that carry force for each row of forces (n, 8), shape (n,)."""
+    """Return for each row of forces, shape (n, 8), the set of pairs that carry force, shape (n,)."""
     masks: Indexes = ((force > 0.0) << np.arange(PAIR_COUNT)).sum(axis=1)
     return masks
 
 
 class ContactSets:
-    """Writes changes of the contact set; in a thinned run, the first change and the last set of each span."""
+    """Writer of the changes of the contact set. In a thinned run, it writes the first change and the last set of each
+    span.
+    """
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis, labels: tuple[str, ...], span_ns: int) -> None:
         self._names = tuple(label or name for label, name in zip(labels, CORNER_NAMES, strict=True))
@@ -44,7 +47,7 @@ class ContactSets:
         self._before: str | None = None
         self._at: int | None = None
         self._last: tuple[int, int] | None = None
-        #: newest set of the present span that has not been written, and the step of its row
+        #: Newest set of the present span that has not been written, and the step of its row.
         self._left: tuple[str, int] | None = None
         names: dict[str, Color] = {}
         for ccw, cw in product(range(16), range(16)):
@@ -62,7 +65,9 @@ class ContactSets:
         )
 
     def name(self, mask: int) -> str:
-        """Return the name of a set of pairs: its corners by rotation."""
+        """Return the name of a set of pairs: the corners that stop a ccw rotation, then the corners that stop a cw
+        rotation.
+        """
         parts = []
         for word, bits in (("ccw", mask & _CCW_BITS), ("cw", mask & ~_CCW_BITS)):
             corners = sorted(self._names[corner] for corner in range(4) if bits >> 2 * corner & 3)
@@ -70,7 +75,7 @@ class ContactSets:
         return ", ".join(parts) or FREE
 
     def add(self, stamps: Indexes, steps: Indexes, force: Array) -> None:
-        """Add forces, shape (n, 8)."""
+        """Add stamps [ns], shape (n,), steps, shape (n,), and forces, shape (n, 8)."""
         masks = masks_of(force)
         if len(stamps):
             self._last = int(stamps[-1]) + 1, int(steps[-1])
@@ -88,7 +93,7 @@ class ContactSets:
             self._end_span(int(stamps[-1]))
 
     def _end_span(self, stamp_ns: int) -> None:
-        """Write the last set of the present span, if the stamp lies beyond the span."""
+        """Write the last set of the present span if the stamp lies after the span."""
         if self._left is None or self._at is None or stamp_ns // self._span_ns == self._at:
             return
         name, step = self._left
@@ -102,11 +107,11 @@ class ContactSets:
             self._end_span((self._at + 1) * self._span_ns)
 
     def end(self) -> None:
-        """End the curve, because the set is unknown from here on."""
+        """End the curve. From here on, the set is unknown."""
         if self._last is not None:
             self._states.add(*self._last, state=[])
         self._before = self._at = self._last = self._left = None
 
     def flush(self) -> None:
-        """Send the collected changes."""
+        """Send the buffered changes."""
         self._states.flush()

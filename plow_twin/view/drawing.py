@@ -1,4 +1,4 @@
-"""Drawing of a recording, batch by batch: curves, cross-sections, events."""
+"""Drawing of a recording into rerun, batch by batch: curves, cross-sections and events."""
 
 from __future__ import annotations
 
@@ -32,21 +32,22 @@ from plow_twin.view.residuals import Residuals
 from plow_twin.view.section import ARROW_MM_PER_N, LABEL_MM, LOAD_COLOR, PAIR_COLORS, Section
 from plow_twin.view.what_if import WhatIf
 
-#: Largest age of a sample that is drawn [ns]; beyond it, stamp and recorder's clock are not the same clock.
+#: Largest drawn difference between the recorder's clock and a stamp [ns]. A larger difference shows that stamps come
+#: from a different clock.
 _LARGEST_AGE_NS: Final = 3_600_000_000_000
 _GREY: Final = (150, 155, 165)
 _WHITE: Final = (235, 235, 235)
 _TOUCHING: Final = (240, 140, 40)
 _PADS: Final = np.array([name.startswith("pad_") for name in CLEARANCE_NAMES])
 _BEST_PADS: Final = np.array([name in PAD_NAMES for name in CLEARANCE_NAMES])
-#: Columns of the pads' depths, and of their 5 % and 95 % points.
+#: Columns of the wear depths of the pads, and of their 5 % and 95 % points.
 _PAD_POINTS: Final = [[CLEARANCE_NAMES.index(f"{name}{point}") for name in PAD_NAMES] for point in ("", "/p05", "/p95")]
 _BOUNDS: Final = [
     CLEARANCE_NAMES.index(f"{way}/{point}") for way in ("horizontal", "vertical") for point in ("p05", "p95")
 ]
-#: Number of rows of a band for each clearance message, unless curves are thinned.
+#: Number of rows with which a band is drawn between two clearance messages, unless curves are thinned.
 _BAND_ROWS: Final = 10
-#: Shortest time between two charts of forces along the face [ns].
+#: Shortest time [ns] between two drawings of the forces along the face.
 _FACE_NS: Final = 1_000_000_000
 
 
@@ -54,10 +55,10 @@ Sink = Callable[[rr.RecordingStream, rrb.Blueprint], object]
 
 
 class Drawing:
-    """Draws batches of a recording into a stream of the viewer.
+    """Drawing of the batches of a recording into a rerun stream.
 
-    `sink` receives the stream and its blueprint, before anything is drawn. In a span of `span_ns`, a curve keeps its
-    least and largest value; 0 keeps every row. The other arguments are those of `to_rrd`.
+    `sink` receives the stream and its blueprint before anything is drawn. In each span of `span_ns`, only the least and
+    the largest value of a curve are drawn; with 0, all rows are drawn. The other arguments are those of `to_rrd`.
     """
 
     def __init__(
@@ -109,12 +110,12 @@ class Drawing:
         self.pad_names = Batches(stream, axis, "exaggerated/pads/wear", rr.Points2D, ("positions", "labels"))
         self.events = Events(stream, axis)
         self.section_rows = 0
-        #: number and stamp [ns] of the newest advance
+        #: Number and stamp [ns] of the newest advance.
         self.step, self.stamp_ns = -1, 0
         self._shown: int | None = None
         self._sample_ns: int | None = None
         self._early: list[tuple[int, DiagnosticStatus]] = []
-        self._wrench = np.full(3, np.nan)  # unknown so far
+        self._wrench = np.full(3, np.nan)  # unknown until the first load
         self._worn = False
         self._largest_load = self._named_load = np.zeros(3)
         self._scene = scene
@@ -124,7 +125,7 @@ class Drawing:
 
     @property
     def first_ns(self) -> int:
-        """The first stamp; 0 before it is known."""
+        """The first stamp [ns], or 0 if no stamp has been read."""
         return self._axis.first_ns or 0
 
     def _draw_still(self, scene: Scene, source: Path) -> None:
@@ -155,7 +156,7 @@ class Drawing:
         self.stream.log("about", document, static=True)
 
     def add(self, batch: Batch) -> None:
-        """Draw a batch; no line crosses missing entries or a reset."""
+        """Draw a batch. Lines are interrupted at missing journal entries and at resets."""
         missing = self._holes.find(batch.entries)
         resets = {index for index, entry in batch.entries.others.items() if isinstance(entry, Reset)}
         places = sorted(resets | set(missing))
@@ -178,7 +179,7 @@ class Drawing:
     def _hole(self, count: int, after: Batch) -> None:
         self._sample_ns, self._wrench = None, np.full(3, np.nan)
         self.events.forget()
-        if not isinstance(after.entries.others.get(0), Loss):  # a loss is drawn as an event
+        if not isinstance(after.entries.others.get(0), Loss):  # a `Loss` in the journal is drawn as an event of its own
             text = f"{count} journal entries are not there after this"
             self.events.add(self.stamp_ns, max(self.step, 0), text, "ERROR")
 
@@ -236,7 +237,7 @@ class Drawing:
         for index in sorted(entries.others):
             self._back(samples[: np.searchsorted(samples, index)], stamps, steps)
             entry, stamp_ns = entries.others[index], int(stamps[index])
-            # an entry without a stamp belongs to the stamp that the model had reached
+            # the time of an entry without a stamp is the stamp that the model has reached
             if not hasattr(entry, "stamp_ns"):
                 reached = np.flatnonzero(advance[:index])
                 stamp_ns = int(stamps[reached[-1]]) if reached.size else self.stamp_ns
@@ -249,7 +250,7 @@ class Drawing:
 
     @staticmethod
     def _loads(entries: Entries, advance: NDArray[np.bool_], before: Array) -> Array:
-        """Return the load at the end of each advance, (n, 3): sampled, held or zero; NaN if unknown."""
+        """Return the load at the end of each advance, shape (n, 3): sampled, held or zero, or NaN if it is unknown."""
         places = np.flatnonzero(advance)
         loads = np.where(entries.sample[places, None], entries.wrench[places], 0.0)
         for row in np.flatnonzero(~entries.sample[places]).tolist():
@@ -294,16 +295,16 @@ class Drawing:
             self.measured.add(np.array(stamps), np.array(places), 1e3 * np.array(poses))
 
     def _growth_m(self, numbers: Array) -> Array:
-        """Return the growth of the clearances by wear [m] with its interval, in the order of `layout.GROWTH`.
+        """Return the growth of the clearances by wear [m], with its interval, in the order of `layout.GROWTH`.
 
-        Estimates and changed parameters do not affect it.
+        Estimates and parameter changes have no effect on the result.
         """
         new = clearances(self._scene, np.zeros(PAIR_COUNT))[:2]
         best, low, high = (clearances(self._scene, numbers[:, pads])[:, :2] - new for pads in _PAD_POINTS)
         return np.concatenate((best, np.stack((low, high), axis=2).reshape(len(numbers), 4)), axis=1)
 
     def _bands(self, stamps: Indexes, steps: Indexes, numbers: Array) -> None:
-        """Draw the area between two bounds as a curve that alternates between them, row by row."""
+        """Draw the area between two bounds as a curve that alternates between the bounds from row to row."""
         total = np.concatenate((1e3 * numbers[:, _BOUNDS], 1e6 * self._growth_m(numbers)[:, 2:]), axis=1)
         if self._band_end is not None and len(stamps) and self._band_end[0][0] < stamps[0]:
             ends = zip(self._band_end, (stamps, steps, total), strict=True)
@@ -323,7 +324,9 @@ class Drawing:
         self.band.add(stamps, steps, np.where(bound[:, None], sides[:, :, 1], sides[:, :, 0]))
 
     def _color_bands(self, stamps: Indexes, steps: Indexes) -> None:
-        """Colour the bands: the first stroke, which the legend shows, is opaque, the others are faint."""
+        """Set the colours of the bands. The first stroke is opaque, because the legend shows its colour; all others are
+        faint.
+        """
         behind = int(np.searchsorted(stamps, stamps[0] + 2 * self.band.span_ns))
         changes = [0, min(max(1, behind), len(stamps) - 1)]
         for entity in layout.BAND:
@@ -338,7 +341,7 @@ class Drawing:
                 self.pads.add(int(stamps[row]), int(steps[row]), centers=middles, half_sizes=halves)
                 labels = [f"{depth:.3g} mm" if depth >= 1.0 else f"{1e3 * depth:.3g} µm" for depth in depth_mm[row]]
                 self.pad_names.add(int(stamps[row]), int(steps[row]), positions=places, labels=labels)
-            elif self._worn:  # new pads were set
+            elif self._worn:  # the pads were replaced
                 self.pads.add(int(stamps[row]), int(steps[row]), centers=[], half_sizes=[])
                 self.pad_names.add(int(stamps[row]), int(steps[row]), positions=[], labels=[])
             self._worn = bool(depth_mm[row].any())
@@ -360,7 +363,7 @@ class Drawing:
             self._drawn_face_ns = self.stamp_ns
 
     def _section(self, contact: Rows, head: Rows, steps: Indexes, loads: Array) -> None:
-        """In each span, draw the first instant that has forces and pose of one publication."""
+        """Draw the first stamp of each span for which forces and pose were published together."""
         at = np.minimum(np.searchsorted(contact.sequence, head.sequence), len(contact) - 1)
         spans = head.stamp_ns // round(1e9 / self.section_hz)
         for row in np.flatnonzero(contact.stamp_ns[at] == head.stamp_ns).tolist():
@@ -388,7 +391,7 @@ class Drawing:
         self.walls.add(stamp_ns, step, strips=list(walls), colors=shades)
 
     def _load(self, stamp_ns: int, step: int, pose: tuple[float, float, float], load: Array) -> None:
-        """Draw the head's name, and at its centre the sampled load; the scene's own loads are not in the journal."""
+        """Draw the name of the head, and the sampled load at its centre. Loads of the scene are not in the journal."""
         centre, name = self.section.head_points(pose)
         self.names.add(stamp_ns, step, positions=[name])
         fx, fy, moment = load.tolist()
@@ -398,7 +401,7 @@ class Drawing:
             self.load_arrow.add(stamp_ns, step, origins=[centre], vectors=[vector], labels=[label])
 
     def _statuses(self, batch: Batch) -> None:
-        """Write changes of status and alarms, at the earliest at the first sample."""
+        """Write changes of status and alarms. Changes before the first sample are written at the first sample."""
         topics = (self.header.topic("status"), self.header.topic(ALARMS))
         for part in batch.outputs:
             for channel in [number for number, (name, _) in part.topics.items() if name in topics]:
@@ -418,7 +421,7 @@ class Drawing:
         self._early = []
 
     def flush(self) -> None:
-        """Send the collected rows."""
+        """Send the buffered rows."""
         if (self._largest_load > 1.05 * self._named_load).any():
             layout.style_load(self.stream, self._largest_load)
             self._named_load = self._largest_load
@@ -428,7 +431,7 @@ class Drawing:
             part.flush()
 
     def finish(self, reader: RunReader) -> None:
-        """Write how the recording ended and what is missing, and send the collected rows."""
+        """Write how the recording ended and what is missing, and send the buffered rows."""
         self._write_statuses()
         self.face.draw(self.stamp_ns, max(self.step, 0))
         self.contact_sets.finish()

@@ -1,4 +1,4 @@
-"""Curves of any length for a picture: every row, or the extremes in bins of equal width."""
+"""Curves of any length for a picture: all rows, or the extremes in bins of equal width."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Indexes = NDArray[np.int64]
 
-#: Largest number of rows that are kept as they are.
+#: Largest number of rows that are stored without bins.
 MOST_ROWS: Final = 8000
-#: Largest number of bins, about one for each pixel: narrower bins would show beats with the load's period.
+#: Largest number of bins, about one for each pixel. With narrower bins, the picture would show a beat between bins and
+#: load period.
 _MOST_BINS: Final = 700
 
 
 class Envelope:
     """Rows of `width` numbers over time, in bounded memory.
 
-    Beyond `most_rows`, time is divided into bins of equal width over the whole span, and a bin keeps the least and the
+    Above `most_rows` rows, the whole time span is divided into bins of equal width. A bin contains the least and the
     largest value of each column, so that no peak is lost. A segment is a line between two gaps.
     """
 
     def __init__(self, width: int, most_rows: int = MOST_ROWS, most_bins: int = _MOST_BINS) -> None:
         self._most_rows, self._most_bins = most_rows, most_bins
         self._segment = 0
-        #: width of a bin [s]; 0 while every row is kept
+        #: Width of a bin [s]; 0 as long as all rows are stored.
         self._bin_s = 0.0
-        # place: time [s] of a row, or number of its bin
+        # `place` is the time [s] of a row, or the number of its bin
         self._kept = _Rows(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, width)), np.zeros((0, width)))
         self._added: list[_Rows] = []
         self._added_rows = 0
@@ -37,7 +38,7 @@ class Envelope:
         return bool(self._added_rows or len(self._kept.place))
 
     def add(self, times_s: Array, values: Array) -> None:
-        """Add rows, shapes (n,) and (n, width)."""
+        """Add times [s], shape (n,), and values, shape (n, width)."""
         if len(times_s):
             segment = np.full(len(times_s), self._segment, np.int64)
             self._added.append(_Rows(segment, np.array(times_s, np.float64), values, values))
@@ -46,19 +47,19 @@ class Envelope:
             self._merge()
 
     def break_line(self) -> None:
-        """End the lines; the next rows begin new ones."""
+        """End the lines. The next rows begin new lines."""
         self._segment += 1
 
     @property
     def bin_s(self) -> float:
-        """Width of a bin [s]; 0 while every row is kept."""
+        """Width of a bin [s]; 0 as long as all rows are stored."""
         self._merge()
         return self._bin_s
 
     def bands(self, column: int) -> tuple[Array, Array, Array]:
-        """Return times [s], least and largest values of a column, shape (n,) each; NaN where a line ends.
+        """Return times [s], least and largest values of a column, shape (n,) each. NaN interrupts a line.
 
-        The time of a bin is its middle.
+        The time of a bin is the middle of the bin.
         """
         self._merge()
         rows = self._kept
@@ -83,14 +84,14 @@ class Envelope:
             self._bin_s = max(2.0 * float(np.ptp(self._kept.place)) / self._most_bins, 1e-9)
             self._kept = self._kept.binned(self._bin_s)
         self._kept = self._kept.merged()
-        # rows of different segments are not merged, so their number may stay above the limit
+        # bins of different segments are never merged, so the limit may not be reached
         while len(self._kept.place) > self._most_bins and np.ptp(self._kept.place) > 1.0:
             self._bin_s *= 2.0
             self._kept = self._kept.binned(2.0).merged()
 
 
 class _Rows:
-    """Rows by segment and place, which is a time [s] or the number of a bin."""
+    """Rows with their segment and their place: a time [s], or the number of a bin."""
 
     def __init__(self, segment: Indexes, place: Array, least: Array, largest: Array) -> None:
         self.segment, self.place, self.least, self.largest = segment, place, least, largest
@@ -108,7 +109,7 @@ class _Rows:
         return _Rows(self.segment, np.floor(self.place / width), self.least, self.largest)
 
     def merged(self) -> _Rows:
-        """Return one row for each bin of a segment."""
+        """Return one row for each segment and place."""
         order = np.lexsort((self.place, self.segment))
         segment, place = self.segment[order], self.place[order]
         first = np.flatnonzero(np.r_[True, (np.diff(segment) != 0) | (np.diff(place) != 0)])

@@ -1,4 +1,4 @@
-"""Picture of an estimate: the fitted motion, and each quantity with its interval beside its prior."""
+"""Picture of an estimate: the fitted motion, and each quantity with its interval and its prior."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ from plow_twin.view.fitted import FittedPicture, FittedValue
 def estimate_picture(
     result: Estimate, prior: Mapping[str, Interval], poses: Poses, labels: Mapping[str, str], title: str
 ) -> FittedPicture:
-    """Return the picture of an estimate; without a fitted motion, the measured `poses` are drawn alone.
+    """Return the picture of an estimate. Without a fitted motion, only the measured `poses` are drawn.
 
-    `prior` and `labels` have the interval of the prior and the name with unit of each quantity, by its name in
-    `QUANTITIES`.
+    `prior` and `labels` contain the interval of the prior, and the name with unit, for each name in `QUANTITIES`.
     """
     states = {"horizontal": result.horizontal_state, "vertical": result.vertical_state}
     values = result.values()

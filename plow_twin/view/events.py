@@ -1,4 +1,4 @@
-"""The event log: touches, changes of status, settings, silences, losses."""
+"""The event log of a recording: touches, changes of status, parameter changes, silences and losses."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _LEVELS = ("INFO", "WARN", "ERROR", "WARN")
 
 
 class Events:
-    """Writes the log."""
+    """Writer of the event log."""
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis) -> None:
-        #: number of lines, and of failed advances
+        #: Number of lines, and number of failed advances.
         self.count = self.failed = 0
         self._lines = Batches(stream, axis, "events", rr.TextLog, ("text", "level"))
         self._makes_before: NDArray[np.float64] | None = None
@@ -34,13 +34,13 @@ class Events:
         self._lines.add(stamp_ns, step, text=[text], level=[level])
 
     def sample(self, stamp_ns: int, step: int) -> None:
-        """Write that the excitation is back, if it was silent."""
+        """Write that the excitation has returned, if it was silent before."""
         if self.silent:
             self.add(stamp_ns, step, "excitation is back")
         self.silent = False
 
     def entry(self, stamp_ns: int, step: int, entry: Entry | Dropped, excitation_source: str) -> None:
-        """Write an entry of the journal, if it is an event."""
+        """Write an entry of the journal if it is an event."""
         match entry:
             case Hold() | Unload():
                 if not self.silent and excitation_source != "scene":
@@ -48,7 +48,7 @@ class Events:
                     self.add(stamp_ns, step, f"excitation silent: {subject}", "WARN")
                     self.silent = True
             case Travel(_, speed):
-                # sensors repeat an unchanged speed many times a second
+                # sensors repeat an unchanged speed many times per second
                 if speed != self._speed_m_s:
                     self.add(stamp_ns, step, f"travel along the face at {speed:g} m/s")
                 self._speed_m_s = speed
@@ -72,7 +72,10 @@ class Events:
                 self.add(stamp_ns, step, f"{count} messages on {topic} were not recorded before this", "ERROR")
 
     def peaks(self, stamps: Indexes, steps: Indexes, makes: Array, peak: Array) -> None:
-        """Write the touches in rows of `contact_peaks`: cumulative makes and largest forces [N], (n, 8) each."""
+        """Write the touches in rows of `contact_peaks`.
+
+        `makes`, shape (n, 8), are cumulative numbers of touches. `peak`, shape (n, 8), are the largest forces [N].
+        """
         if not len(stamps):
             return
         before = makes[:1] if self._makes_before is None else self._makes_before[None]
@@ -85,7 +88,7 @@ class Events:
             self.add(int(stamps[row]), int(steps[row]), text)
 
     def forget(self) -> None:
-        """Count touches from the next row on, because earlier rows are unknown."""
+        """Restart the count of touches at the next row, because rows are missing before it."""
         self._makes_before = None
 
     def status(self, stamp_ns: int, step: int, message: DiagnosticStatus) -> None:
@@ -97,5 +100,5 @@ class Events:
         self._status[message.name] = now
 
     def flush(self) -> None:
-        """Send the collected lines."""
+        """Send the buffered lines."""
         self._lines.flush()

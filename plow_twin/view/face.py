@@ -1,6 +1,6 @@
-"""Chart of the largest contact force along the face, pass by pass.
+"""Chart of the largest contact force along the face, for each pass.
 
-The chart divides the face into pieces of equal length, and each pass keeps the largest force in each piece.
+The face is divided into pieces of equal length. The chart shows the largest force of each pass in each piece.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from plow_twin.stream.journal import Travel
 from plow_twin.view.columns import Array, Batches, Indexes, TimeAxis
 
-#: Size of the chart in the units of its view.
+#: Size of the chart, in the units of its view.
 WIDTH: Final = 300.0
 HEIGHT: Final = 90.0
-#: First length of a piece [m], which doubles when a pass has more than `_MOST_PIECES` pieces.
+#: Initial length of a piece [m]. It is doubled when a pass has more than `_MOST_PIECES` pieces.
 _PIECE_M: Final = 0.1
 _MOST_PIECES: Final = 600
-#: Number of passes drawn; the newest is bright.
+#: Number of passes in the chart; the newest pass is drawn in a bright colour.
 _MOST_PASSES: Final = 8
 _AXIS: Final = (110, 115, 125)
 _NEWEST: Final = (240, 160, 60)
@@ -30,7 +30,7 @@ _EARLIER: Final = (90, 110, 130)
 
 
 class FaceChart:
-    """Collects forces by place and draws them; `known` is true once the head has moved along the face."""
+    """Chart of the forces along the face. The attribute `known` is true once the head has moved along the face."""
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis) -> None:
         self._lines = Batches(stream, axis, "face/force", rr.LineStrips2D, ("strips", "colors"))
@@ -44,12 +44,12 @@ class FaceChart:
         self._speed = self._place_m = 0.0
         self._direction = 0.0
         self._reached_ns: int | None = None
-        #: speeds whose stamps have not been reached, in order
+        #: Speeds with stamps that the forces have not reached, sorted by stamp.
         self._coming: list[Travel] = []
         self.known = False
 
     def travel(self, travel: Travel) -> None:
-        """Change the speed from its stamp on."""
+        """Change the speed from the stamp of `travel` on."""
         if self._reached_ns is not None and travel.stamp_ns > self._reached_ns:
             insort(self._coming, travel, key=lambda one: one.stamp_ns)
         else:
@@ -64,7 +64,7 @@ class FaceChart:
         self.known = self.known or bool(speed_m_s)
 
     def forces(self, stamps: Indexes, force: Array) -> None:
-        """Add forces [N], shape (n,), each at the speed of its time."""
+        """Add forces [N], shape (n,), with their stamps [ns]. Each force belongs to the speed at its stamp."""
         while len(stamps) and self._coming and stamps[-1] > self._coming[0].stamp_ns:
             count = int(np.searchsorted(stamps, self._coming[0].stamp_ns, "right"))
             self._forces(stamps[:count], force[:count])
@@ -91,7 +91,7 @@ class FaceChart:
             here = self._passes[-1]
 
     def restart(self) -> None:
-        """Continue after a reset: stamps may go back, so waiting speeds apply now."""
+        """Continue after a reset. Stamps may step back, so speeds that wait for their stamp are applied at once."""
         for travel in self._coming:
             self._set_speed(travel.speed_m_s)
         self._coming, self._reached_ns = [], None
@@ -119,7 +119,7 @@ class FaceChart:
         self._ticks.add(stamp_ns, step, positions=[(x, y) for x, y, _ in ticks], labels=[text for *_, text in ticks])
 
     def flush(self) -> None:
-        """Send the collected charts."""
+        """Send the buffered charts."""
         self._lines.flush()
         self._ticks.flush()
 
@@ -132,6 +132,6 @@ def _halved(one: dict[int, float]) -> dict[int, float]:
 
 
 def _round_up(value: float) -> float:
-    """Return the smallest of 1, 2, 5 and 10 times a power of ten that is not below the value."""
+    """Return the smallest number of the form 1, 2, 5 or 10 times a power of ten that is not below the value."""
     power = 10.0 ** math.floor(math.log10(value))
     return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= value)

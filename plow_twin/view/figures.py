@@ -1,4 +1,4 @@
-"""Writing figures as PNG files, and parts that all figures share."""
+"""Functions that all figures share: PNG files, legends, numbers and dates."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MINUS: Final = "\N{MINUS SIGN}"
 
 
 def write_png(figure: Figure, path: Path) -> None:
-    """Write a figure.
+    """Write a figure as a PNG file.
 
     Raises
     ------
@@ -42,12 +42,12 @@ def legend_beside(axis: Any, **options: Any) -> None:
 
 
 def signed(value: float, form: str) -> str:
-    """Return a number with a proper minus sign, as on the axes of matplotlib."""
+    """Format a number with a typographic minus sign, as matplotlib does on axes."""
     return f"{value:{form}}".replace("-", MINUS)
 
 
 def scene_and_date(reader: RunReader, first_ns: int | None = None) -> str:
-    """Return scene and date of a recording for a title; `first_ns` is its first stamp, if known."""
+    """Return the scene and the date of a recording for a title; `first_ns` is the first stamp if it is known."""
     scene = reader.header.parameters.get("scene")
     parts = [f"scene {Path(scene).name}"] if isinstance(scene, str) and scene else []
     date = date_text(reader.began_ns() if first_ns is None else first_ns)
@@ -55,7 +55,7 @@ def scene_and_date(reader: RunReader, first_ns: int | None = None) -> str:
 
 
 def date_text(stamp_ns: int | None) -> str:
-    """Return the date of a stamp; empty if stamps count from an arbitrary start."""
+    """Return the date of a stamp, or an empty text if the stamp does not count from 1970."""
     if stamp_ns is None or stamp_ns < EPOCH_S * 1e9:
         return ""
     return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

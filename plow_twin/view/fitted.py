@@ -1,4 +1,4 @@
-"""The picture of a fit: measured and fitted motion, residuals, and values with intervals beside the prior."""
+"""Picture of a fit: measured and fitted motion, residuals, and fitted values with their intervals and priors."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ Array = NDArray[np.float64]
 _SCALE: Final = 1e3
 _COMPONENTS: Final = (("x", "mm"), ("y", "mm"), ("θ", "mrad"))
 _LINE: Final = 150
-#: Multiple of the median time between rows from which on there is a gap.
+#: Steps that exceed the median step by more than this factor are drawn as gaps.
 _GAP: Final = 10.0
-#: Largest drawn distance from the prior's middle, in half widths of the prior.
+#: Largest drawn distance of a value from the middle of its prior, in half widths of the prior.
 _FARTHEST: Final = 2.0
 
 
 @dataclass(frozen=True)
 class FittedValue:
-    """A fitted value and its prior, each as middle, low, high in the unit of the label.
+    """A fitted value and its prior. Each is a triple (middle, low, high) in the unit of the label.
 
-    `note` is the state of the value or another short word. `is_log`: its scale is logarithmic.
+    `note` is the state of the value, or another short remark. `is_log` selects a logarithmic scale.
     """
 
     label: str
@@ -48,13 +48,14 @@ class FittedValue:
 
     @property
     def prior_text(self) -> str:
-        """The prior's interval, or an empty text."""
+        """The interval of the prior, or an empty text."""
         if self.prior is None:
             return ""
         return " to ".join(signed(number, self.digits) for number in self.prior[1:])
 
     def places(self) -> Array:
-        """Return value, low and high on a scale that puts the prior's low, middle and high at -1, 0 and 1."""
+        """Return value, low and high on a scale on which low, middle and high of the prior are -1, 0 and 1, shape (3,).
+        """
         if self.prior is None:
             return np.full(3, np.nan)
         scale = np.log if self.is_log else np.asarray
@@ -65,10 +66,10 @@ class FittedValue:
 
 @dataclass(frozen=True)
 class FittedPicture:
-    """The content of the picture of a fit.
+    """Content of the picture of a fit.
 
-    `noise` is the standard deviation of the measured x, y [m], theta [rad]. `prior_name` names the prior beside each
-    value, and `prior_meaning` explains it.
+    `noise` contains the standard deviations of the measured x, y [m] and theta [rad]. `prior_name` is the label of the
+    prior beside each value, and `prior_meaning` explains the grey bars.
     """
 
     title: str
@@ -80,7 +81,7 @@ class FittedPicture:
     notes: Sequence[str] = ()
 
     def figure(self) -> Any:
-        """Return the figure of matplotlib."""
+        """Return the matplotlib figure."""
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(16, 9.5), layout="constrained")
@@ -144,7 +145,7 @@ class FittedPicture:
 
 
 def _broken(t: Array, values: Array) -> tuple[Array, Array]:
-    """Return a curve that is interrupted by NaN at each gap."""
+    """Return a curve with NaN inserted at each gap."""
     there = np.isfinite(values)
     t, values = t[there], values[there]
     steps = np.diff(t)

@@ -1,4 +1,4 @@
-"""The picture of a fit as a PNG, or as a file for rerun."""
+"""Output of the picture of a fit as a PNG file or a rerun file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _COMPONENTS: Final = (("x", "mm"), ("y", "mm"), ("theta", "mrad"))
 
 
 def write_fit_picture(picture: FittedPicture, path: Path) -> None:
-    """Write a PNG, or with the suffix .rrd a file for rerun; raise RecordingError if it cannot be written."""
+    """Write a PNG file, or a rerun file if the suffix is .rrd. Raise `RecordingError` if the file cannot be written."""
     if path.suffix == ".rrd":
         _write_rrd(picture, path)
     else:

@@ -1,4 +1,4 @@
-"""Picture of a forecast: the clearances over time, and when the first of them reaches its limit."""
+"""Picture of a forecast: the clearances over time, and the probability that a limit has been reached."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ _COLOURS = ("#1f4e9c", "#d62728")
 
 
 def draw_forecast(found: Forecast, path: FilePath, title: str) -> None:
-    """Draw P10, P50 and P90 of both clearances over time, and the probability that a limit is reached, into a PNG."""
+    """Draw a PNG with P10, P50 and P90 of both clearances over time, and the probability that a limit has been reached.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13.0, 4.8), layout="constrained", dpi=110)
@@ -25,14 +26,14 @@ def draw_forecast(found: Forecast, path: FilePath, title: str) -> None:
     left, right = figure.subplots(1, 2)
     plan = found.plan
     reached = found.hours[np.isfinite(found.hours)]
-    # the whole horizon is shown if the limits have been reached already
+    # if the limits have already been reached, the whole horizon is shown
     last = 1.3 * float(np.quantile(reached, 0.95)) if len(reached) else 0.0
     end = min(plan.horizon_h, last) if last > 0.0 else plan.horizon_h
     hours = np.linspace(0.0, end, _MOMENTS)
     growing = 1e3 * found.clearances(hours)
     limits = (plan.limit_horizontal_m, plan.limit_vertical_m)
     for axis, (name, limit, colour) in enumerate(zip(("horizontal", "vertical"), limits, _COLOURS, strict=True)):
-        # a clearance whose limit has been reached is infinite
+        # the forecast is infinite from the time at which the limit is reached
         low, middle, high = np.minimum(growing[:, :, axis], 1e3 * limit)
         middle[~np.isfinite(growing[1, :, axis])] = np.nan
         left.fill_between(hours, low, high, color=colour, alpha=0.2, linewidth=0.0)
@@ -53,7 +54,7 @@ def draw_forecast(found: Forecast, path: FilePath, title: str) -> None:
                 xytext=(offset, -10.0),
                 textcoords="offset points",
                 ha=side,
-                # this label covers the line of the other points
+                # a white box hides the line behind the label
                 bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
             )
     if plan.stop_h is not None and plan.stop_h <= end:

@@ -1,4 +1,4 @@
-"""Blueprint of the viewer for a recording, and the style of each curve."""
+"""Blueprint of the rerun viewer for a recording, and the style of each curve."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from plow_twin.view.section import ARROW_MM_PER_N, LOAD_COLOR, PAD_MM_PER_MM, PA
 
 FORCE: Final = tuple(f"force/{name}" for name in PAIR_NAMES)
 FORCE_AT_STAMP: Final = tuple(f"force_at_stamp/{name}" for name in PAIR_NAMES)
-#: 5 % and 95 % bounds of the forces at the stamps, for a twin that follows its machine.
+#: 5 % and 95 % points of the forces at the stamps, for a twin that follows its machine.
 FORCE_BOUNDS: Final = tuple(f"force_interval/{name}/{point}" for point in ("p05", "p95") for name in PAIR_NAMES)
 POSE: Final = ("pose/x", "pose/y", "pose/theta")
 MEASURED: Final = ("pose/measured/x", "pose/measured/y", "pose/measured/theta")
@@ -32,12 +32,13 @@ AGE: Final = ("quality/sample_age_ms",)
 INTERVAL: Final = ("quality/sample_interval_ms",)
 TOTAL: Final = tuple(f"clearance/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
 GROWTH: Final = tuple(f"growth/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
-#: Areas between the bounds of a clearance, whose names sort before those of the clearances, so that they lie below.
+#: Areas between the bounds of a clearance. Their names sort before the names of the clearances, so that the curves are
+#: drawn on top.
 BAND: Final = tuple(f"{group}/band/{way}" for group in ("clearance", "growth") for way in ("horizontal", "vertical"))
 RESIDUAL: Final = ("residual/x", "residual/y", "residual/theta")
 WEAR: Final = tuple(f"wear/{name}" for name in CLEARANCE_NAMES if name.startswith("pad_"))
 
-#: Contents of a view without bounds, which the bands show already; a legend shows at most eight names.
+#: Contents of a view without the bounds. The bands already show the bounds, and a legend has room for eight names only.
 _WITHOUT_BOUNDS: Final = (
     "$origin/**",
     *(f"- $origin/{name}" for name in CLEARANCE_NAMES if name.endswith(("/p05", "/p95"))),
@@ -55,7 +56,8 @@ _WHAT_IF_COLORS: Final = (
     (204, 121, 167),
     (240, 228, 66),
 )
-#: Opacity of a band's stroke, at most 255: several wide, faint strokes at each pixel give an even area without stripes.
+#: Opacity of a stroke of a band (255: opaque). Several wide, faint strokes overlap at each pixel and give an even area
+#: without stripes.
 _BAND_ALPHA: Final = 10
 _BAND_WIDTH: Final = 6.0
 _CLEARANCE_COLORS: Final = {"horizontal": (86, 180, 233), "vertical": (240, 160, 60)}
@@ -66,7 +68,7 @@ def blueprint(
 ) -> rrb.Blueprint:
     """Return the arrangement of the views.
 
-    With `what_if`, the view of other scenes is in front; with `followed`, there is a view of the forces with their 90 %
+    With `what_if`, the view of other scenes is the active tab. With `followed`, a view shows the forces with their 90 %
     intervals. `title` is appended to the name of the view of the forces.
     """
     half_x, half_y = (float(half) for half in section.half_view)
@@ -98,7 +100,7 @@ def blueprint(
         active_tab=0,
     )
     curves = rrb.Vertical(
-        # a narrower view would cut the title off
+        # a narrower view would cut off its title
         _plot("force", f"Largest contact force [kN]{title and '; '}{title}"),
         rrb.StateTimelineView(origin=ENTITY, name="Corners that carry force"),
         _plot("load", "Load on the head"),
@@ -113,7 +115,7 @@ def blueprint(
             _plot("wear", "Wear [mm]", rrb.Corner2D.LeftTop, _WITHOUT_BOUNDS),
             active_tab=0,
         ),
-        # with these shares the contact sets fit even in a window 600 pixels high
+        # with these shares, the contact sets fit into a window of 600 pixels height
         row_shares=[4.7, 2.2, 2.7, 3.4],
     )
     return rrb.Blueprint(
@@ -132,12 +134,12 @@ def _plot(
     legend: rrb.Corner2D = rrb.Corner2D.RightTop,
     contents: Sequence[str] = ("$origin/**",),
 ) -> rrb.TimeSeriesView:
-    # rerun puts a legend only into a corner inside the plot
+    # rerun draws a legend only in a corner inside the plot
     return rrb.TimeSeriesView(origin=origin, contents=list(contents), name=name, plot_legend=legend)
 
 
 def style_curves(stream: rr.RecordingStream) -> None:
-    """Give the curves colours, names, and a reduction that keeps peaks where many points share a pixel."""
+    """Set the colours and names of the curves, and a reduction that preserves peaks where many points share a pixel."""
     for entities in (FORCE, FORCE_AT_STAMP, PENETRATION):
         for entity, name, color in zip(entities, PAIR_NAMES, PAIR_COLORS, strict=True):
             _style(stream, entity, name, color)
@@ -156,7 +158,7 @@ def style_curves(stream: rr.RecordingStream) -> None:
         _style(stream, entity, name, color)
     for entity in BAND:
         _style(stream, entity, "90 % interval", None, _BAND_WIDTH)
-    # the lines of bounds are thinner and darker
+    # bounds are drawn thinner and darker than values
     for entity in (*TOTAL, *GROWTH, *WEAR):
         base, _, bound = entity.partition("/")[2].partition("/")
         base = base.removeprefix("pad_")
@@ -166,20 +168,22 @@ def style_curves(stream: rr.RecordingStream) -> None:
 
 
 def band_colors(entity: str) -> list[tuple[int, ...]]:
-    """Return the colours of a band: of its first stroke, which the legend shows too, and of the others."""
+    """Return two colours of a band: of the opaque first stroke, which the legend shows, and of the faint other strokes.
+    """
     color = _CLEARANCE_COLORS[entity.rpartition("/")[2]]
     return [(*(part // 2 for part in color), 255), (*color, _BAND_ALPHA)]
 
 
 def style_load(stream: rr.RecordingStream, largest: Iterable[float]) -> None:
-    """Put the largest values into the names of the load curves, since a low plot labels only powers of ten."""
+    """Put the largest loads into the names of the load curves, because the axis of a low plot shows only powers of ten.
+    """
     for entity, name, unit, color, value in zip(LOAD, *_LOAD_NAMES, _LOAD_COLORS, largest, strict=True):
         named = f"{name}, to {value:.3g} {unit}" if value else f"{name} [{unit}]"
         _style(stream, entity, named, color)
 
 
 def what_if_curves(stream: rr.RecordingStream, names: Sequence[str]) -> tuple[str, ...]:
-    """Name and colour the curves of the run and of other scenes; return their entities."""
+    """Set the names and colours of the curves of the run and of other scenes. Return their entities."""
     entities = tuple(f"what_if/{number}" for number in range(len(names) + 1))
     for number, (entity, name) in enumerate(zip(entities, ("the run", *names), strict=True)):
         color = _WHAT_IF_COLORS[number % len(_WHAT_IF_COLORS)]
@@ -201,7 +205,7 @@ def _style(
 
 
 def about(scene: Scene, header: RunHeader, source: Path) -> str:
-    """Return a description of the run and the picture in Markdown."""
+    """Return a description of the run and of the views as Markdown."""
     contact = scene.contact
     frame = "fixed frame" if scene.support is None else "frame, on springs, to which this picture is fixed,"
     return f"""# {source.name}
@@ -209,19 +213,22 @@ def about(scene: Scene, header: RunHeader, source: Path) -> str:
 The head ({scene.head.mass_kg:g} kg) moves about the {frame} of the guide
 ({1e3 * scene.frame.width_m:g} x {1e3 * scene.frame.height_m:g} mm) inside the clearance of its cavity
 ({1e3 * scene.clearance.horizontal_m:g} mm horizontal, {1e3 * scene.clearance.vertical_m:g} mm vertical in total).
-Where a corner of the frame meets a wall of the cavity, an arrow shows the force on the head (100 kN are
-{1e5 * ARROW_MM_PER_N:g} mm long), in the colour of its curve. Everything is to scale but the outer outline of the head.
+Where a corner of the frame meets a wall of the cavity, an arrow shows the force on the head in the colour of its curve.
+An arrow of {1e5 * ARROW_MM_PER_N:g} mm means 100 kN. Everything except the outer outline of the head is drawn to scale.
 
-- grey: frame, with its corners; white: the cavity and, schematically, the body of the head; violet: the load on it
-- force curves: the largest force between two messages, no peak is left out (`force_at_stamp`: the force at the stamp)
-- the cross-section is thinned in time; curves keep every row
-- growth of the clearance: over the clearance without wear, in micrometres, with the band of its 90 % interval
-- head's outline and corners that carry force: blue stops a counter-clockwise swing, orange a clockwise one, violet both
-- force along the face: the largest in each piece, the newest pass bright; residual: measured pose less the model's
-- a twin that follows its machine (`follow: full`): its forces at the stamps with their 90 % interval
-- timelines: `{ROS_TIME}` is the stamp, `{RUN_TIME}` the time since the first one, `{STEP}` counts the advances
-- beside it the same with the clearance drawn several times as wide, which slants the walls more than they are; walls
-  that touch are orange; bars inside the frame are the wear of its pads, {1e-3 * PAD_MM_PER_MM:g} mm for each µm
+- Colours: the frame and its corners are grey, the cavity and the schematic body of the head are white, and the load on
+  the head is violet.
+- Force curves show the largest force between two messages. `force_at_stamp` shows the force at the stamp of a message.
+- The cross-section is drawn at a limited rate; curves contain all rows or their extremes. - The growth of the clearance
+is measured from the clearance without wear [µm]. The band is its 90 % interval. - The outline of the head and the
+corners that carry force are blue if they stop a counter-clockwise swing, orange if
+  they stop a clockwise swing, and violet for both.
+- The force along the face is the largest force in each piece of the face. The newest pass is bright. - A residual is a
+measured pose minus the pose of the model. - If the twin follows its machine (`follow: full`), the forces at the stamps
+are shown with their 90 % interval. - On the timeline `{ROS_TIME}`, time is the stamp. `{RUN_TIME}` counts from the
+first stamp, and `{STEP}` counts advances. - The second cross-section widens the clearance, which also exaggerates the
+slope of the walls. Walls that touch are
+  orange. Bars inside the frame show the wear of its pads, {1e-3 * PAD_MM_PER_MM:g} mm for each µm.
 
 | | |
 |---|---|

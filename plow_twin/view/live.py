@@ -1,4 +1,4 @@
-"""A live view of a run by a process that follows its file, so that the node does not depend on the view."""
+"""Live view of a run. A separate process follows the file of the run, so that the node is independent of the view."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from plow_twin.record.reader import RunReader
 from plow_twin.view.drawing import Drawing, Sink
 from plow_twin.view.rrd import ViewSummary
 
-#: Rate of the spans in which a curve keeps two values [Hz]; an hour of all curves takes some 200 MB in the viewer.
+#: Rate of spans [Hz]; two values of each curve are drawn per span. One hour of all curves then takes some 200 MB in the
+#: viewer.
 CURVE_HZ: Final = 25.0
 SECTION_HZ: Final = 20.0
-#: Rate of the cross-section for the part recorded before the view started [Hz].
+#: Rate of the cross-section [Hz] in the part of the run before the view started.
 _SECTION_HZ_BEFORE: Final = 1.0
 
 
@@ -27,7 +28,7 @@ def follow(
     exaggerate: float | None = None,
     others: Mapping[str, Scene] | None = None,
 ) -> ViewSummary:
-    """Show a recording until its recorder ends or `stop` returns true; options as in `to_rrd`."""
+    """Show a recording until its recorder ends or `stop` returns True. See `to_rrd` for the other arguments."""
     reader = RunReader(path, Tail(stop))
     drawing = Drawing(
         reader, sink, section_hz=_SECTION_HZ_BEFORE, exaggerate=exaggerate, span_ns=round(1e9 / CURVE_HZ), others=others
@@ -35,7 +36,7 @@ def follow(
     for batch in reader.batches():
         if len(batch.entries) or batch.outputs:
             drawing.add(batch)
-        else:  # the view is live from here on
+        else:  # all recorded data have been drawn: the view is live from here on
             drawing.section_hz = SECTION_HZ
             drawing.flush()
             drawing.stream.flush()

@@ -14,7 +14,7 @@ from plow_twin.view.section import PAIR_COLORS
 
 
 class NotebookFigure(Figure):
-    """A figure that a notebook displays without pyplot and its global state."""
+    """A figure that a notebook displays without the global state of pyplot."""
 
     def _repr_png_(self) -> bytes:
         stream = io.BytesIO()
@@ -23,21 +23,21 @@ class NotebookFigure(Figure):
 
 
 def plot_motion(result: Result, title: str = "") -> Figure:
-    """Draw pose and contact forces over time.
+    """Draw the pose and the contact forces over time.
 
-    Needs matplotlib (extra `view` or `study`).
+    This function needs matplotlib (extra `view` or `study`).
 
     Parameters
     ----------
     result : Result
         The motion that `simulate` returned.
     title : str
-        Title of the figure; by default it states the length of the motion and the number of contact changes.
+        Title of the figure. The default title contains the length of the motion and the number of contact changes.
 
     Returns
     -------
     matplotlib.figure.Figure
-        Notebooks show the figure, and `savefig` writes it.
+        The figure. Notebooks display it, and its method `savefig` writes it to a file.
     """
     figure = NotebookFigure(figsize=(11.0, 7.5), layout="constrained")
     position, angle, force = (axes := figure.subplots(3, 1, sharex=True, height_ratios=(2, 1, 2)))

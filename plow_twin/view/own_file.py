@@ -1,4 +1,4 @@
-"""Picture of the first seconds of a user's file, as the mapping reads them."""
+"""Picture of the first seconds of a user's file, as it is read through the mapping."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _PREFIXES: Final = (("M", 1e6), ("k", 1e3))
 
 
 def draw_own_file(guess: Guess, path: Path) -> Path:
-    """Draw the first ten seconds into a PNG; return its path."""
+    """Draw the first ten seconds as PNG. Return the path of the picture."""
     from matplotlib.figure import Figure
 
     load = [("excitation", name) for name in ("fx", "fy", "m")]
@@ -38,6 +38,6 @@ def draw_own_file(guess: Guess, path: Path) -> Path:
         axis.set_ylabel(label)
         axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8)
     axes[-1].set_xlabel("time since the first row [s]")
-    figure.suptitle(f"{guess.path.name}, its first ten seconds as they are read")
+    figure.suptitle(f"{guess.path.name}, the first ten seconds as read through the mapping")
     write_png(figure, path)
     return path

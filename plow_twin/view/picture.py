@@ -1,4 +1,4 @@
-"""A recording as one picture: cross-section at the largest force, forces, load, clearance."""
+"""Picture of a recording: cross-section at the largest force, contact forces, load and clearances."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from plow_twin.view.section import PAIR_COLORS, Section
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Room around the end of an arrow for its label [mm].
+#: Margin around the end of an arrow for its label [mm].
 _LABEL_ROOM_MM: Final = 50.0
 _LABEL_WIDTH: Final = 0.015
 _LOAD_NAMES: Final = ("Fx [kN]", "Fy [kN]", "M [kN m]")
-#: The state of a clearance in the words of the operator's screen.
+#: Labels of the states of a clearance, as on the operator's screen.
 _STATES: Final = {
     "prior": "assumed",
     "estimated": "estimated",
@@ -38,9 +38,9 @@ _STATES: Final = {
 
 
 def to_png(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], int]:
-    """Draw a recording into a PNG; return how it ended, its losses, and the number of failed advances.
+    """Draw a recording as PNG. Return its status, its losses, and the number of failed advances.
 
-    No line crosses missing entries or a reset. A long run is drawn as the envelope of its curves.
+    Lines are interrupted at missing journal entries and at resets. Of a long run, the envelope of the curves is drawn.
     """
     reader = RunReader(path)
     curves = RunCurves.of(reader)
@@ -50,7 +50,7 @@ def to_png(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], int]:
 
 
 def run_figure(reader: RunReader, curves: RunCurves) -> Figure:
-    """Return the figure of a recording; raise RecordingError if there is no row to draw."""
+    """Return the figure of a recording, or raise `RecordingError` if there is no row to draw."""
     from matplotlib.figure import Figure
 
     if not curves:
@@ -136,7 +136,7 @@ def _draw_section(axis: Any, section: Section, instant: Instant, curves: RunCurv
             sideways = abs(vector[0]) > abs(vector[1])
             side = "center" if not sideways else "left" if vector[0] > 0.0 else "right"
             axis.annotate(text, origin + 1.1 * vector, color=color, ha=side, va="center", fontsize=8)
-        # annotations do not widen the axes, so points on both sides of each label do
+        # matplotlib ignores annotations in the limits of axes, so points on both sides of each label are added
         axis.update_datalim(
             np.concatenate([origins + 1.1 * vectors + side for side in (-_LABEL_ROOM_MM, _LABEL_ROOM_MM)])
         )
@@ -149,19 +149,18 @@ def _draw_section(axis: Any, section: Section, instant: Instant, curves: RunCurv
         fontsize=9,
     )
     axis.margins(0.1)
-    axis.set_xlabel("to scale: a wall drawn inside a corner is pressed in by that depth", fontsize=8)
+    axis.set_xlabel("to scale: where a wall overlaps a corner, the overlap is the penetration", fontsize=8)
     axis.legend(loc="upper left", bbox_to_anchor=(0.0, -0.1), ncols=2, fontsize=7)
     _y_upwards(axis)
 
 
 def _y_upwards(axis: Any) -> None:
-    """Label y upwards, although y points downwards in the section."""
     axis.invert_yaxis()
     axis.yaxis.set_major_formatter(lambda y, _: signed(0.0 - y, "g"))
 
 
 def _draw_gaps(axis: Any, penetration: NDArray[np.float64]) -> None:
-    """Draw a bar for each pair: its gap to one side, or its penetration to the other."""
+    """Draw a bar for each pair: the gap to the left, or the penetration to the right."""
     places = np.arange(len(PAIR_NAMES))
     colors = ["tab:orange" if value > 0.0 else "0.6" for value in penetration]
     bars = axis.barh(places, 1e3 * penetration, color=colors)
@@ -183,9 +182,10 @@ def _curves(
     only_largest: bool = False,
     gaps: Sequence[tuple[float, float]] = (),
 ) -> None:
-    """Draw curves, and if they are in bins, the band from the least to the largest value of each bin.
+    """Draw curves. If the rows are in bins, draw the band from the least to the largest value of each bin.
 
-    `only_largest` is for forces, whose bands would all begin at zero. No line crosses a gap (its begin and end [s]).
+    `only_largest` omits the bands, for forces whose least value is nearly always zero. Lines are interrupted at the
+    `gaps` (begin and end [s]).
     """
     axis.set_ylabel(label)
     if not rows:
@@ -203,7 +203,9 @@ def _curves(
 
 
 def _widest(times: NDArray[np.float64], begin: float, end: float) -> int:
-    """Return the index after the longest step [s] overlapping a gap, or `len(times)` if there is none."""
+    """Return the index after the longest step that overlaps a gap from `begin` to `end` [s], or `len(times)` if none
+    does.
+    """
     steps = np.where((times[1:] > begin) & (times[:-1] < end), np.diff(times), 0.0)
     return int(steps.argmax()) + 1 if steps.any() else len(times)
 
@@ -215,7 +217,7 @@ def _thresholds(axis: Any, thresholds: Thresholds, factor: float) -> None:
 
 
 def _clearance(axis: Any, curves: RunCurves) -> None:
-    """Draw the clearances with their intervals, and mark changes that are not wear."""
+    """Draw the clearances with their intervals, and mark the changes that are not due to wear."""
     axis.set_ylabel("clearance with its\n90 % interval [mm]")
     if not curves.clearance:
         _note_absence(axis, "not in the recording")

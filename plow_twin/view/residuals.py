@@ -1,4 +1,4 @@
-"""Residuals: measured poses of the journal minus the model's poses at the same stamps."""
+"""Residuals: measured poses of the journal minus poses of the model at the same stamps."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ _SCALE = 1e3
 
 
 class Residuals:
-    """Compares measured poses with linearly interpolated poses of the model, once these reach the stamps."""
+    """Comparison of measured poses with poses of the model, which are interpolated linearly between its stamps."""
 
     def __init__(self) -> None:
         self._waiting: list[tuple[int, int, tuple[float, ...]]] = []
         self._last: tuple[int, Array] | None = None
 
     def compare(self, poses: Sequence[tuple[int, Pose]], steps: Indexes, head: Rows) -> tuple[Indexes, Indexes, Array]:
-        """Return stamps, steps and residuals x, y [mm], theta [mrad], (n, 3), of the poses that can be compared now.
+        """Return stamps [ns], steps and residuals x, y [mm], theta [mrad], shape (n, 3).
 
-        Each of the `poses` has its index among the journal's entries, whose `steps` are given. `head` has rows of
-        `head_state`.
+        Each item of `poses` is the index of a journal entry and its pose; `steps` are those of the journal entries.
+        `head` has rows of `head_state`. A pose beyond the last row of `head` is compared at a later call.
         """
         self._waiting += [(pose.stamp_ns, max(int(steps[place]), 0), pose.pose) for place, pose in poses]
         predicted = np.column_stack((head.numbers[:, :2], 2.0 * np.arctan2(head.numbers[:, 2], head.numbers[:, 3])))

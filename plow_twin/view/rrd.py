@@ -1,4 +1,4 @@
-"""A recording as a rerun file with its blueprint."""
+"""Output of a recording as a rerun file with its blueprint."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from plow_twin.view.drawing import Drawing
 from plow_twin.view.rrd_file import RrdFile
 
 MOST_ROWS: Final = 200_000
-#: Rate of the cross-section [Hz]; curves keep every row.
+#: Rate of the cross-section [Hz]. Curves are not thinned to this rate.
 SECTION_HZ: Final = 100.0
-#: Assumed size of a recording per row of its curves [B].
+#: Assumed size of a recording [B] per row of its curves.
 _BYTES_PER_ROW: Final = 400
 
 
 @dataclass(frozen=True)
 class ViewSummary:
-    """Content of a .rrd: first stamp, rows of the curves, cross-sections, events.
+    """Content of a rerun file: first stamp, numbers of rows, cross-sections and events.
 
-    `status` is how the recording ended. `lost` has the recorder's counts by topic, the missing and foreign parts, and
-    the samples that came too late for other scenes. Of the `rows` of the force curves, `curve_rows` were sent. `failed`
-    is the number of failed advances, which have no forces.
+    `status` describes how the recording ended. `lost` contains the recorder's counts by topic, the missing and foreign
+    parts, and the samples that came too late for other scenes. `rows` is the number of rows of the force curves, and
+    `curve_rows` the number of rows sent. `failed` is the number of failed advances, for which no forces exist.
     """
 
     path: Path
@@ -65,7 +65,8 @@ def to_rrd(
     others: Mapping[str, Scene] | None = None,
     on_progress: Callable[[float], object] | None = None,
 ) -> ViewSummary:
-    """Write the .rrd of a complete or cut-off recording, with only a few of its chunks in memory at a time.
+    """Write a complete or truncated recording as a rerun file. Only a few chunks of the recording are in memory at a
+    time.
 
     Parameters
     ----------
@@ -76,14 +77,15 @@ def to_rrd(
     section_hz
         Rate of the cross-section [Hz].
     exaggerate
-        Factor by which the second cross-section widens the clearance; None: chosen by the size of the clearance.
+        Factor by which the second cross-section widens the clearance. With None, the factor follows from the clearance.
     most_rows
-        Largest number of rows of a curve; the limit for the cross-section is a twentieth of this number. A longer run
-        is thinned: a curve keeps the least and the largest value of each span, so that no peak is lost.
+        Largest number of rows of a curve. The number of cross-sections is limited to a twentieth of this number. Of a
+        longer run, only the least and the largest value of each curve in each span are written, so that no peak is
+        lost.
     others
-        Other scenes, by name, whose forces under the load of the run are drawn too.
+        Other scenes, by name. Their forces under the load of the run are drawn too.
     on_progress
-        Receives the share that is done, 0..1.
+        Callback that receives the share of the work done, 0..1.
 
     Raises
     ------
@@ -113,6 +115,8 @@ def to_rrd(
 
 
 def _span_ns(reader: RunReader, duration_s: float, most_rows: int) -> int:
-    """Return the span of which a curve keeps two rows [ns]; 0 for a short run, which keeps all."""
+    """Return the length of a span [ns], of which two rows are written, or 0 for a short run, of which all rows are
+    written.
+    """
     rows = reader.size() / _BYTES_PER_ROW
     return 0 if rows <= most_rows else max(1, round(2e9 * duration_s / most_rows))

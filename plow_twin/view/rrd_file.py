@@ -1,4 +1,4 @@
-"""Writer of .rrd files that fails on a full disk instead of waiting for it."""
+"""Writer of rerun files that raises an error if the disk is full."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ import rerun.blueprint as rrb
 
 from plow_twin.errors import RecordingError
 
-#: Largest number of bytes copied at once; a pipe holds fewer, so each copy takes all that wait.
+#: Largest number of bytes copied at once. A pipe contains fewer bytes, so each copy empties the pipe.
 _CHUNK: Final = 1 << 20
 
 
 class RrdFile:
-    """Writes a stream to a file through a pipe; an incomplete file is removed.
+    """Writer of a stream to a file through a pipe, as a context manager. An incomplete file is removed.
 
-    The SDK's own file sink (0.41) waits forever for a disk that is full; `check` and the end of the context raise
-    RecordingError.
+    The file sink of rerun 0.41 waits forever if the disk is full. Here, `check` and the end of the context raise
+    `RecordingError`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -45,7 +45,7 @@ class RrdFile:
             self._stream.disconnect()
         os.close(self._inlet)
         self._writer.join()
-        if (kind is not None or self.failed) and self.path.is_file():  # not a device
+        if (kind is not None or self.failed) and self.path.is_file():  # a device such as /dev/null is not removed
             self.path.unlink()
         if kind is None:
             self.check()
@@ -57,11 +57,11 @@ class RrdFile:
 
     @property
     def failed(self) -> bool:
-        """Whether a write has failed."""
+        """True if a write has failed."""
         return self._error is not None
 
     def check(self) -> None:
-        """Raise RecordingError if a write has failed."""
+        """Raise `RecordingError` if a write has failed."""
         if self._error is not None:
             raise self._refused(self._error) from self._error
 
@@ -75,5 +75,5 @@ class RrdFile:
                     shutil.copyfileobj(outlet, self._file, _CHUNK)
             except OSError as error:
                 self._error = error
-                while outlet.read(_CHUNK):  # otherwise the stream would wait for a reader
+                while outlet.read(_CHUNK):  # the stream would block if nothing read the pipe
                     pass

@@ -1,4 +1,4 @@
-"""The curves of a whole recording for one picture."""
+"""The curves of a whole recording for a picture or a page."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from plow_twin.view.envelope import Envelope
 
 Array = NDArray[np.float64]
 
-#: Columns of each clearance with its 5 % and 95 % points.
+#: Columns of each clearance and of its 5 % and 95 % points.
 _CLEARANCE_COLUMNS: Final = np.array(
     [CLEARANCE_NAMES.index(f"{axis}{point}") for axis in ("horizontal", "vertical") for point in ("", "/p05", "/p95")]
 )
 _NS: Final = 1e-9
-#: States of a clearance whose value comes from measurements.
+#: States of a clearance with a measured value.
 _KNOWN_STATES: Final = ("estimated", "rough")
-#: Largest number of marks of each kind; more would cover the picture.
+#: Largest number of marks of each kind; more marks would cover the picture.
 _MOST_MARKS: Final = 40
 
 
 class Instant(NamedTuple):
-    """Pose x, y [m], theta [rad] of the head at a stamp [ns]; forces [N] and penetrations [m] of the pairs."""
+    """State at a stamp [ns]: pose x, y [m], theta [rad], and the forces [N] and penetrations [m] of all pairs."""
 
     stamp_ns: int
     pose: tuple[float, float, float]
@@ -45,11 +45,11 @@ class Instant(NamedTuple):
 
 @dataclass
 class RunCurves:
-    """Largest forces [kN], load [kN, kN m] and clearances [mm] over time, and the instant of the largest force.
+    """Largest forces [kN], load [kN, kN m] and clearances [mm] over time, and the state at the largest force.
 
-    Times [s] count from `first_ns`, the first stamp. `held_s` has the intervals without samples, which the hold policy
-    or a straight line bridges, and `failed_s` those of failed advances, whose number is `failed`. `changes` has each
-    change of the clearance that is not wear, with its reason.
+    Times [s] are counted from the first stamp `first_ns`. `held_s` contains the intervals without samples, in which the
+    load is held or interpolated linearly. `failed_s` contains the intervals of failed advances, and `failed` their
+    number. `changes` contains each change of the clearance that is not due to wear, with its reason.
     """
 
     first_ns: int | None = None
@@ -57,26 +57,26 @@ class RunCurves:
     load: Envelope = field(default_factory=lambda: Envelope(3))
     clearance: Envelope = field(default_factory=lambda: Envelope(len(_CLEARANCE_COLUMNS)))
     instant: Instant | None = None
-    #: largest peak of all pairs [kN]; 0 without peaks
+    #: Largest force of all pairs [kN], or 0 without forces.
     peak: float = 0.0
     held_s: list[tuple[float, float]] = field(default_factory=list)
     failed_s: list[tuple[float, float]] = field(default_factory=list)
-    #: description of the intervals without samples
+    #: Description of the intervals without samples.
     silences: str = ""
     failed: int = 0
     changes: list[tuple[float, str]] = field(default_factory=list)
-    #: states of the newest clearances, as in the twin's status
+    #: States of the newest clearances, from the status of the twin.
     states: dict[str, str] = field(default_factory=lambda: {"horizontal": "prior", "vertical": "prior"})
     _estimated: bool = False
     _held_since_ns: int | None = None
     _newest_ns: int | None = None
-    #: sequence number and result of the newest estimate
+    #: Sequence number and result of the newest estimate.
     _estimate: tuple[int, str] | None = None
     _clearance: Array | None = None
 
     @classmethod
     def of(cls, reader: RunReader) -> RunCurves:
-        """Read a whole recording; no line crosses missing entries, a reset or a silence."""
+        """Read a whole recording. Lines are interrupted at missing entries, resets and silences."""
         curves = cls()
         run_time = RunTime(reader.header.parameters)
         templates = publication_templates(reader.header.frame_id, reader.header.child_frame_id)
@@ -101,7 +101,7 @@ class RunCurves:
 
     @property
     def instant_s(self) -> float | None:
-        """Time of the instant of the largest force [s]."""
+        """Time [s] of the largest force, or None."""
         return None if self.instant is None else (self.instant.stamp_ns - (self.first_ns or 0)) * _NS
 
     def __bool__(self) -> bool:
@@ -132,7 +132,7 @@ class RunCurves:
                     self._newest_ns = stamp_ns
                 case Estimated(end_ns=end_ns, result=result):
                     if not self._estimated:
-                        # the samples before the estimate came without it
+                        # first add the samples that arrived before the estimate
                         self._samples(batch.entries.stamp_ns[samples[(samples >= done) & (samples < index)]])
                         done = index
                         self._change(end_ns if self._newest_ns is None else self._newest_ns, "first estimate")
@@ -150,7 +150,7 @@ class RunCurves:
         self._samples(batch.entries.stamp_ns[samples[samples >= done]])
 
     def _samples(self, stamps: NDArray[np.int64]) -> None:
-        """Add the stamps of samples; the first sample beyond the begin of a hold ends the hold."""
+        """Add the stamps of samples. The first sample after the begin of a hold ends the hold."""
         if not len(stamps):
             return
         behind = stamps[stamps > (self._held_since_ns or 0)]
@@ -166,14 +166,16 @@ class RunCurves:
         self._held_since_ns = None
 
     def _bridged(self, begin_ns: int, end_ns: int) -> None:
-        """End the lines at a silence without a journal entry, and mark it as long as there are few marks."""
+        """End the lines at a silence without a journal entry. Mark the silence unless there are too many marks."""
         if self._held_since_ns is None and len(self.held_s) < _MOST_MARKS:
             self._held_since_ns = begin_ns
             self._end_of_held(end_ns)
             self._break_lines()
 
     def _failed(self, stamp_ns: int, since_ns: int, advances: int) -> None:
-        """Add the first failed advance of a series or, at its end, all others."""
+        """Add a series of failed advances: the first call is for the first advance, the last call for the remaining
+        advances.
+        """
         first = self.first_ns or 0
         self.failed += advances
         if stamp_ns == since_ns:
@@ -187,7 +189,7 @@ class RunCurves:
             self.changes.append(((stamp_ns - self.first_ns) * _NS, reason))
 
     def _last_estimate(self) -> None:
-        """Add the clearances of an estimate that came after the last publication."""
+        """Add the clearances of an estimate that arrived after the last publication."""
         if self._estimate is None or self._clearance is None or self._newest_ns is None:
             return
         result, values = json.loads(self._estimate[1]), self._clearance.copy()
@@ -209,7 +211,7 @@ class RunCurves:
             self.clearance.add(self._seconds(rows.stamp_ns), values)
             self._clearance = values[-1]
             if self._estimate is not None and rows.sequence[-1] > self._estimate[0]:
-                # publications after an estimate include it
+                # publications after an estimate already contain its clearances
                 self._estimate = None
         if "contact_forces" in found and "head_state" in found:
             for instant in _largest(found["contact_forces"], found["head_state"]):
@@ -218,7 +220,7 @@ class RunCurves:
 
 
 def _largest(contact: Rows, head: Rows) -> Iterator[Instant]:
-    """Yield the instant of the largest force, among those with a pose of the same publication."""
+    """Yield the state at the largest force, among the stamps for which a pose was published too."""
     at = np.minimum(np.searchsorted(contact.sequence, head.sequence), len(contact) - 1)
     both = np.flatnonzero(contact.stamp_ns[at] == head.stamp_ns)
     if not both.size:

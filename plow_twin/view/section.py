@@ -1,4 +1,4 @@
-"""The cross-section of head and frame for a picture, in millimetres, with y downwards."""
+"""Geometry of the cross-section of head and frame for pictures, in mm, with y downwards."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _MM: Final = 1000.0
 #: Length of an arrow [mm] per force [N].
 ARROW_MM_PER_N: Final = 7e-4
 FAINT_N: Final = 500.0
-#: Distance of the body's drawn outline from the cavity [mm], since a scene states no outline.
+#: Distance [mm] of the drawn outline of the body from the cavity. The scene contains no outline.
 BODY_MARGIN_MM: Final = 60.0
 
-#: Drawn depth of a pad per depth of its wear [mm/mm].
+#: Drawn depth of a pad per wear depth [mm/mm].
 PAD_MM_PER_MM: Final = 200.0
 _PAD_MM: Final = 60.0
-#: Distance of a label below its place [mm].
+#: Distance of a label below its point [mm].
 LABEL_MM: Final = 16.0
 
-#: Hues of the corners; the pair at a vertical wall has the lighter colour (Okabe and Ito's palette).
+#: Hues of the corners. The pair at a vertical wall has a lighter colour than the other pair (palette of Okabe and Ito).
 _HUES: Final = ((0, 114, 178), (230, 159, 0), (213, 94, 0), (0, 158, 115))
 _LIGHTER: Final = ((86, 180, 233), (240, 228, 66), (255, 158, 105), (110, 220, 185))
 PAIR_COLORS: Final = tuple(color for pair in zip(_HUES, _LIGHTER, strict=True) for color in pair)
@@ -43,23 +43,23 @@ _OUTWARDS: Final[Array] = np.stack((NORMAL_X, NORMAL_Y), axis=1)
 
 @dataclass(frozen=True)
 class Section:
-    """Sizes of the cross-section [mm].
+    """Dimensions of the cross-section [mm].
 
-    A head that carries walls is drawn as a cavity that moves about the frame, a head that carries corners as a block
-    that moves in the cavity.
+    A head that carries walls is drawn as a cavity that moves about the frame. A head that carries corners is drawn as a
+    block that moves in the cavity.
     """
 
     frame: Array
     cavity: Array
     labels: tuple[str, ...]
-    #: name of the body that is drawn at rest; on a support, the section is drawn in its axes
+    #: Name of the body that is drawn at rest. If this body is on a support, the axes of the picture move with it.
     frame_name: str = "frame (fixed)"
     is_block: bool = False
     radius: float = 0.0
 
     @classmethod
     def of(cls, scene: Scene) -> Section:
-        """Return the sizes of a scene."""
+        """Return the cross-section of a scene."""
         frame = _MM * np.array([scene.frame.width_m, scene.frame.height_m])
         gaps = _MM * np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
         letters = {corner: letter for letter, corner in scene.frame.labels.items()}
@@ -71,7 +71,7 @@ class Section:
 
     @property
     def half_view(self) -> Array:
-        """Half width and half height that show the body and the arrows of the largest forces, shape (2,)."""
+        """Half width and half height of a view that shows the body and the arrows of the largest forces, shape (2,)."""
         return 0.5 * self.cavity + BODY_MARGIN_MM + 70.0
 
     def frame_strip(self) -> Array:
@@ -81,9 +81,10 @@ class Section:
     def corners(self, pose: Iterable[float] = (0.0, 0.0, 0.0)) -> Array:
         """Corners of the frame, or of a block at a pose, in the order of `CORNER_NAMES`, shape (4, 2).
 
-        A block's corners are named by their place, so they change their names when it has turned beyond 45 degrees.
+        The corners of a block are named by their present place. A block that has turned by more than 45 degrees
+        therefore has other names at its corners.
         """
-        # distance of the middle of a corner's arc from the point where the sides would meet, along each axis
+        # distance of the middle of a rounded corner from the intersection of its sides, along each axis
         within = self.radius * (1.0 - math.sqrt(0.5))
         corners = ((0.5 * self.frame - within) * _SIGNS)[::2]
         if not self.is_block:
@@ -92,52 +93,54 @@ class Section:
         return np.roll(_placed(corners, (x, y, theta)), -round(theta / (0.5 * math.pi)), axis=0)
 
     def head_strips(self, pose: Iterable[float]) -> Array:
-        """Outlines of the head at a pose x, y [m], theta [rad]: cavity and body (2, 5, 2), or block (1, n, 2)."""
+        """Outlines of the head at a pose x, y [m], theta [rad]: cavity and body, shape (2, 5, 2), or block, shape (1,
+        n, 2).
+        """
         if self.is_block:
             return _placed(outline(self.frame, self.radius)[None], pose)
         sides = np.stack((self.cavity, self.cavity + 2.0 * BODY_MARGIN_MM))
         return _placed(0.5 * sides[:, None, :] * _SQUARE, pose)
 
     def exaggeration(self) -> float:
-        """Return the factor at which the clearance fills a third of the frame's smaller side."""
+        """Return the factor with which the clearance fills a third of the frame's smaller side."""
         gap = float((self.cavity - self.frame).max())
         return max(1.0, round(float(self.frame.min()) / 3.0 / gap, 1)) if gap > 0.0 else 1.0
 
     def exaggerated(self, penetration: Array, factor: float) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the four walls with gaps `factor` times as wide, shape (4, 2, 2), and which of them touch.
+        """Return the four walls with gaps widened by `factor`, shape (4, 2, 2), and whether each touches, shape (4,).
 
-        The order is top, right, bottom, left. A wall passes through two points at the frame's corners, displaced by the
-        pad's wear, and ends at the next wall.
+        The walls are ordered top, right, bottom, left. The gaps at the two corners beside a wall, including the wear of
+        the pads, determine the line of the wall. The wall ends where it meets the next walls.
         """
         places = (0.5 * self.frame * _SIGNS - _OUTWARDS * (_MM * factor * penetration)[:, None]) * _FLIP
         walls = np.array([(0, 2), (3, 5), (4, 6), (7, 1)])
         return _closed(places[walls]), (penetration[walls] > 0.0).any(axis=1)
 
     def pads(self, wear_depth_mm: Array) -> tuple[Array, Array, Array]:
-        """Return centres, half sizes and places of labels, shape (8, 2) each, of bars that show the wear of the pads.
+        """Return centres, half sizes and label positions, shape (8, 2) each, of bars that show the wear of the pads.
 
-        A bar lies inside the frame along its pair's wall, from the corner on.
+        A bar lies inside the frame along the wall of its pair and begins at the corner.
         """
         corners = 0.5 * self.frame * _SIGNS
         along = _SIGNS - _OUTWARDS
         depth = np.minimum(PAD_MM_PER_MM * wear_depth_mm, 0.25 * self.frame.min())[:, None]
         middles = (corners - 0.5 * depth * _OUTWARDS - (0.5 * _PAD_MM + 12.0) * along) * _FLIP
-        # of the two labels at a corner, that of the vertical wall is nearer the centre
+        # of the two labels at a corner, the label of the vertical wall is closer to the centre
         inwards = np.stack((np.full(PAIR_COUNT, 0.5), np.where(np.abs(_OUTWARDS[:, 0]) > 0.5, 0.26, 0.64)), axis=1)
         labels = corners * inwards * _FLIP - [0.0, LABEL_MM]
         return middles, 0.5 * (depth * np.abs(_OUTWARDS) + _PAD_MM * np.abs(along)), labels
 
     def head_points(self, pose: Iterable[float]) -> Array:
-        """Centre of the head and the place of its name, shape (2, 2)."""
+        """Centre of the head and position of its name, shape (2, 2)."""
         above = 0.5 * (self.frame if self.is_block else self.cavity)[1] + 0.5 * BODY_MARGIN_MM
         places = _placed(np.array([[0.0, 0.0], [0.0, above]]), pose)
         places[1, 1] -= LABEL_MM
         return places
 
     def arrows(self, pose: tuple[float, float, float], force: Array) -> tuple[Array, Array, NDArray[np.intp]]:
-        """Origins and vectors of the forces on the head, shape (k, 2), and their pairs, (k,)."""
+        """Origins and vectors of the forces on the head, shape (k, 2), and their pairs, shape (k,)."""
         drawn = np.flatnonzero(force >= FAINT_N)
-        # a frame's corner pushes the wall of the head outwards, a wall pushes the corner of a block inwards
+        # a corner of a frame pushes the wall of the head outwards; a wall pushes a corner of a block inwards
         theta = math.pi if self.is_block else pose[2]
         normal_x = math.cos(theta) * NORMAL_X[drawn] - math.sin(theta) * NORMAL_Y[drawn]
         normal_y = math.sin(theta) * NORMAL_X[drawn] + math.cos(theta) * NORMAL_Y[drawn]
@@ -146,13 +149,13 @@ class Section:
         return self.corners(pose)[drawn // 2], vectors, drawn
 
     def corner_radii(self, force: Array) -> Array:
-        """Radius of each corner's mark [mm], shape (4,), larger where the corner carries force."""
+        """Radius [mm] of the mark of each corner, shape (4,); it is larger if the corner carries force."""
         total = force.reshape(PAIR_COUNT // 2, 2).sum(axis=1)
         return np.where(total >= FAINT_N, 7.0, 3.0)
 
 
 def _closed(walls: Array) -> Array:
-    """Return walls (4, 2, 2) extended to their neighbours, unless two are parallel."""
+    """Extend walls, shape (4, 2, 2), to their intersections, unless two neighbours are parallel."""
     along = walls[:, 1] - walls[:, 0]
     before, along_before = np.roll(walls, 1, axis=0), np.roll(along, 1, axis=0)
     across = _cross(along_before, along)
@@ -169,7 +172,7 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def _placed(points: Array, pose: Iterable[float]) -> Array:
-    """Return points of the head, shape (..., 2) [mm], at the pose x, y [m], theta [rad], y downwards."""
+    """Return points of the head, shape (..., 2) [mm], at the pose x, y [m], theta [rad], with y downwards."""
     x, y, theta = pose
     turn = np.array([[math.cos(theta), math.sin(theta)], [-math.sin(theta), math.cos(theta)]])
     placed: Array = (points @ turn + _MM * np.array([x, y])) * _FLIP

@@ -1,4 +1,4 @@
-"""rerun's viewer as a program on the loopback address, which ends with the process that started it."""
+"""The rerun viewer as a child process on the loopback address, which ends with its parent."""
 
 from __future__ import annotations
 
@@ -19,13 +19,16 @@ import rerun.blueprint as rrb
 from plow_twin.errors import RecordingError
 
 LOOPBACK: Final = "127.0.0.1"
-#: Memory limit of viewer and server, above which they drop the oldest data.
+#: Memory limits of viewer and server. Above these limits, the oldest data are discarded.
 _MEMORY: Final = "2GB"
 _START_S: Final = 60.0
 
 
 def viewer_program() -> str:
-    """Return rerun's program itself, not its wrapper, whose child would outlive it; raise RecordingError without it."""
+    """Return the path of the rerun program, or raise `RecordingError` if it is not installed.
+
+    The wrapper script `rerun` is avoided if possible, because its child process would outlive it.
+    """
     found = find_spec("rerun_cli")
     beside = Path(found.origin).with_name("rerun") if found is not None and found.origin is not None else None
     program = str(beside) if beside is not None and beside.exists() else shutil.which("rerun")
@@ -36,7 +39,7 @@ def viewer_program() -> str:
 
 @dataclass(frozen=True)
 class Viewer:
-    """A running viewer: `url` receives data, `page` shows them in a browser (empty: a window)."""
+    """A running viewer. `url` receives data. `page` is the address of its web page, or empty for a native window."""
 
     process: subprocess.Popen[bytes]
     url: str
@@ -53,13 +56,16 @@ class Viewer:
 
 
 def start_viewer(*, web_port: int | None = None) -> Viewer:
-    """Start a viewer, as a page on `web_port` or a window; raise RecordingError if it is missing or does not answer."""
+    """Start a viewer as a web page on `web_port`, or as a window without `web_port`.
+
+    Raise `RecordingError` if the viewer is missing or does not answer.
+    """
     port, web_port = free_port(), None if web_port is None else page_port(web_port)
     command = [viewer_program(), "--bind", LOOPBACK, "--port", str(port), "--memory-limit", _MEMORY]
     if web_port is not None:
         command += ["--serve-web", "--web-viewer-port", str(web_port), "--server-memory-limit", _MEMORY]
     bound = shutil.which("setpriv")
-    if bound is not None:  # the viewer ends with this process
+    if bound is not None:  # the kernel ends the viewer when this process ends
         command = [bound, "--pdeathsig", "KILL", *command]
     environment = {"RUST_LOG": "warn", **os.environ}
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment)
@@ -78,7 +84,7 @@ def _address(port: int) -> str:
 
 
 def page_address(web_port: int, port: int) -> str:
-    """Return the address of the page for a port, in the dark theme, where the cross-section's names can be read."""
+    """Return the address of the web page, in the dark theme, in which the names in the cross-section are legible."""
     return f"http://{LOOPBACK}:{web_port}/?url={quote(_address(port), safe='')}&theme=dark"
 
 
@@ -90,7 +96,7 @@ def free_port() -> int:
 
 
 def page_port(asked: int) -> int:
-    """Return a port for a page, any free port for 0; raise RecordingError if another program uses it."""
+    """Return the given port for a page, or a free port for 0. Raise `RecordingError` if the port is in use."""
     if not asked:
         return free_port()
     with socket.socket() as probe:
@@ -99,7 +105,7 @@ def page_port(asked: int) -> int:
             probe.bind((LOOPBACK, asked))
         except OSError as error:
             raise RecordingError(
-                f"web port: got {asked}, expected one that is free, or 0 ({error.strerror})"
+                f"web port: got {asked}, expected a free port, or 0 ({error.strerror})"
             ) from error
     return asked
 

@@ -1,4 +1,4 @@
-"""Largest contact forces of other scenes under the load of a run, beside the run's own."""
+"""Largest contact forces of other scenes under the load of a run, beside the forces of the run."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from plow_twin.view.columns import Array, Curves, Indexes, TimeAxis
 
 
 class WhatIf:
-    """Runs other scenes under the journal of a run and draws their forces; does nothing without scenes.
+    """Simulation of other scenes with the journal of a run, and curves of their forces. Without scenes, nothing is
+    drawn.
 
-    A run under the loads of its own scene has no load in its journal, and raises RecordingError.
+    If the run used the loads of its own scene, its journal contains no load, and `RecordingError` is raised.
     """
 
     def __init__(
@@ -53,7 +54,7 @@ class WhatIf:
         return {"samples_too_late": self._walk.late} if self._walk.late else {}
 
     def add(self, entries: Entries, stamps: Indexes, steps: Indexes) -> None:
-        """Advance by entries of the journal."""
+        """Advance the other scenes by entries of the journal."""
         if self._curves:
             order = np.argsort(stamps[entries.sample], kind="stable")
             self._stamps, self._steps = stamps[entries.sample][order], steps[entries.sample][order]
@@ -65,12 +66,12 @@ class WhatIf:
             self._curves[0].add(stamps, steps, _largest_kn(peak))
 
     def end_lines(self) -> None:
-        """End the lines; the next rows begin new lines."""
+        """End the lines. The next rows begin new lines."""
         for curve in self._curves:
             curve.end()
 
     def flush(self) -> None:
-        """Send the collected rows."""
+        """Send the buffered rows."""
         for curve in self._curves:
             curve.flush()
 
