@@ -1,6 +1,6 @@
-"""A year of a head, from new pads to the limit: monthly estimates of the clearance, and a forecast that narrows.
+"""A year in the life of a head, from new pads to the limit: monthly estimates of the clearance, and a forecast.
 
-The head's sensor is synthetic: its poses are those of the simulated machine, with noise, bias and delay.
+The sensor of the head is synthetic: it measures the poses of the simulated machine with noise, bias and delay.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples/a_year")
 out.mkdir(parents=True, exist_ok=True)
 rng = np.random.default_rng(1)
 
-# the assumed machine: its load is wrong by a few per cent, and its wear coefficient is known to a factor of ten
+# the assumed machine: its load has an error of a few per cent, and its wear coefficient is known to a factor of ten
 believed = replace(load_scene("paper"), wear=Wear(1e-15, 0.06, SPEED_M_S, prior_m2_n=(3e-16, 3e-15)))
 assert believed.wear is not None
 limits = believed.clearance.horizontal_m + GROWTH_M, believed.clearance.vertical_m + GROWTH_M
@@ -39,13 +39,13 @@ load = compile_loads(believed.loads).at(t)
 true_load = load * (1.0 + 0.04 * rng.standard_normal(3))
 path = wear_path(replace(believed, loads=(Table("true", t, true_load),)), limits, np.inf)
 grown = path.clearance_growth()
-# the wear coefficient with which a clearance reaches its limit at the end of the year
+# with this wear coefficient, a clearance reaches its limit at the end of the year
 reached = min(float(np.interp(GROWTH_M, column, path.exposure, right=np.inf)) for column in grown.T)
 k_s = reached * believed.wear.pad_area_m2 / (DAYS * DAY_M)
 
 
 def visit(day: float) -> tuple[np.ndarray, Poses]:
-    """Return the true clearances on a day, and the poses that the sensor measures during some load periods."""
+    """Return the true clearances on a day, and the poses that the sensor measures over a few load periods."""
     exposure = k_s * day * DAY_M / believed.wear.pad_area_m2
     depth = [float(np.interp(exposure, path.exposure, column)) for column in path.depth.T]
     worn = replace(
@@ -83,7 +83,7 @@ for entity in titles:
 
 
 def show(day: float, entity: str, **values: float | None) -> None:
-    """Draw numbers of a day; a number that is None is left out."""
+    """Draw numbers of a day. Numbers that are None are skipped."""
     stream.set_time("day", sequence=round(day))
     for name, value in values.items():
         if value is not None:
@@ -114,7 +114,8 @@ for day in np.linspace(0.0, DAYS, VISITS, endpoint=False):
     if State.WITHDRAWN in (found.horizontal_state, found.vertical_state):
         print("  " + "; ".join(found.reasons))
         continue
-    # an error of the frame is the same at each visit, so the growth is known as well as the apparent clearances
+    # an error of the frame is equal at all visits, so the growth of the clearance is as certain as the apparent
+    # clearance
     seen = found.in_scene_frame()
     mean, deviation = (np.array([getattr(value, name) for value in seen]) for name in ("mean", "deviation"))
     history.append((float(day), mean, deviation))

@@ -1,4 +1,4 @@
-"""A calibration: the contact's stiffness and damping from a measured motion."""
+"""Calibration of the stiffness and damping of a contact to a measured motion."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from plow_twin import dump_scene, load_scene, simulate
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples/calibration")
 out.mkdir(parents=True, exist_ok=True)
 
-# in place of a measurement: the simulated motion of a head whose contact is stiffer than the assumed contact
+# a simulated motion replaces the measurement; its contact is stiffer than the assumed contact
 believed = load_scene("bench_kv")
 true = replace(believed, contact=replace(believed.contact, stiffness=3.1e7, damping=8.5e4))
 motion = simulate(true, t_end=2.0, output_dt=0.01)

@@ -1,4 +1,4 @@
-"""A machine of one's own: from ten lines of YAML to a picture."""
+"""A scene of ten lines of YAML, its simulation, and a picture."""
 
 from __future__ import annotations
 

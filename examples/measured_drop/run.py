@@ -1,6 +1,6 @@
-"""Draw a measured drop of a square, the preset's block simulated from the same first flight, and the 90 % band.
+"""Picture of a measured drop of a square, of the simulated drop from the same first flight, and of the 90 % band.
 
-It writes a picture, and a recording for rerun that shows the measured and the simulated body in one place.
+The example also writes a rerun file that shows the measured and the simulated body together.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SIDE = 0.06
 
 
 def main() -> None:
-    """Simulate the drop, draw it in its band, and print its distance from the measured drop."""
+    """Simulate the drop, draw it with its band, and print its distance from the measured drop."""
     out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples/measured_drop")
     drops = Drops.load(DATA)
     pose, given = drops.pose[DROP], int(drops.flight_rows[DROP])
@@ -61,7 +61,7 @@ def main() -> None:
 
 
 def write_rrd(path: Path, scene: Scene, measured: np.ndarray, simulated: np.ndarray) -> None:
-    """Write the motion of both bodies in mm, with y downwards and one row for each 4 ms."""
+    """Write the motion of both bodies in mm, with y downwards, one row every 4 ms."""
     stream = rr.RecordingStream("plow_twin")
     stream.save(str(path))
     table = rr.LineStrips2D([[[-800.0, 0.0], [800.0, 0.0]]], colors=[(128, 128, 128)])

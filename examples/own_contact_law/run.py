@@ -1,4 +1,4 @@
-"""A contact law of one's own: it is defined in one place, used by every solver, and its restitution is measured."""
+"""Definition of a contact law, which all solvers can then use, and a measurement of its restitution."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ add_law(
 
 
 def rebound(contact: Contact) -> float:
-    """Return the ratio of the speeds after and before an impact, of a head thrown at the top wall without load."""
+    """Throw a head at the top wall without load. Return the ratio of its speeds after and before the impact."""
     scene = Scene(
         Head(mass_kg=500.0, inertia_kg_m2=100.0), Frame(0.3, 0.3), Clearance(0.02, 0.02), contact, Gravity(0.0),
         initial=Initial(v=(0.0, -0.5, 0.0)), locked=("x", "theta"),
     )  # fmt: skip
-    # the run is long enough to leave the wall, and too short to reach the opposite wall
+    # within this time, the head leaves the wall, but does not reach the opposite wall
     return abs(simulate(scene, t_end=0.035, tol=1e-10).v[-1, 1]) / 0.5
 
 
-print("asked for   own law   exact_restitution")
+print("  nominal   own law   exact_restitution")
 for e in (0.9, 0.7, 0.5, 0.3):
     own = rebound(Contact("logarithmic", stiffness=1e8, exponent=1, restitution=e))
     exact = rebound(Contact("exact_restitution", stiffness=1e8, exponent=1, restitution=e))

@@ -1,6 +1,6 @@
-"""A recording: it is read with the libraries of others, and computed again bit for bit.
+"""A recording is read with third-party libraries, and its results are computed again and compared bit for bit.
 
-The argument is the folder of a run of the node (`record_path`, or `plow-twin demo`); without an argument the example
+The argument is the folder of a run of the node (`record_path`, or `plow-twin demo`). Without an argument, the example
 records three seconds.
 """
 
@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 
 
 def record(folder: Path) -> None:
-    """Record 3 s of samples at 1 kHz as the node does: journal and publications."""
+    """Record 3 s of samples at 1 kHz, with journal and publications, as the node does."""
     from plow_twin import Twin, dump_scene, load_scene
     from plow_twin.record.header import RunHeader
     from plow_twin.record.recorder import Recorder
@@ -56,5 +56,5 @@ with AnyReader([run], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as rea
 for name, force in largest.items():
     print(f"{name:20}  largest {force / 1e3:6.1f} kN, impulse {impulse[name] / 1e3:7.3f} kN s")
 
-# the replay computes every message again; all are equal bit for bit, so it ends with exit code 0
+# the replay computes all messages again; since they are bit-identical, its exit code is 0
 subprocess.run([sys.executable, "-m", "plow_twin", "replay", str(run)], check=True)

@@ -1,4 +1,5 @@
-"""A sweep: the largest contact force over clearance and stiffness, all members at once on all cores."""
+"""Sweep of the largest contact force over clearance and stiffness. All members are computed in one call on all cores.
+"""
 
 from __future__ import annotations
 

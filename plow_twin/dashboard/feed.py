@@ -157,7 +157,7 @@ class Feed:
     ) -> None:
         self._link, self._answer, self._load, self._on_error = link, answer, load, on_error
         self._by_second = by_second
-        self._end = f"{process} has ended: {consequence}, the twin goes on"
+        self._end = f"{process} has ended: {consequence}, but the twin continues"
         self.report: dict[str, Any] = {}
         self._ended = False
         self._news: dict[str, Any] = {"facts": {**facts, "can_ask": answer is not None}}

@@ -1,1 +1,2 @@
-"""The demo: a publisher of excitation, the node and its recorder as processes, and a summary of the recording."""
+"""The demo: a publisher of excitation, and the node with its recorder, as processes; then a summary of the recording.
+"""

@@ -1,4 +1,4 @@
-"""The forces of the demo's synthetic machine, beside those of the twin and of the nominal scene."""
+"""Comparison of the forces of the twin and of the nominal scene with the forces of the demo's synthetic machine."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from plow_twin.stream.journal import Estimated
 
 Array = NDArray[np.float64]
 
-#: Length of the compared end of a run [s]: a load period of the paper.
+#: Length [s] of the compared part at the end of a run, about one load period of the paper.
 COMPARED_S: Final = 3.2
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Forces over the newest `COMPARED_S` of a run.
+    """Forces in the last `COMPARED_S` of a run.
 
     Attributes
     ----------
     peaks : dict of str to ndarray, shape (8,)
-        Largest force of each pair [N]: `nominal`, `followed` and `true`.
+        Largest force of each pair [N], for the keys `nominal`, `followed` and `true`.
     error : dict of str to float
-        RMS of the difference from the true forces over their RMS: `nominal` and `followed`.
+        RMS of the difference from the true forces divided by the RMS of the true forces, for `nominal` and `followed`.
     estimates_s : list of float
-        Times of the run at which estimates were made [s].
+        Times [s] of the run at which estimates were made.
     since_s : float
-        Time of the run from which on the forces are compared [s].
+        Time [s] of the run at which the compared part begins.
     """
 
     peaks: dict[str, Array]
@@ -44,7 +44,7 @@ class Comparison:
 
 
 def compare_forces(run: Path, wider_m: float) -> Comparison | None:
-    """Compare the forces of a run with those of a machine whose clearances are larger by `wider_m` [m].
+    """Compare the forces of a run with the forces of a machine whose clearances are larger by `wider_m` [m].
 
     The result is None if the run has no forces.
     """

@@ -29,49 +29,50 @@ from plow_twin.model.scene import Mark, Provenance, Wear
 from plow_twin.scene_file import dump_scene, load_scene
 
 DONE, FAILED, DONE_WITH_LOSS = 0, 1, 3
-#: Longest wait for the estimate, and for a solver that is compiled on a busy machine [s].
+#: Longest wait [s] for an estimate, and for the compilation of the solver on a busy machine.
 _START_TIMEOUT_S: Final = 300.0
 _STOP_TIMEOUT_S: Final = 10.0
 _RATE_HZ: Final = 1000.0
-#: Excess of the synthetic machine's clearance over that of the scene [mm].
+#: Difference [mm] between the clearances of the synthetic machine and of the scene.
 _SENSOR_MM: Final = 1.5
-#: Shortest demo with an estimate, length of its window, time between the ends of two windows [s].
+#: Duration of the shortest demo with an estimate [s], length of the estimate's window [s], and time between two windows
+#: [s].
 _ESTIMATED_S, _WINDOW_S, _INTERVAL_S = 15.0, 14.0, 3.0
 _STUCK_S: Final = 30.0
 
 
 class DemoError(PlowTwinError):
-    """A process of the demo failed; the message has its output."""
+    """A process of the demo has failed. The message contains the output of the process."""
 
 
 @dataclass
 class Watch:
-    """The newest figures of `/diagnostics`, by part and key."""
+    """The newest values of `/diagnostics`, by part and key."""
 
     parts: dict[str, dict[str, str]] = field(default_factory=dict)
     reports: int = 0
 
     def receive(self, message: Any) -> None:
-        """Take a DiagnosticArray."""
+        """Take the values of a `DiagnosticArray`."""
         for status in message.status:
             part = status.name.partition(": ")[2]
             self.parts[part] = {value.key: value.value for value in status.values}
         self.reports += 1
 
     def text(self, part: str, key: str) -> str:
-        """Return one figure, empty before the first report."""
+        """Return a value, or an empty text before the first report."""
         return self.parts.get(part, {}).get(key, "")
 
     def number(self, part: str, key: str) -> float:
-        """Return one figure as a number, 0 if it is missing."""
+        """Return a value as a number, or 0 if the value is missing."""
         return float(self.text(part, key) or 0.0)
 
 
 def run_demo(speed: str, seconds: float, out: Path, quiet: bool, screen: list[str] | None = None) -> int:
-    """Run the twin on the paper's load and print a summary; return 0, 1 after a failure, or 3 after counted losses.
+    """Run the twin under the paper's load and print a summary. Return 0, 1 after a failure, or 3 after counted losses.
 
-    At the speed `real` the run has the system's clock, at the speed `fast` it has /clock. `screen` has the arguments of
-    the operator's screen.
+    At the speed `real`, the run uses the clock of the system; at the speed `fast`, it uses `/clock`. `screen` contains
+    the arguments of the operator's screen.
     """
     folder = out / datetime.now().strftime("%Y%m%d_%H%M%S_%f")
     folder.mkdir(parents=True)
@@ -95,16 +96,16 @@ def run_demo(speed: str, seconds: float, out: Path, quiet: bool, screen: list[st
 
 
 def _set_environment(folder: Path) -> None:
-    """Confine the demo's processes to this machine and a domain of their own."""
+    """Restrict the ROS communication of the demo to this machine and to a ROS domain of its own."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    # domains above 101 share their ports with outgoing connections
+    # domain numbers above 101 use ports that outgoing connections use too
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
     os.environ.setdefault("ROS_LOG_DIR", str((folder / "log").resolve()))
 
 
 def _worn_scene(folder: Path) -> Path:
-    """Write the paper's scene with wear, so that the clearance grows."""
+    """Write the paper's scene with wear, so that the clearance grows. Return its path."""
     wear = Wear(coefficient_m2_n=1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0)
     assumed = Provenance(Mark.ASSUMED, "hard steel guide in coal dust, 1e-15 .. 1e-13 m^2/N; not in the paper")
     paper = load_scene("paper")
@@ -117,17 +118,17 @@ def _worn_scene(folder: Path) -> Path:
 def _run(
     speed: str, seconds: float, folder: Path, console: Console, quiet: bool, screen: list[str] | None
 ) -> tuple[Watch, int]:
-    """Run the processes to their end; return the node's last figures and the number of samples sent."""
+    """Run all processes to their end. Return the last diagnostics of the node and the number of samples sent."""
     from plow_twin.demo.excitation_publisher import QUEUE
 
     parameters = {
         "scene": _worn_scene(folder),
         "record_path": (folder / "run").resolve(),
         "expected_rate": _RATE_HZ,
-        # publisher and reader keep every sample, so that a busy machine loses none
+        # the queues are long enough that no sample is lost on a busy machine
         "qos_overrides./excitation.subscription.reliability": "reliable",
         "input_depth": QUEUE,
-        "excitation_timeout": 60.0,  # the run ends before the hold policy acts
+        "excitation_timeout": 60.0,  # longer than the run, so that the hold policy is never applied
         "use_sim_time": str(speed == "fast").lower(),
     }
     publisher = ["plow_twin.demo.excitation_publisher", "--speed", speed, "--seconds", repr(seconds)]
@@ -182,7 +183,7 @@ def _follow(source: Child, twin: Child, watch: Watch, spin: Any, bar: Progress, 
         now = watch.number("state", "model_time_s")
         if now > reached:
             moved, reached = time.monotonic(), now
-        # the start of the publisher is slow on a busy machine
+        # on a busy machine, the publisher starts slowly
         elif time.monotonic() - moved > (patience := _STUCK_S if reached else _START_TIMEOUT_S):
             raise DemoError(f"no progress for {patience:g} s at model time {reached:g} s\n{twin.output()}")
         bar.update(task, completed=reached)
@@ -190,7 +191,7 @@ def _follow(source: Child, twin: Child, watch: Watch, spin: Any, bar: Progress, 
 
 
 def _until(name: str, reached: Any, spin: Any, twin: Child, timeout_s: float) -> None:
-    """Wait until `reached` is true; raise `DemoError` after the time limit, or when the twin has ended."""
+    """Wait until `reached` is true. Raise `DemoError` after the time limit, or if the twin has ended."""
     give_up = time.monotonic() + timeout_s
     while not reached():
         spin()
@@ -200,7 +201,7 @@ def _until(name: str, reached: Any, spin: Any, twin: Child, timeout_s: float) ->
 
 
 class Child:
-    """A process of the demo, whose output goes to a file."""
+    """A process of the demo. Its output is written to a file."""
 
     def __init__(self, arguments: list[str], log: Path) -> None:
         self._name = arguments[0]
@@ -208,7 +209,7 @@ class Child:
         self._stream: IO[bytes] = log.open("wb")
         command = [sys.executable, "-m", *arguments]
         bound = shutil.which("setpriv")
-        if bound is not None:  # the child ends with this process
+        if bound is not None:  # the kernel ends the child when this process ends
             command = [bound, "--pdeathsig", "TERM", *command]
         self._process = subprocess.Popen(
             command, stdout=self._stream, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL
@@ -216,7 +217,7 @@ class Child:
 
     @property
     def running(self) -> bool:
-        """Whether the process has not ended yet."""
+        """True if the process has not ended."""
         return self._process.poll() is None
 
     def output(self) -> str:
@@ -224,13 +225,13 @@ class Child:
         return self._log.read_text(errors="replace").strip()
 
     def check(self, allowed: tuple[int, ...] = ()) -> None:
-        """Raise `DemoError` if the process has ended with a code that is not allowed."""
+        """Raise `DemoError` if the process has ended with an exit code that is not in `allowed`."""
         code = self._process.poll()
         if code is not None and code not in allowed:
             raise DemoError(f"{self._name} ended with code {code}\n{self.output()}")
 
     def stop(self) -> None:
-        """Ask for a clean stop; raise `DemoError` if there is none."""
+        """Request the end of the process. Raise `DemoError` if it does not end in time, or ends with an error."""
         if self.running:
             self._process.send_signal(signal.SIGINT)
         try:
@@ -240,7 +241,7 @@ class Child:
         self.check(allowed=(0,))
 
     def end(self) -> None:
-        """Terminate the process, and kill it if it continues."""
+        """Terminate the process; kill it if it does not end."""
         if self.running:
             self._process.terminate()
             try:
@@ -262,7 +263,7 @@ def _process(arguments: list[str], log: Path) -> Iterator[Child]:
 
 @contextmanager
 def _watching() -> Iterator[tuple[Watch, Any]]:
-    """Listen to /diagnostics; yield the figures, and a function that waits briefly for messages."""
+    """Subscribe to `/diagnostics`. Yield its values, and a function that waits briefly for messages."""
     from diagnostic_msgs.msg import DiagnosticArray
 
     from plow_twin.ros.connections import WithoutEvents
@@ -326,7 +327,7 @@ def _print(console: Console, watch: Watch, summary: RunSummary, sent: int, lost:
             console.print(f"  {name}: {count}", style="red", highlight=False)
     factor = watch.text("state", "real_time_factor_mean")
     p50, p99 = watch.text("output", "latency_p50_ms"), watch.text("output", "latency_p99_ms")
-    waiting = ", most of it in the queue: samples come as fast as they are used" if fast else ""
+    waiting = ", mostly time in the queue, because samples are sent as fast as they are used" if fast else ""
     console.print(f"real-time factor {factor}; latency p50 {p50} ms, p99 {p99} ms{waiting}", highlight=False)
 
 
@@ -359,7 +360,7 @@ def _print_comparison(console: Console, beside: Comparison) -> None:
     came = ", ".join(f"{time_s:.1f}" for time_s in beside.estimates_s)
     text = f"estimates came at {came} s of the run" if came else "no estimate came during the run"
     if not came or beside.estimates_s[0] > beside.since_s:
-        text += ", too late for these forces: until the first one the twin knows no more than the scene"
+        text += ", too late for these forces: before the first estimate, the twin uses the values of the scene"
     console.print(text, highlight=False)
 
 
@@ -382,11 +383,11 @@ def _force_table(summary: RunSummary) -> Table:
 
 
 def program(name: str, module: str) -> str:
-    """Return the command that starts a program of this environment from the present folder, with or without PATH."""
+    """Return the shell command that starts a program of this environment from the current folder."""
     beside = Path(sys.executable).with_name(name)
     path, arguments = (beside, []) if beside.exists() else (Path(sys.executable), ["-m", module])
     relative = os.path.relpath(path)
-    # the shell would look for a bare name on PATH
+    # the shell would search PATH for a name without a slash
     relative = relative if os.sep in relative else os.path.join(os.curdir, relative)
     return shlex.join([min(str(path), relative, key=len), *arguments])
 

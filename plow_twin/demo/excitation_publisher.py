@@ -1,11 +1,11 @@
 """The program `excitation_publisher`: a scene's load as samples on `excitation`, in real time or as fast as possible.
 
-With `--sensor` it publishes on `head_pose` the pose of a head in a wider guide with the noise of a sensor: a synthetic
-measurement of known truth. With `--cutting` it adds a stochastic cutting load and publishes the speed along the face on
-`travel`.
+With `--sensor`, it also publishes `head_pose`: the pose of a head in a wider guide, with noise of a sensor. This
+synthetic measurement has a known true clearance. With `--cutting`, it adds a stochastic cutting load and publishes the
+speed along the face on `travel`.
 
-`real` sends each sample at its time on a grid of the steady clock; late samples are sent at once. `fast` publishes
-`/clock`, and runs ahead of the twin's `contact_peaks` by a bounded number of samples.
+At the speed `real`, each sample is sent at its time on the steady clock, or at once if it is late. At the speed `fast`,
+the program publishes `/clock`. It sends at most `WINDOW` samples ahead of the twin's `contact_peaks`.
 """
 
 from __future__ import annotations
@@ -44,28 +44,30 @@ from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.stream.intake import NS_PER_S
 
-#: Stamp of the first sample under /clock [ns], since zero means no stamp.
+#: Stamp [ns] of the first sample under /clock. A stamp of zero would mean that there is no stamp.
 FIRST_STAMP_NS: Final = NS_PER_S
-#: Largest number of samples that wait for their answers at the speed `fast`.
+#: Largest number of samples without an answer at the speed `fast`.
 WINDOW: Final = 200
 #: Number of samples by which a reliable reader may be late: 100 s at 1 kHz.
 QUEUE: Final = 100_000
 _CLOCK_EVERY: Final = 10
 _TRAVEL_S: Final = 0.1
 _POSE_HZ: Final = 100.0
-#: Noise of the synthetic sensor [m, m, rad].
+#: Standard deviations [m, m, rad] of the noise of the synthetic sensor.
 _POSE_NOISE: Final = np.array([5e-4, 5e-4, 2e-3])
-#: Time without an answer after which samples count as lost [s].
+#: Time [s] without an answer after which samples are counted as lost.
 _STALL_S: Final = 2.0
-#: CDR of a message that begins with a stamp: 4 bytes of encapsulation, then sec and nanosec.
+#: Begin of a serialised message that begins with a stamp: 4 bytes of encapsulation, sec and nanosec.
 _STAMP: Final = struct.Struct("<4xiI")
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Samples to send: `wrench` (n, 3) Fx, Fy [N], M [N m], one row every `period_ns`; `speed` (n,) [m/s] of travel.
+    """The samples to send.
 
-    `pose` (m, 3) x, y [m], theta [rad] of a synthetic sensor has one row with every `pose_every`-th sample.
+    `wrench`, shape (n, 3), are the loads Fx, Fy [N], M [N m], one row every `period_ns`. `speed`, shape (n,), is the
+    speed of travel [m/s]. `pose`, shape (m, 3), are poses x, y [m], theta [rad] of a synthetic sensor; one row is sent
+    with every `pose_every`-th sample.
     """
 
     wrench: NDArray[np.float64]
@@ -76,7 +78,7 @@ class Plan:
 
 
 class ExcitationPublisher(WithoutEvents):
-    """Sends the samples of a plan."""
+    """Publisher of the samples of a plan."""
 
     def __init__(self, plan: Plan, stop: StopSignals, *, fast: bool) -> None:
         super().__init__("excitation_publisher")
@@ -97,7 +99,7 @@ class ExcitationPublisher(WithoutEvents):
         self._answered_ns = FIRST_STAMP_NS
         self.sent = 0
         self.latest_s = 0.0
-        #: how often the twin did not answer in time
+        #: Number of times that the twin did not answer in time.
         self.stalls = 0
         self.create_subscription(DiagnosticStatus, "status", self._on_status, OUTPUTS["status"])
         self._answers = (
@@ -107,7 +109,7 @@ class ExcitationPublisher(WithoutEvents):
         )
 
     def wait_for_twin(self, timeout_s: float) -> bool:
-        """Wait until a twin reads `excitation`; return False after the time limit or on a stop."""
+        """Wait until a twin subscribes to `excitation`. Return False after the time limit or on a stop."""
         give_up = time.monotonic() + timeout_s
         while not self._connected():
             if self._stop.stopped or time.monotonic() > give_up:
@@ -120,7 +122,7 @@ class ExcitationPublisher(WithoutEvents):
         return self._twin_reads and self._samples.get_subscription_count() > 0 and answering
 
     def run_real(self) -> None:
-        """Send each sample at its own time, stamped with that time."""
+        """Send each sample at its time, with this time as its stamp."""
         stamp_ns, start_ns = time.time_ns(), time.monotonic_ns()
         for index, wrench in enumerate(self._plan.wrench.tolist()):
             due_ns = start_ns + index * self._plan.period_ns
@@ -150,7 +152,7 @@ class ExcitationPublisher(WithoutEvents):
         self._wait_for_answer(FIRST_STAMP_NS + (self.sent - 1) * self._plan.period_ns)
 
     def flush(self) -> None:
-        """Wait until every reliable reader has received every message."""
+        """Wait until all reliable subscribers have received all messages."""
         self._samples.wait_for_all_acked(Duration(nanoseconds=round(_STALL_S * NS_PER_S)))
 
     def _wait_for_answer(self, stamp_ns: int) -> None:
@@ -180,7 +182,7 @@ class ExcitationPublisher(WithoutEvents):
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         values = {value.key: value.value for value in message.values}
-        # this process may see the connection before the twin does
+        # this process may find the connection earlier than the twin does
         self._twin_reads = values.get("lifecycle") == "active" and values.get("publishers_excitation", "0") != "0"
 
     def _on_answer(self, data: bytes) -> None:
@@ -191,9 +193,9 @@ class ExcitationPublisher(WithoutEvents):
 def plan(
     scene_name: str, rate_hz: float, seconds: float, cutting: CuttingLoad | None = None, sensor_mm: float | None = None
 ) -> Plan:
-    """Sample the loads of a scene without gravity, and add a cutting load.
+    """Sample the loads of a scene, without gravity, and add a cutting load.
 
-    With `sensor_mm` the plan has the noisy pose of a head whose clearances are larger by as much.
+    With `sensor_mm`, the plan contains noisy poses of a head whose clearances are larger by `sensor_mm` [mm].
     """
     period_ns = round(NS_PER_S / rate_hz)
     scene = load_scene(scene_name)
@@ -210,7 +212,7 @@ def plan(
 def _measured(
     scene: Scene, times: NDArray[np.float64], wrench: NDArray[np.float64], wider_mm: float
 ) -> NDArray[np.float64]:
-    """Return the noisy pose of a head in a wider guide, shape (n, 3)."""
+    """Return the noisy poses of a head in a wider guide, shape (n, 3)."""
     clearance = Clearance(scene.clearance.horizontal_m + 1e-3 * wider_mm, scene.clearance.vertical_m + 1e-3 * wider_mm)
     twin = Twin(replace(scene, clearance=clearance), excitation="sampled")
     noise = np.random.default_rng(0).standard_normal((len(times), 3)) * _POSE_NOISE
@@ -226,7 +228,7 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--speed", choices=("real", "fast"), default="real", help="by the clock, or at full speed")
     parser.add_argument("--wait", type=float, default=60.0, help="longest wait for an active twin [s]")
     parser.add_argument(
-        "--sensor", type=float, metavar="MM", help="synthetic head_pose of a head in a guide wider by this [mm]"
+        "--sensor", type=float, metavar="MM", help="publish a synthetic head_pose; clearances are larger by MM [mm]"
     )
     group = parser.add_argument_group("cutting load", "added to the scene's loads; the speed is published on travel")
     group.add_argument("--cutting", type=float, metavar="N", help="mean force into the face, along x [N]")
@@ -235,8 +237,8 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     group.add_argument("--variation", type=float, default=0.5, help="coefficient of variation (Gamma distribution)")
     group.add_argument("--correlation", type=float, default=0.05, help="correlation length along the face [m]")
     group.add_argument("--travel-speed", type=float, default=2.0, help="speed along the face [m/s]")
-    group.add_argument("--face", type=float, default=250.0, help="length of the face, at whose ends it turns [m]")
-    group.add_argument("--turn", type=float, default=4.0, help="time of a turn [s]")
+    group.add_argument("--face", type=float, default=250.0, help="length of the face between two turns [m]")
+    group.add_argument("--turn", type=float, default=4.0, help="duration of a turn [s]")
     group.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)
     for name in ("rate", "seconds", "wait"):
@@ -260,7 +262,7 @@ def _cutting(options: argparse.Namespace) -> CuttingLoad | None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Send a scene's load; return 0 if all was sent, 1 without a twin, 2 for wrong usage, 3 if answers are missing."""
+    """Send a scene's load. Return 0 on success, 1 without a twin, 2 for wrong usage, or 3 if answers are missing."""
     import rclpy.utilities
 
     given = list(sys.argv if arguments is None else ["excitation_publisher", *arguments])

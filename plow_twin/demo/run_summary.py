@@ -1,4 +1,4 @@
-"""Summary of a recorded run: forces per corner and sense, contact sets, clearance and wear."""
+"""Summary of a recorded run: forces by corner and direction of swing, contact sets, clearance and wear."""
 
 from __future__ import annotations
 
@@ -17,30 +17,32 @@ from plow_twin.record.estimated import left_by
 from plow_twin.record.reader import RunReader
 from plow_twin.record.recording import read_recording
 
-#: The pairs of each sense of swing.
+#: Mask of the pairs that stop a counter-clockwise or a clockwise swing.
 SENSES: Final = {"ccw": STOPS_COUNTER_CLOCKWISE, "cw": ~STOPS_COUNTER_CLOCKWISE}
 
 
 @dataclass(frozen=True)
 class RunSummary:
-    """Figures of one run.
+    """Summary of one run.
 
     Attributes
     ----------
     largest, mean_in_contact : ndarray, shape (8,)
-        Largest force, and impulse over the time in contact [N], which each touch makes uncertain by a sample interval.
+        Largest force, and impulse divided by the time in contact [N]. The time in contact is a sum of sample intervals,
+        so
+        each touch adds an uncertainty of one interval.
     makes : ndarray, shape (8,)
         Number of touches.
     contact_sets : dict
-        Share of the contact time in which exactly the corners of a set carry force, by sense of swing and set.
+        Share of the contact time in which exactly the corners of a set carry force, by direction of swing and set.
     clearance : dict
         Newest value, 5 % and 95 % point [m] of `horizontal` and `vertical`.
     wear_depth : ndarray, shape (8,)
-        Newest depth of each pad [m].
+        Newest wear depth of each pad [m].
     frames : int
         Number of messages on contact_forces.
     estimate : dict or None
-        The newest estimate of the node, as `plow-twin estimate --json` prints it.
+        The newest estimate of the node, in the format of `plow-twin estimate --json`.
     """
 
     scene: Scene
@@ -55,13 +57,13 @@ class RunSummary:
 
 
 def corner_letters(scene: Scene) -> dict[str, str]:
-    """Return the letter of each corner, or its name where the scene has no letter."""
+    """Return the letter of each corner. A corner without a letter has its name instead."""
     letters = {corner: letter for letter, corner in scene.frame.labels.items()}
     return {corner: letters.get(corner, corner) for corner in CORNER_NAMES}
 
 
 def summarise(path: Path) -> RunSummary:
-    """Return the figures of a recording; raise RecordingError if the file is none."""
+    """Return the summary of a recording. Raise `RecordingError` if the file is not a recording."""
     recording = read_recording(path)
     newest = left_by(RunReader(path))[1]
     stamps, peaks = recording["contact_peaks"].numpy()

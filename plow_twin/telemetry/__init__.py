@@ -1,1 +1,1 @@
-"""Outputs to a plant: the twin's results by MQTT, Sparkplug B, InfluxDB and OPC UA, each from its own process."""
+"""Outputs of the twin's results to a plant by MQTT, Sparkplug B, InfluxDB and OPC UA, each in a separate process."""

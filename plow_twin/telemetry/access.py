@@ -1,4 +1,4 @@
-"""Outputs by address, and their credentials: secrets come from files or the environment."""
+"""Descriptions of outputs by address, with credentials from files or from the environment."""
 
 from __future__ import annotations
 
@@ -32,16 +32,17 @@ class AccessError(InputError):
         super().__init__([Problem(key, got, expected)], "telemetry")
 
 
-#: Wildcards, control characters and a `$` at the beginning, which the name of a topic must not have.
+#: Characters that are not allowed in the name of a topic: wildcards, control characters and a `$` at the beginning.
 _NO_TOPIC: Final = re.compile(r"[+#\x00-\x1f]|^\$")
 
 
 @dataclass(frozen=True)
 class WayOut:
-    """An output: its part of the diagnostics by `name`, its address without credentials, the modules that its process
-    needs, and the first message to this process, with the options.
+    """Description of an output.
 
-    `may_acknowledge` states whether an operator at the destination may acknowledge alarms.
+    `name` is its part of the diagnostics, and the address contains no credentials. The modules are those that the
+    process of the output imports. The first message to the process contains the options. `may_acknowledge` is True if
+    an operator at the destination may acknowledge alarms.
     """
 
     name: str
@@ -53,14 +54,14 @@ class WayOut:
 
 @dataclass(frozen=True)
 class Credentials:
-    """Credentials by section (`mqtt`, `opcua`, `influx`); paths are relative to the file."""
+    """Credentials by section (`mqtt`, `opcua`, `influx`). Paths in them are relative to the folder of their file."""
 
     sections: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, repr=False)
     folder: Path = Path()
 
     @classmethod
     def read(cls, path: Path | None) -> Credentials:
-        """Read a YAML file; raise InputError or OSError if it cannot be used."""
+        """Read a YAML file. Raise `InputError` or `OSError` if it cannot be used."""
         if path is None:
             return cls()
         data, found = read_yaml(path, "credentials", _CREDENTIALS["description"])
@@ -69,11 +70,12 @@ class Credentials:
         return cls(data, path.parent)
 
     def text(self, section: str, key: str, otherwise: str = "") -> str:
-        """Return a value."""
+        """Return a value of a section, or `otherwise` if it is not given."""
         return str(self.sections.get(section, {}).get(key, otherwise))
 
     def file(self, section: str, key: str) -> str | None:
-        """Return the absolute path of a file, or None if it is not given; raise AccessError if it is missing."""
+        """Return the absolute path of a file, or None if it is not given. Raise `AccessError` if the file is missing.
+        """
         name = self.text(section, key)
         if not name:
             return None
@@ -83,16 +85,18 @@ class Credentials:
         return str(path)
 
     def secret(self, section: str, key: str, variable: str) -> str:
-        """Return the first line of the given file, or the environment variable `PLOW_TWIN_<variable>`."""
+        """Return the first line of the given file; without a file, return the environment variable
+        `PLOW_TWIN_<variable>`.
+        """
         path = self.file(section, key)
         return os.environ.get(f"PLOW_TWIN_{variable}", "") if path is None else read_secret(Path(path))
 
 
 def mqtt_out(url: str, credentials: Credentials, *, plain: bool, sparkplug: str = "") -> list[WayOut]:
-    """Return the outputs to an MQTT broker, `mqtt[s]://HOST[:PORT]/PREFIX`.
+    """Return the outputs to an MQTT broker at `mqtt[s]://HOST[:PORT]/PREFIX`.
 
-    With `sparkplug`, GROUP/NODE, JSON is sent beside it only if `url` has a prefix. An address, name or file that
-    cannot be used raises AccessError or OSError.
+    `sparkplug` is GROUP/NODE of an edge node. With `sparkplug`, JSON messages are sent only if `url` has a prefix.
+    Raises `AccessError` or `OSError` if an address, a name or a file cannot be used.
     """
     expected = "mqtt[s]://HOST:PORT/PREFIX"
     host, port, prefix, tls = _address("--mqtt-out", url, ("mqtt", "mqtts"), expected, plain=plain)
@@ -113,7 +117,7 @@ def mqtt_out(url: str, credentials: Credentials, *, plain: bool, sparkplug: str 
 
 
 def influx_out(url: str, credentials: Credentials, *, plain: bool) -> WayOut:
-    """Return the output to InfluxDB, `http[s]://HOST[:PORT]/ORG/BUCKET`; raise the errors of `mqtt_out`."""
+    """Return the output to InfluxDB at `http[s]://HOST[:PORT]/ORG/BUCKET`. The errors are those of `mqtt_out`."""
     expected = "http[s]://HOST:PORT/ORG/BUCKET"
     host, port, path, encrypted = _address("--influx", url, ("http", "https"), expected, plain=plain)
     org, _, bucket = path.partition("/")
@@ -132,7 +136,7 @@ def influx_out(url: str, credentials: Credentials, *, plain: bool) -> WayOut:
 
 
 def opcua_out(url: str, credentials: Credentials, *, plain: bool, acknowledges: bool) -> WayOut:
-    """Return an OPC UA server that listens on `opc.tcp://HOST:PORT`; raise the errors of `mqtt_out`."""
+    """Return the OPC UA server that listens on `opc.tcp://HOST:PORT`. The errors are those of `mqtt_out`."""
     expected = "opc.tcp://HOST:PORT"
     files = {key: credentials.file("opcua", key) for key in ("certificate", "key", "trusted")}
     if bool(files["certificate"]) != bool(files["key"]) or (files["trusted"] and not files["key"]):
@@ -170,7 +174,9 @@ def _broker_options(host: str, port: int, credentials: Credentials, *, tls: bool
 def _address(
     option: str, url: str, schemes: tuple[str, ...], expected: str, *, plain: bool
 ) -> tuple[str, int, str, bool]:
-    """Return host, port and path, and whether `url` has the last of `schemes`, which means encryption."""
+    """Return host, port and path of an address, and whether its scheme is the last of `schemes`, which means
+    encryption.
+    """
     try:
         parts = urlsplit(url)
         port = parts.port or _PORTS.get(parts.scheme, 0)

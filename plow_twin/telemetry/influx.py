@@ -1,4 +1,4 @@
-"""Results sent to InfluxDB by its official client: a measurement for each group of values."""
+"""Output to InfluxDB by its official client, with one measurement for each group of values."""
 
 from __future__ import annotations
 
@@ -16,19 +16,21 @@ from plow_twin.dashboard.link import Link
 from plow_twin.telemetry.values import Group, Newest
 from plow_twin.telemetry.way import State
 
-#: Largest number of points that wait: ten minutes of all groups of numbers at 1 Hz; the oldest are dropped.
+#: Largest number of points in the queue, ten minutes of all numeric groups at 1 Hz. If the queue is full, the oldest
+#: points are dropped.
 _WAITING: Final = 2000
 _AT_ONCE: Final = 500
 _ANSWER_MS: Final = 5000
-#: First and longest wait after a failed attempt to write [s]; the wait doubles with each failure.
+#: Wait [s] after the first failed attempt to write, which doubles with each failure, and its upper limit [s].
 _FIRST_WAIT_S: Final = 1.0
 _LONGEST_WAIT_S: Final = 30.0
 
 
 class Influx:
-    """Writes lines `plow_twin_<group>,head=... name=value,... stamp` to a bucket of InfluxDB.
+    """Writer of lines `plow_twin_<group>,head=... name=value,... stamp` to a bucket of InfluxDB.
 
-    `ca` is the file of the authority that certifies the database, or None for those that the system trusts.
+    `ca` is the certificate file of the authority that certifies the database. With None, the authorities of the system
+    are trusted.
     """
 
     def __init__(self, url: str, org: str, bucket: str, token: str, ca: str | None) -> None:
@@ -39,7 +41,7 @@ class Influx:
         self._wait_s, self._again_s = 0.0, 0.0
 
     async def open(self, link: Link, newest: Newest) -> None:
-        """Do nothing: each request opens its own connection."""
+        """Do nothing, because each request opens its own connection."""
 
     async def send(self, changed: dict[str, Group], newest: Newest) -> None:
         """Queue the groups that have changed."""
@@ -52,7 +54,7 @@ class Influx:
             self.state.lost += 1
 
     async def turn(self) -> None:
-        """Write waiting lines, unless a failed attempt was a short time ago."""
+        """Write the queued lines, unless the wait after a failed attempt has not ended."""
         while self._waiting and time.monotonic() >= self._again_s:
             lines = [self._waiting[index] for index in range(min(len(self._waiting), _AT_ONCE))]
             try:
@@ -65,14 +67,16 @@ class Influx:
             self.state.connected, self.state.trouble, self._wait_s = True, "", 0.0
 
     async def close(self, patience_s: float) -> None:
-        """Try once more to write the waiting lines; those that remain are lost."""
+        """Try once more to write the queued lines. The remaining lines are counted as lost."""
         if self.state.connected and patience_s:
             await self.turn()
         self.state.lost += len(self._waiting)
         self._client.close()
 
     def _fail(self, error: Any, count: int) -> None:
-        """Keep the lines for another attempt, unless the database has refused their content."""
+        """Record a failure. Lines are dropped if the database has rejected their content; otherwise they stay in the
+        queue.
+        """
         self.state.connected = False
         status = getattr(error, "status", None)
         reason = f"{status} {error.reason}" if status else str(error)
@@ -89,7 +93,7 @@ class Influx:
 
 
 def line_of(name: str, group: Group, head: str) -> str:
-    """Return a group as a line of InfluxDB's protocol, empty if no value is known."""
+    """Return a group as a line of the InfluxDB protocol, or an empty text if no value is known."""
     point = Point(f"plow_twin_{name}")
     if head:
         point = point.tag("head", head)

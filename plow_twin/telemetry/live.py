@@ -16,7 +16,7 @@ from plow_twin.telemetry.outlet import Outlet
 
 
 def open_way(front: BridgeFront, way: WayOut, rate_hz: float, source: str) -> Outlet:
-    """Open an output of a twin that does not run yet; raise the errors of `Outlet`."""
+    """Open an output of a twin that has not been started yet. The errors are those of `Outlet`."""
     runtime = front.runtime
     services = Services(runtime, front.changed)
 

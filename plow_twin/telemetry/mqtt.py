@@ -1,4 +1,4 @@
-"""Results sent to an MQTT broker as JSON: a topic for each group of values."""
+"""Output to an MQTT broker as JSON, with one topic for each group of values."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ from plow_twin.live.bridge.paho_client import end_of, make_client, refusal, use_
 from plow_twin.telemetry.values import UNITS, Group, Newest
 from plow_twin.telemetry.way import State, TelemetryError
 
-#: Largest number of messages that wait: ten minutes of all groups of numbers at 1 Hz; the oldest are dropped.
+#: Largest number of messages in the queue, ten minutes of all numeric groups at 1 Hz. If the queue is full, the oldest
+#: messages are dropped.
 _WAITING: Final = 2000
 _UNACKNOWLEDGED: Final = 20
-#: Keep-alive interval [s]; 1.5 silent intervals mean that the broker has gone.
+#: Keep-alive interval [s]. After 1.5 intervals without a message, the connection to the broker is treated as broken.
 _KEEPALIVE_S: Final = 10
 
 
 class Message(NamedTuple):
-    """A message; later subscribers receive it too if it is retained."""
+    """A message. If it is retained, the broker also sends it to later subscribers."""
 
     topic: str
     payload: bytes
@@ -33,20 +34,20 @@ class Message(NamedTuple):
 
 
 class Broker:
-    """A connection to a broker, restored after a break, with a queue of waiting messages.
+    """A connection to a broker that is restored after a break, with a queue of messages.
 
     Parameters
     ----------
     tls
-        Files `ca`, `certificate` and `key`; None: not encrypted.
+        The files `ca`, `certificate` and `key`. With None, the connection is not encrypted.
     will
-        Returns the message that the broker sends when the next connection breaks.
+        Function that returns the message that the broker publishes if the next connection breaks.
     on_connected
-        Returns the messages to send before waiting messages, once there is a connection.
+        Function that returns the messages to send, ahead of the queue, after each connection.
     waiting
-        Largest number of messages that wait; the oldest are dropped and counted.
+        Largest length of the queue. Further messages displace the oldest messages, which are counted as lost.
     keeps
-        Whether waiting messages outlive a break; otherwise they are dropped and counted.
+        If True, the queue survives a break of the connection. Otherwise its messages are dropped and counted as lost.
     """
 
     def __init__(
@@ -68,7 +69,7 @@ class Broker:
         self._most, self._keeps = waiting, keeps
         self._waiting: deque[Message] = deque()
         self._unacknowledged: set[int] = set()
-        #: held while messages are numbered and queued, so that they are sent in order
+        #: Held while messages are numbered and queued, so that their order is that of their numbers.
         self.lock = threading.RLock()
         self.client = make_client(client_id, clean=True)
         self._set_will()
@@ -88,14 +89,14 @@ class Broker:
         self.client.loop_start()
 
     def send(self, message: Message) -> None:
-        """Send a message now, or when the broker answers."""
+        """Send a message, or queue it until the broker answers."""
         with self.lock:
             self._waiting.append(message)
             self._pass_on()
             self._drop(len(self._waiting) - (self._most if self._keeps or self.state.connected else 0))
 
     async def close(self, last: Message, patience_s: float) -> None:
-        """Send waiting messages, then the last message, and disconnect."""
+        """Send the queued messages and the last message, and disconnect."""
         self.send(last)
         give_up = time.monotonic() + patience_s
         while self.state.connected and (self._waiting or self._unacknowledged) and time.monotonic() < give_up:
@@ -151,9 +152,9 @@ class Broker:
 
 
 class MqttOut:
-    """Sends JSON to `<prefix>/<group>`, retained except for `peaks`; `<prefix>/online` is true or false.
+    """Output of JSON to the topics `<prefix>/<group>`, which are retained except for `peaks`.
 
-    The `options` are those of `Broker`.
+    The topic `<prefix>/online` is true or false. `options` are the arguments of `Broker`.
     """
 
     def __init__(self, prefix: str, **options: Any) -> None:
@@ -176,7 +177,7 @@ class MqttOut:
         """Do nothing, because the connection has its own thread."""
 
     async def close(self, patience_s: float) -> None:
-        """Send waiting messages, and the message that the twin is offline."""
+        """Send the queued messages, and the message that the twin is offline."""
         await self._broker.close(self._gone, patience_s)
 
 

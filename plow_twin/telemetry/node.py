@@ -1,4 +1,4 @@
-"""Outputs of a ROS node, by a process that reads the node's topics and calls its service."""
+"""Outputs of a ROS node, in a process that subscribes to the topics of the node and calls its services."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def send_node(
     stopped: Callable[[], bool],
     on_error: Callable[[str], object],
 ) -> int:
-    """Send the results of a node until `stopped`; return the number of messages that were lost on the way.
+    """Send the results of a node until `stopped`. Return the number of messages that were lost on the way.
 
-    `scene` is needed if the node's scene cannot be read here by its name. `on_error` is called with a text when the
-    receiver of an output stops or resumes taking messages.
+    `scene` is needed if the file of the node's scene cannot be read on this machine. `on_error` receives a text
+    whenever the receiver of an output stops or resumes accepting messages.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""An output of a twin: its process, the feed to it, and its part of the diagnostics."""
+"""An output of a twin: its process, the feed to this process, and its part of the diagnostics."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from plow_twin.live.part import Part
 from plow_twin.telemetry.access import WayOut
 from plow_twin.telemetry.way import TelemetryError
 
-#: Longest time to open an output, most of it for the import of its library [s].
+#: Longest time [s] to open an output. Most of this time is the import of its library.
 _START_S: Final = 60.0
 
 
 class Outlet(Beside):
-    """A running output, as a context manager that ends its process; `facts` and `answer` are those of `Feed`.
+    """A running output, as a context manager that ends its process.
 
-    `on_error` is called with a text when the receiver of the output stops or resumes taking messages. An output that
-    cannot be opened raises TelemetryError, or ModuleNotFoundError if its library is missing.
+    `facts` and `answer` are the arguments of `Feed`. `on_error` receives a text whenever the receiver of the output
+    stops or resumes accepting messages. If the output cannot be opened, `TelemetryError` is raised, or
+    `ModuleNotFoundError` if its library is missing.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class Outlet(Beside):
             raise TelemetryError(failed)
 
     def turn(self) -> None:
-        """Send an update, and report whether the receiver takes messages, if this has changed."""
+        """Send an update, and report a change in whether the receiver accepts messages."""
         self.feed.turn()
         self._report()
 
@@ -83,7 +84,7 @@ class Outlet(Beside):
 
 
 def _is_there(name: str) -> bool:
-    """Return whether a module can be imported, without its import."""
+    """Return whether a module can be imported, without importing it."""
     try:
         return find_spec(name) is not None
     except ModuleNotFoundError:

@@ -1,7 +1,7 @@
-"""The process of one output: `python -m plow_twin.telemetry.process LINK`; the first message names the output.
+"""The process of one output, run as `python -m plow_twin.telemetry.process LINK`. The first message names the output.
 
-While the receiver does not answer, the output keeps a bounded number of updates and counts those that it drops, so that
-the twin is never delayed.
+While the receiver does not answer, a limited number of updates is queued. Further updates are dropped and counted, so
+that the twin is never delayed.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ WAYS: Final = {
     "influx": ("plow_twin.telemetry.influx", "Influx"),
     "opcua": ("plow_twin.telemetry.opcua.server", "OpcUaServer"),
 }
-#: Increment of `nice`, which gives the twin priority.
+#: Increment of `nice`, so that the twin has priority.
 _NICE: Final = 5
-#: Longest time without a look at the output's state, which is reported when it changes [s].
+#: Longest time [s] between two checks of the output's state. Changes of the state are reported.
 _REPORT_S: Final = 0.5
-#: Time at the end for the receiver to take the waiting messages [s].
+#: Time [s] at the end in which the receiver can take the queued messages.
 _END_S: Final = 2.0
 
 
@@ -41,7 +41,7 @@ def _report(way: Way) -> dict[str, Any]:
 
 
 async def serve(link: Link, way: Way, newest: Newest) -> None:
-    """Pass on updates until the twin requests the end or has gone."""
+    """Pass on updates until the twin requests the end, or has ended."""
     sent, ends = _report(way), False
     link.send(sent)
     while not (ends or link.broken):
@@ -80,7 +80,7 @@ async def _run(link: Link, first: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Serve an output over the link whose descriptor is the argument."""
+    """Serve an output over the link, whose file descriptor is the argument."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
     end = socket.socket(fileno=int(sys.argv[1]))

@@ -1,7 +1,8 @@
 """Sparkplug B over MQTT: birth with all metrics, data with changed metrics, death, and rebirth on request.
 
-The messages have the format of `sparkplug_b.proto` of Eclipse Tahu, built from its published field numbers, because the
-file itself has another licence.
+The messages have the format of `sparkplug_b.proto` of Eclipse Tahu. The format is built here from the published field
+numbers, because that file has another licence.
+
 
 References
 ----------
@@ -39,7 +40,7 @@ _FIELDS: Final = {
     "PropertyValue": (("type", 1, _UINT32, ""), ("string_value", 8, _STRING, "")),
 }  # fmt: skip
 _INT32, _UINT64_TYPE, _DOUBLE_TYPE, _BOOLEAN, _TEXT = 3, 8, 10, 11, 12
-#: The two metrics that Sparkplug requires.
+#: The two metrics that the Sparkplug specification requires.
 BIRTH_NUMBER: Final = "bdSeq"
 REBIRTH: Final = "Node Control/Rebirth"
 
@@ -55,7 +56,7 @@ def _messages() -> tuple[Any, Any]:
                 added.type_name = f".plow_twin.sparkplug.{of}"
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
-    # protobuf before 4.22 has a factory instead of the function `GetMessageClass`
+    # protobuf before 4.22 has a class for this purpose instead of the function `GetMessageClass`
     class_of = getattr(message_factory, "GetMessageClass", None) or message_factory.MessageFactory(pool).GetPrototype
     return tuple(class_of(pool.FindMessageTypeByName(f"plow_twin.sparkplug.{name}")) for name in ("Payload", "Metric"))
 
@@ -64,17 +65,17 @@ Payload, Metric = _messages()
 
 
 class Sparkplug:
-    """An edge node whose metrics are `<group>/<name>`; the `options` are those of `Broker`."""
+    """An edge node with metrics `<group>/<name>`; the `options` are the arguments of `Broker`."""
 
     def __init__(self, group: str, node: str, **options: Any) -> None:
         self._topic = f"spBv1.0/{group}/{{}}/{node}"
         self._number = 0
-        #: number of the connection in birth and death messages
+        #: Number of the connection, which birth and death messages contain.
         self._connection = -1
         self._rebirth = False
         self._newest = Newest()
         self._sent: dict[tuple[str, str], Value] = {}
-        # the next birth has all newest values, so messages that a break delayed are dropped
+        # the next birth contains all newest values, so messages queued during a break are dropped
         self._broker = Broker(will=self._next_death, on_connected=self._born, keeps=False, **options)
         self._broker.client.on_message = self._asked
         self.state = self._broker.state
@@ -93,20 +94,20 @@ class Sparkplug:
                 self._broker.send(self._numbered("NDATA", payload))
 
     def _news(self, name: str, group: Group) -> Group:
-        """Return a group with only the values that have changed; note them as sent."""
+        """Return the changed values of a group, and record them as sent."""
         values = {key: value for key, value in group.values.items() if self._sent.get((name, key), self) != value}
         self._sent |= {(name, key): value for key, value in values.items()}
         return group._replace(values=values)
 
     async def turn(self) -> None:
-        """Send the birth again if this was requested."""
+        """Send the birth again if a rebirth was requested."""
         if self._rebirth:
             self._rebirth = False
             with self._broker.lock:
                 self._broker.send(self._birth())
 
     async def close(self, patience_s: float) -> None:
-        """Send the node's death message."""
+        """Send the death message of the node."""
         await self._broker.close(self._death(), patience_s)
 
     def _born(self) -> list[Message]:
@@ -123,7 +124,7 @@ class Sparkplug:
         return self._numbered("NBIRTH", payload)
 
     def _next_death(self) -> Message:
-        """Return the death of the next connection, which the broker receives before the birth."""
+        """Return the death message of the next connection. The broker receives it before the birth message."""
         self._connection = (self._connection + 1) % 256
         return self._death()
 
@@ -159,7 +160,7 @@ def _payload(groups: Mapping[str, Group], *, with_units: bool) -> Any:
 
 
 def _typed(value: Value) -> tuple[int, str, Any]:
-    """Return the number of a value's type, and the field of the message with its content."""
+    """Return the type number of a value, and the name and content of the message field for it."""
     if value is None:
         return _DOUBLE_TYPE, "is_null", True
     if isinstance(value, str):

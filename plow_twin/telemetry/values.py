@@ -1,4 +1,4 @@
-"""The newest numbers and texts of a twin, in groups that are the same on every output."""
+"""The newest numbers and texts of a twin, in groups that are equal on all outputs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 
 from plow_twin.live.part import number_of
 
-#: A value; None: not known.
+#: A value, or None if it is unknown.
 Value = float | int | str | None
 
 _POINTS: Final = ("", "/p05", "/p95")
@@ -25,9 +25,9 @@ UNITS: Final = {"clearance": "m", "wear": "m", "peaks": "N"}
 
 
 class Group(NamedTuple):
-    """Values in SI that are sent together; `held` states that the load had no new samples.
+    """Values in SI units that are sent together. `held` is True if the load had no new samples.
 
-    `time_s` is the stamp that the model had reached [s since 1970], or 0 before the first stamp.
+    `time_s` is the stamp that the model has reached, in s since 1970, or 0 before the first stamp.
     """
 
     time_s: float
@@ -38,9 +38,9 @@ class Group(NamedTuple):
 class Newest:
     """The newest values of all groups, from the updates of a feed.
 
-    The groups are `clearance` [m] and `wear` [m] with their 5 % and 95 % points, `peaks` (largest forces [N] since the
-    last update), `life` (P10, P50 and P90 of the forecast), `flags`, `status` and `alarms`. From the first update on,
-    each group has all of its names.
+    `clearance` and `wear` contain values [m] with their 5 % and 95 % points. `peaks` contains the largest forces [N]
+    since the last update, and `life` contains P10, P50 and P90 of the forecast. The other groups are `flags`, `status`
+    and `alarms`. After the first update, each group contains all of its names.
     """
 
     def __init__(self) -> None:
@@ -51,7 +51,7 @@ class Newest:
         self._held = False
 
     def update(self, update: Mapping[str, Any]) -> dict[str, Group]:
-        """Use an update; return the groups that it has changed."""
+        """Apply an update. Return the groups that have changed."""
         self.not_taken = update.get("not_taken", self.not_taken)
         changed: dict[str, dict[str, Value]] = {}
         if "facts" in update:

@@ -18,8 +18,8 @@ class TelemetryError(PlowTwinError):
 class State:
     """State of an output.
 
-    `sent` and `lost` count messages (or points, or updates) that the receiver has taken, and those dropped. `trouble`
-    is empty, or says why the receiver takes no messages.
+    `sent` counts the messages, points or updates that the receiver has accepted, and `lost` those that were dropped.
+    `trouble` states why the receiver accepts no messages, or is empty.
     """
 
     connected: bool = False
@@ -29,18 +29,18 @@ class State:
 
 
 class Way(Protocol):
-    """An output."""
+    """Interface of an output."""
 
     state: State
 
     async def open(self, link: Link, newest: Newest) -> None:
-        """Open the output for the machine of `newest.facts`; operators' requests go through `link`."""
+        """Open the output for the machine of `newest.facts`. Operator requests are sent through `link`."""
 
     async def send(self, changed: dict[str, Group], newest: Newest) -> None:
         """Send the groups that have changed."""
 
     async def turn(self) -> None:
-        """Do pending work, at least twice a second."""
+        """Do pending work. This method is called at least twice per second."""
 
     async def close(self, patience_s: float) -> None:
-        """Send waiting messages within `patience_s` [s], and close."""
+        """Send queued messages within `patience_s` [s], and close the output."""

@@ -1,4 +1,4 @@
-// The curves of the span shown: peaks of the pads, clearances with their intervals, extremes of the load.
+// Charts of the selected time span: peaks of the pads, clearances with their intervals, and extremes of the load.
 
 /* global uPlot */
 const COLORS = ["#0072b2", "#56b4e9", "#e69f00", "#b8a600", "#d55e00", "#ff9e69", "#009e73", "#6edcb9"];
@@ -8,7 +8,8 @@ const ink = () => getComputedStyle(document.documentElement).getPropertyValue("-
 const grid = () => getComputedStyle(document.documentElement).getPropertyValue("--line");
 const faded = (color) => `${color}33`;
 
-// Columns: the time of each second, then the value that `read` returns for it; a line ends where seconds are missing.
+// Returns columns: the time of each second, and the values that `read` returns for it. Missing seconds interrupt a
+line.
 function columns(seconds, count, read) {
   const found = Array.from({length: count + 1}, () => []);
   let before = null;
@@ -90,7 +91,7 @@ export class Charts {
     });
   }
 
-  // Seconds in which a publication was held, in grey.
+  // Draws in grey the seconds in which the load was held.
   shade(plot) {
     plot.ctx.save();
     plot.ctx.fillStyle = "#80808040";
@@ -103,7 +104,7 @@ export class Charts {
     plot.ctx.restore();
   }
 
-  // Horizontal lines for thresholds, vertical lines for marks and acknowledgements.
+  // Draws thresholds as horizontal lines, and marks and acknowledgements as vertical lines.
   rule(plot, limits) {
     const {ctx, bbox} = plot;
     ctx.save();

@@ -1,4 +1,4 @@
-// The operator's screen: it keeps the server's data, and draws them while the page is visible.
+// The operator's screen. It stores the data of the server, and draws them while the page is visible.
 
 import {Section, forceColor, wearColor} from "./section.js";
 import {Charts} from "./charts.js";
@@ -18,7 +18,7 @@ const state = {facts: null, parts: {}, events: [], seconds: [], motion: null, ne
 let section = null, charts = null, socket = null, wait = 500;
 const token = {value: sessionStorage.getItem("token") ?? ""};
 
-// a token in the address never leaves the browser: it follows #
+// the token follows # in the address, so that the browser never sends it
 if (location.hash.startsWith("#token=")) {
   token.value = decodeURIComponent(location.hash.slice(7));
   sessionStorage.setItem("token", token.value);
@@ -30,7 +30,7 @@ const kilo = (newton) => fixed(newton === null ? null : newton / 1e3, 1);
 const depth = (metre) => (metre === undefined || metre === null ? "–" : metre >= 1e-3 ? `${fixed(metre * 1e3, 2)} mm` : `${fixed(metre * 1e6, 1)} µm`);
 const padName = (name) => { const words = name.split("_"); const wall = words.pop(); return `${words.join(" ")}, ${wall} wall`; };
 const clock = (seconds) => (seconds > 1e9 ? new Date(seconds * 1e3).toLocaleTimeString("en-GB") : `${fixed(seconds, 1)} s`);
-// A time with date and zone: all times of the page are in the browser's zone.
+// Formats a time with date and zone. All times on the page are in the time zone of the browser.
 const moment = (seconds) => (seconds > 1e9 ? new Date(seconds * 1e3).toLocaleString("en-GB", {dateStyle: "medium", timeStyle: "long"}) : clock(seconds));
 
 function cell(row, text, kind = "") {
@@ -57,7 +57,7 @@ function connect() {
     state.closed = event.code === 1001 ? "the twin has ended" : event.code === 1013 ? "too many pages are open" : "the connection is lost";
     if (event.code === 4401) {
       by("door").hidden = false;
-      state.closed = token.value ? "this token is not the right one" : "a token is needed";
+      state.closed = token.value ? "the token is wrong" : "a token is needed";
       show();
       return;
     }
@@ -131,13 +131,13 @@ function show() {
   showPads(peak, largest, wear, points);
   showClearance();
   const [fx, fy, m] = motion.load;
-  by("load").textContent = facts.loads ? `Fx ${kilo(fx)} kN, Fy ${kilo(fy)} kN, M ${kilo(m)} kN m${motion.held ? " (held: no sample comes)" : ""}` : "the scene's own loads";
+  by("load").textContent = facts.loads ? `Fx ${kilo(fx)} kN, Fy ${kilo(fy)} kN, M ${kilo(m)} kN m${motion.held ? " (held: no samples arrive)" : ""}` : "loads of the scene";
   by("load").className = motion.held ? "warn" : "";
 }
 
 function showHealth() {
   const old = age(), banner = by("banner");
-  const said = state.closed || (old > OLD_S && state.facts ? `no update from the twin for ${old.toFixed(0)} s: the values are those of before` : "");
+  const said = state.closed || (old > OLD_S && state.facts ? `no update from the twin for ${old.toFixed(0)} s: the values shown are old` : "");
   banner.hidden = !said;
   banner.textContent = said;
   by("main").classList.toggle("old", Boolean(said));
@@ -208,9 +208,9 @@ function showPads(peak, largest, wear, points) {
     worn.style.boxShadow = `inset -4px 0 ${wearColor(wear[index], Math.max(...wear, 1e-6))}`;
   });
   const set = limits.some((limit) => limit > 0);
-  by("pads-note").textContent = `Upright stroke: largest of the span shown. ${set ? "Amber and red: thresholds of warning and error." : "No threshold is set (parameter alarm_force)."}` +
-    (points ? " Thin line: 5 % to 95 % of the peak over the machines that the measurements allow." :
-      Object.keys(window).length ? " Thin line: the same of the last window that was estimated, 5 % to 95 % over the machines that it allows." : "");
+  by("pads-note").textContent = `Vertical stroke: largest force in the time span. ${set ? "Amber and red: thresholds of warning and error." : "No threshold is set (parameter alarm_force)."}` +
+    (points ? " Thin line: 5 % to 95 % interval of the peak, given the measurements." :
+      Object.keys(window).length ? " Thin line: 5 % to 95 % interval of the peak in the last estimated window." : "");
 }
 
 function showClearance() {
@@ -225,13 +225,13 @@ function showClearance() {
 }
 
 function life(found, known, limits) {
-  if (!limits.some((limit) => limit > 0)) return "Remaining life: no limits are set (parameter forecast_limits).";
-  if (!known) return "Remaining life: not known yet; it follows the first estimate.";
+  if (!limits.some((limit) => limit > 0)) return "Remaining life: no limit is set (parameter forecast_limits).";
+  if (!known) return "Remaining life: not known before the first estimate.";
   if (!Object.keys(found).length) return "Remaining life: withdrawn with the estimate.";
   const hours = (point) => (found[`seconds/${point}`] === undefined ? "beyond the horizon" : `${fixed(found[`seconds/${point}`] / 3600, 0)} h`);
   const beyond = found.not_reached_in_horizon === undefined ? "" : `, ${fixed(100 * found.not_reached_in_horizon, 0)} % beyond the horizon`;
   const shifts = found["shifts/p50"] === undefined ? "" : `; ${fixed(found["shifts/p50"], 0)} shifts`;
-  return `Remaining life of operation to the limits ${limits.map((limit) => fixed(limit * 1e3, 1)).join(" and ")} mm: ${hours("p50")} (10 % to 90 %: ${hours("p10")} to ${hours("p90")}${beyond})${shifts}; from the estimate and the prior of the wear.`;
+  return `Remaining life of operation to the limits ${limits.map((limit) => fixed(limit * 1e3, 1)).join(" and ")} mm: ${hours("p50")} (10 % to 90 %: ${hours("p10")} to ${hours("p90")}${beyond})${shifts}. It follows from the estimate and the prior of the wear.`;
 }
 
 function showInputs() {
@@ -255,7 +255,7 @@ function showInputs() {
     output.recent_latency_p99_ms ? `latency (99 %) ${output.recent_latency_p99_ms} ms` : "",
     Number(input.messages_lost ?? 0) ? `messages lost: ${input.messages_lost}` : "",
     values("state").solver_failures > 0 ? `failed advances: ${values("state").solver_failures}` : "",
-    status.follow && status.follow !== "off" ? `the twin follows, numbers of the ${status.follow}` : "",
+    status.follow && status.follow !== "off" ? `the twin follows the machine (values of the ${status.follow})` : "",
     status.recorder && status.recorder !== "off" ? `recorder: ${status.recorder}` : "not recorded",
     LEVELS[part("input")[0]] !== "OK" ? part("input")[1] : "",
   ];

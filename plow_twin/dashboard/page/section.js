@@ -1,4 +1,4 @@
-// The cross-section as SVG: frame, walls of the head with gaps drawn wider, pads coloured by force and wear, load.
+// The cross-section as SVG: frame, head with widened gaps, pads coloured by force and wear, and the load.
 
 const SVG = "http://www.w3.org/2000/svg";
 const MM = 1000;
@@ -16,7 +16,8 @@ const mixed = (from, to, share) => {
 };
 const CALM = [150, 160, 168], BLUE = [0, 114, 178], AMBER = [230, 159, 0], RED = [200, 0, 30], PURPLE = [88, 40, 150];
 
-// Colour of a force [N]: grey to amber at the warning, red at the error; without thresholds grey to blue at `largest`.
+// Colour of a force [N]: from grey to amber at the warning threshold, and red above the error threshold.
+// Without thresholds, the colour goes from grey to blue at the force `largest`.
 export function forceColor(force, [warn, error], largest) {
   if (error > 0 && force >= error) return mixed(RED, RED, 1);
   if (warn > 0 && force >= warn) return mixed(AMBER, AMBER, 1);
@@ -26,10 +27,10 @@ export function forceColor(force, [warn, error], largest) {
 
 export const wearColor = (depth, largest) => mixed([205, 210, 214], PURPLE, largest > 0 ? depth / largest : 0);
 
-// The walls (top, right, bottom, left), each as the two pads at its ends.
+// The walls (top, right, bottom, left), each given by the indices of the two pads at its ends.
 const WALLS = [[0, 2], [3, 5], [4, 6], [7, 1]];
 
-// The intersection of two lines, each through two points.
+// The intersection of two lines, each given by two points.
 function crossing([[ax, ay], [bx, by]], [[cx, cy], [dx, dy]]) {
   const [ux, uy, vx, vy] = [bx - ax, by - ay, dx - cx, dy - cy];
   const share = ((cx - ax) * vy - (cy - ay) * vx) / (ux * vy - uy * vx);
@@ -44,11 +45,11 @@ export class Section {
     const [width, height] = this.half = facts.frame.map((side) => 0.5 * MM * side);
     const small = Math.min(width, height);
     const gap = MM * Math.max(...facts.clearance);
-    // the clearance fills a third of the frame's smaller side
+    // with this factor, the clearance fills a third of the frame's smaller side
     this.factor = gap > 0 ? Math.max(1, 2 * small / 3 / gap) : 1;
     const [w, h] = [width, height].map((side) => side + 0.62 * small);
     svg.setAttribute("viewBox", `${-w} ${-h} ${2 * w} ${2 * h}`);
-    // letters and strokes keep their size on the screen
+    // letters and strokes have a constant size on the screen
     this.unit = 2 * Math.max(w, h) / 520;
     add(svg, "rect", {class: "frame", x: -width, y: -height, width: 2 * width, height: 2 * height, "vector-effect": "non-scaling-stroke"});
     this.head = add(svg, "polygon", {class: "head", "vector-effect": "non-scaling-stroke"});
@@ -68,7 +69,8 @@ export class Section {
     return found;
   }
 
-  // A pad lies inside the frame along the wall that it touches, from its corner on: force outside, wear inside.
+  // A pad is drawn inside the frame along its wall, beginning at the corner. The outer stripe shows force, the inner
+  wear.
   pad(pad, small) {
     const [length, depth] = [0.42 * small, 0.075 * small];
     const stripe = (from) => {
@@ -80,7 +82,7 @@ export class Section {
       return add(this.svg, "rect", {class: "pad", x: Math.min(...xs), y: Math.min(...ys), width: Math.abs(xs[0] - xs[1]), height: Math.abs(ys[0] - ys[1]), "vector-effect": "non-scaling-stroke"});
     };
     const force = stripe(0), wear = stripe(1);
-    // the number is beyond the end of a horizontal pad, or beside an upright pad
+    // the number is placed beyond the end of a horizontal pad, or beside a vertical pad
     const [dx, dy] = pad.normal[0] ? [0.21, 0.33] : [0.78, 0.1];
     const text = this.text("", pad.at[0] * (this.half[0] - dx * small), -pad.at[1] * (this.half[1] - dy * small));
     if (pad.normal[0]) text.style.textAnchor = pad.normal[0] > 0 ? "end" : "start";
@@ -88,7 +90,7 @@ export class Section {
     return {force, wear, text};
   }
 
-  // `peak` [N] and `wear` [m] of each pad, `largest` force [N] of the span shown
+  // Draws `peak` [N] and `wear` [m] of each pad; `largest` is the largest force [N] in the selected time span.
   draw(motion, peak, wear, largest) {
     const {facts, half} = this;
     const deepest = Math.max(...wear, 1e-6);

@@ -1,1 +1,1 @@
-"""Results as an OPC UA server: a device type based on OPC UA's mining model, and alarms as conditions."""
+"""OPC UA server for the results: a device type based on the OPC UA mining model, and alarms as conditions."""

@@ -1,4 +1,4 @@
-"""Alarms as conditions of OPC UA, which are raised, acknowledged and ended."""
+"""Alarms as OPC UA conditions, which are raised, acknowledged and ended."""
 
 from __future__ import annotations
 
@@ -16,41 +16,42 @@ from plow_twin.telemetry.opcua.model import Model
 from plow_twin.telemetry.values import Group, Value
 
 _ALARM_TYPE: Final = ObjectIds.ExclusiveLevelAlarmType
-#: Severity of each level, from 1 to 1000.
+#: Severity (1 to 1000) of each alarm level.
 _SEVERITY: Final = {"none": 1, "warn": 500, "error": 800}
 _LIMIT: Final = {"warn": "High", "error": "HighHigh"}
 
 
 @dataclass
 class Condition:
-    """One alarm: its events, and its state at the newest event."""
+    """The condition of one alarm: its event generator, and its state at the newest event."""
 
     events: Any
     node_id: ua.NodeId
     level: str = "none"
     acknowledged: bool = True
-    #: time at which it was last raised
+    #: Time at which the alarm was last raised.
     raised: object = None
 
     @property
     def event_id(self) -> bytes:
-        """Identifier of the newest event, which an operator acknowledges."""
+        """Identifier of the newest event, which a client uses to acknowledge it."""
         found = self.events.event.EventId
         return bytes(found.Value) if isinstance(found, ua.Variant) else b""
 
 
 class Conditions:
-    """The alarms of a twin, in a server and its information model."""
+    """The alarms of a twin as conditions of a server."""
 
     def __init__(self, server: Server, model: Model) -> None:
         self._server, self._model = server, model
-        #: asks the twin to acknowledge its alarms, and returns whether it was asked; None if this is not allowed
+        #: Function that requests the twin to acknowledge its alarms, and returns whether the request was sent; None if
+        #: it is not allowed.
         self.acknowledge: Callable[[], bool] | None = None
         self._conditions: dict[str, Condition] = {}
         self._values: Mapping[str, Value] = {}
 
     async def build(self, names: Mapping[str, list[float]]) -> None:
-        """Make a condition for each alarm; `names` has its thresholds (warning, error)."""
+        """Create a condition for each alarm; `names` contains the thresholds (warning, error) of each alarm."""
         alarms = self._server.get_node(self._model.nodes["alarms/message"])
         folder = await alarms.get_parent()
         assert folder is not None
@@ -79,13 +80,13 @@ class Conditions:
         self._server.link_method(self._server.get_node(general), self._called)
 
     async def update(self, alarms: Group) -> None:
-        """Update the alarms, and send an event for each that has changed."""
+        """Update the alarms, and send an event for each alarm that has changed."""
         self._values = values = alarms.values
         for name, condition in self._conditions.items():
             before = condition.level, condition.acknowledged
             condition.level = str(values[f"{name}_level"] or "none")
             raised = values[f"{name}_time"]
-            # an alarm that is not latched has no time, and nothing to acknowledge
+            # an alarm without a time is not latched, so there is nothing to acknowledge
             if raised != condition.raised:
                 condition.raised, condition.acknowledged = raised, raised is None
             if (condition.level, condition.acknowledged) != before:
@@ -104,7 +105,7 @@ class Conditions:
         await condition.events.trigger(datetime.now(UTC), message=f"{name} {values[name]}{place}, {condition.level}")
 
     async def _called(self, parent: ua.NodeId, *arguments: ua.Variant) -> ua.StatusCode:
-        """Answer a condition's method Acknowledge, called with an event's identifier and a comment."""
+        """Handle a call of the method Acknowledge of a condition, with the identifier of an event and a comment."""
         if len(arguments) != 2:
             missing = len(arguments) < 2
             return ua.StatusCode(StatusCodes.BadArgumentsMissing if missing else StatusCodes.BadTooManyArguments)
@@ -119,7 +120,7 @@ class Conditions:
             return ua.StatusCode(StatusCodes.BadConditionBranchAlreadyAcked)
         if not self.acknowledge():
             return ua.StatusCode(StatusCodes.BadOutOfService)
-        for name, found in self._conditions.items():  # the twin acknowledges all of its alarms
+        for name, found in self._conditions.items():  # the twin acknowledges all of its alarms at once
             if not found.acknowledged:
                 found.acknowledged = True
                 await self._send(name, found)

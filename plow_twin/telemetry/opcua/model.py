@@ -1,4 +1,4 @@
-"""The information model: the type of a plough head's twin, a kind of mining equipment, and its instance."""
+"""The OPC UA information model: the type of a plough head's twin, derived from mining equipment, and its instance."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from plow_twin.telemetry.values import UNITS, Group
 
 NAMESPACE: Final = "https://plow-twin.readthedocs.io/opcua"
 _NODESETS: Final = Path(__file__).with_name("nodesets")
-#: Nodeset files, each after those that it needs.
+#: Nodeset files. Each file comes after the files that it needs.
 _FILES: Final = ("Opc.Ua.Di", "Opc.Ua.Machinery", "Opc.Ua.Mining.General")
 _DI, _MINING = "http://opcfoundation.org/UA/DI/", "http://opcfoundation.org/UA/Mining/General/"
 _FUNCTIONAL_GROUP, _DEVICE_SET, _EQUIPMENT, _IDENTIFICATION = 1005, 5001, 1002, 1003
-#: UN/CEFACT code and name of each unit; OPC UA reads the three characters of a code as a number.
+#: UN/CEFACT code and name of each unit. OPC UA encodes the three characters of a code as a number.
 _UNITS: Final = {"m": ("MTR", "metre"), "N": ("NEW", "newton")}
 _POINTS: Final = ("p05", "p95")
 _TYPE: Final = "PloughHeadTwinType"
 
 
 class Model:
-    """The types and the instance of a server, which has been initialised."""
+    """The types and the instance in an initialised server."""
 
     def __init__(self, server: Server) -> None:
         self._server = server
         self._index = 0
         self._di = 0
-        #: node of each value, by `<group>/<name>`
+        #: Node of each value. The key is `<group>/<name>`.
         self.nodes: dict[str, ua.NodeId] = {}
         self.device: Node
 
     async def build(self, groups: Mapping[str, Group], facts: Mapping[str, Any]) -> None:
-        """Make types and instance; the `groups` must have all of their names."""
+        """Create the types and the instance. `groups` must contain all names of the values."""
         for name in _FILES:
             await self._server.import_xml(str(_NODESETS / f"{name}.NodeSet2.xml"))
         self._index = await self._server.register_namespace(NAMESPACE)
@@ -90,7 +90,7 @@ class Model:
             if name in UNITS and "/" not in key:
                 await instantiate(folder, interval, node_id, browse_name, instantiate_optional=False)
                 node = self._server.get_node(node_id)
-                # without a modelling rule, only the type would have the points
+                # without a modelling rule, the instance would have no points
                 for point in _POINTS:
                     await self._server.get_node(self.node_id(f"{begin}.{key}.{point}")).set_modelling_rule(True)
                 await self._set_unit(node, UNITS[name])

@@ -1,4 +1,4 @@
-"""The OPC UA server: the twin's results as variables with stamp and status, which clients can only read."""
+"""OPC UA server for the twin's results, as read-only variables with stamp and status."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ _POLICIES: Final = [
     ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt,
 ]
 _UNKNOWN: Final = ua.StatusCode(StatusCodes.BadWaitingForInitialData)
-#: Status of a number computed without new samples of the load.
+#: Status of a number that was computed without new samples of the load.
 _HELD: Final = ua.StatusCode(StatusCodes.UncertainLastUsableValue)
 _GOOD: Final = ua.StatusCode()
 
 
 class OneUser(UserManager):
-    """Admits one named user or, without a name, every client."""
+    """User manager that admits one named user, or all clients if the name is empty."""
 
     def __init__(self, user: str, password: str) -> None:
         self._user, self._password = user, password
@@ -45,18 +45,18 @@ class OneUser(UserManager):
     def get_user(
         self, iserver: Any, username: str | None = None, password: str | None = None, certificate: Any = None
     ) -> User | None:
-        """Return the user, who may read, or None."""
+        """Return a user with read access, or None if the credentials are wrong."""
         given = zip((self._user, self._password), (username or "", password or ""), strict=True)
         right = all([hmac.compare_digest(own.encode(), found.encode("utf-8", "replace")) for own, found in given])
         return User(UserRole.User, username) if right or not self._user else None
 
 
 class OpcUaServer:
-    """An output to which clients connect.
+    """Output as an OPC UA server, to which clients connect.
 
-    With `certificate` and `key`, all connections are signed and encrypted. `trusted` is a folder with certificates of
-    the admitted clients or their authorities; None admits all. `user` and `password` are those of the only user; if
-    they are empty, clients need no login.
+    With `certificate` and `key`, all connections are signed and encrypted. `trusted` is a folder with the certificates
+    of the admitted clients or of their authorities. With None, all clients are admitted. `user` and `password` are the
+    credentials of the only user; if they are empty, clients need no login.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class OpcUaServer:
         self._conditions = Conditions(self._server, self._model)
 
     async def open(self, link: Link, newest: Newest) -> None:
-        """Make the model of the machine, and listen."""
+        """Create the information model of the machine, and listen."""
         if self._acknowledges:
             self._conditions.acknowledge = lambda: link.send({"do": "acknowledge"})
         server = self._server
@@ -99,7 +99,7 @@ class OpcUaServer:
         try:
             await server.start()
         except OSError as error:
-            raise TelemetryError(f"{self._endpoint}: cannot listen there: {error.strerror}") from error
+            raise TelemetryError(f"{self._endpoint}: cannot listen at this address: {error.strerror}") from error
 
     async def send(self, changed: dict[str, Group], newest: Newest) -> None:
         """Write the values that have changed."""
@@ -111,7 +111,7 @@ class OpcUaServer:
         self.state.sent += 1
 
     async def turn(self) -> None:
-        """Note whether a client is connected."""
+        """Update the connection state: connected means that at least one client is connected."""
         listening = self._server.bserver
         self.state.connected = bool(listening is not None and listening.clients)
 

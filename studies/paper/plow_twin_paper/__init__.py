@@ -1,1 +1,1 @@
-"""The published figures of the paper beside this model."""
+"""Comparison of the paper's published figures with this model."""

@@ -1,4 +1,4 @@
-"""`plow-twin study paper`: the paper's published figures and numbers, reproduced and compared."""
+"""The command `plow-twin study paper`: it computes the paper's figures and numbers and compares them."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ _STYLES = {"yes": "blue", "no": "dark_orange", "not computed": "dim"}
 )
 @quiet_option
 def paper(out: Path, t_end: float, workers: int | None, scene: str, recording: bool, quiet: bool) -> int:
-    """Reproduce the paper's figures and numbers with the preset `paper` and write a report into a folder.
+    """Reproduce the paper's figures and numbers with the preset `paper`, and write a report into a folder.
 
-    The folder gets report.html (plots and the table published / reconstructed / difference / agrees?), the table as
+    The folder gets report.html with plots and a table of published and reconstructed numbers. It also gets the table as
     JSON and CSV, the plots, and the run as MCAP recording and .rrd.
     """
     from plow_twin.scene_file import load_scene

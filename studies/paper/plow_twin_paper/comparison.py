@@ -11,7 +11,7 @@ from plow_twin_paper.runs import PaperRuns
 
 
 def all_rows(runs: PaperRuns) -> list[Row]:
-    """Return the whole comparison in the order of the paper."""
+    """Return all rows of the comparison in the order of the paper."""
     rows = [
         *rows_motion.rows(runs.scene, runs.case),
         *rows_sets.rows(runs.scene, runs.case),
@@ -23,7 +23,7 @@ def all_rows(runs: PaperRuns) -> list[Row]:
 
 
 def one_run_rows(runs: PaperRuns, index: int) -> list[Row]:
-    """Return the rows of Figs 6 to 9 for one form of the head's rotation."""
+    """Return the rows of Figs 6 to 9 for one model of the head's rotation."""
     assert runs.rotation is not None
     scene, result = runs.rotation.scenes[index], runs.rotation.results[index]
     return [*rows_motion.rows(scene, result), *rows_sets.rows(scene, result)]

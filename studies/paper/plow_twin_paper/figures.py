@@ -1,4 +1,4 @@
-"""All figures of the report, with descriptions of the paper's figures and of their own content."""
+"""All figures of the report, each with a description of the paper's figure and of its own content."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture file with its heading and two descriptions: of the paper's figure, and of this one."""
+    """A picture file with its heading, a description of the paper's figure, and a description of the picture."""
 
     path: Path
     heading: str
@@ -27,7 +27,7 @@ class Picture:
 
 
 def draw_all(runs: PaperRuns, scene: str, folder: Path, on_progress: Callable[[float], object]) -> list[Picture]:
-    """Draw every figure into a folder as PNG and return them in the order of the paper."""
+    """Draw all figures into a folder as PNG. Return them in the order of the paper."""
     from plow_twin_paper.style import save
 
     found = []
@@ -97,7 +97,7 @@ def _plans(runs: PaperRuns) -> list[tuple[str, str, str, str, Callable[[], Figur
 
 
 def _falls(runs: PaperRuns) -> str:
-    """Describe how far each curve of Fig. 11 falls below an earlier maximum."""
+    """Return a sentence with the largest decrease of each curve in Fig. 11 from an earlier maximum."""
     forces = runs.horizontal.largest_n
     falls = np.max(np.maximum.accumulate(forces, axis=0) - forces, axis=0)
     listed = ", ".join(f"{corner} {1e-3 * fall:.1f}" for corner, fall in zip(CORNERS, falls, strict=True))
@@ -105,7 +105,7 @@ def _falls(runs: PaperRuns) -> str:
 
 
 def draw_rotation(runs: PaperRuns, scene: str, folder: Path) -> Picture | None:
-    """Draw the three forms of rotation; return None if gravity has no arm."""
+    """Draw the three models of rotation. Return None if gravity has no arm."""
     from plow_twin_paper.figures_trends import rotation_figure
     from plow_twin_paper.style import save
 

@@ -1,4 +1,4 @@
-"""Figures of the case of section 3: Fig. 6 (motion), Fig. 7 (forces), Figs 8 and 9 (close-ups)."""
+"""Figures of section 3 of the paper: motion (Fig. 6), forces (Fig. 7) and close-ups (Figs 8 and 9)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _POSE: Final = (("x [mm]", 1e3, "#0072B2"), ("y [mm]", 1e3, "#D55E00"), ("theta 
 
 
 def fig06(runs: PaperRuns) -> Figure:
-    """x, y and theta over time: the whole run, and its last two load periods."""
+    """Draw x, y and theta over the whole run, and over its last two load periods."""
     t, q = runs.case.t, runs.case.q
     with sheet(10.5, 6.0) as figure:
         panels = figure.subplots(3, 2, sharex="col", width_ratios=(1.5, 1))
@@ -39,7 +39,7 @@ def fig06(runs: PaperRuns) -> Figure:
 
 
 def fig07(runs: PaperRuns) -> Figure:
-    """Force at each point by sense, with the published largest value and mean."""
+    """Draw the force at each point for each direction of swing, with the published largest value and mean."""
     letters, t = paper_sets.letters_of_pairs(runs.scene), runs.case.t
     table = force_table(runs.scene, runs.case)
     highest = 1.12e-3 * max([*(row["max"] for row in table.values()), *(force.value_n for force in FORCES)])
@@ -80,19 +80,21 @@ def _published(panel: Any, sense: Sense, corner: str) -> None:
 
 
 def fig08(runs: PaperRuns) -> Figure:
-    """Close-up of the counter-clockwise contacts."""
+    """Draw a close-up of the counter-clockwise contacts."""
     return _close_up(runs, "ccw")
 
 
 def fig09(runs: PaperRuns) -> Figure:
-    """Close-up of the clockwise contacts."""
+    """Draw a close-up of the clockwise contacts."""
     return _close_up(runs, "cw")
 
 
 def _close_up(runs: PaperRuns, sense: Sense) -> Figure:
-    """Forces of one sense over a period around the quoted times, and when each point carries force."""
+    """Draw the forces of one direction of swing over a period around the quoted times, and when each point carries
+    force.
+    """
     times = {moment: shown_time(moment.time_s, runs.t_end) for moment in MOMENTS if moment.sense == sense}
-    # a shorter run may end before some quoted times, so all move back by the same number of periods
+    # a shorter run may end before some quoted times; then all quoted times move back by the same number of periods
     back = max(moment.time_s - time for moment, time in times.items())
     times = {moment: moment.time_s - back for moment in times}
     centre = 0.5 * (min(times.values()) + max(times.values()))
@@ -131,7 +133,6 @@ def _moved(back: float) -> str:
 
 
 def _bars(panel: Any, timeline: list[paper_sets.Hold], left: float) -> None:
-    """Draw when each point carries force, one line for each point."""
     for row, corner in enumerate(CORNERS):
         spans = [
             (hold.start_s, hold.duration_s)

@@ -1,4 +1,4 @@
-"""Figures of the trends: Figs 10 and 11 (clearance), Figs 13 to 15 (inner faces), and of the head's rotation."""
+"""Figures of trends: clearance (Figs 10 and 11), inner faces (Figs 13 to 15), and the models of the head's rotation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from plow_twin_paper.values import CORNERS, FACE_MARKS, FACES, FIXED_M, GRID_M, 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Colour and line style of the three forms of the head's rotation.
+#: Name, colour and line style of the three models of the head's rotation.
 _FORMS: Final = (
     ("constant moment (paper)", "#333333", "-"),
     ("exact, I about the centre of mass", "#D55E00", "--"),
@@ -26,12 +26,12 @@ _FIRST_S: Final = 4.0
 
 
 def fig10(runs: PaperRuns) -> Figure:
-    """Largest force of each point against the vertical clearance."""
+    """Draw the largest force of each point as a function of the vertical clearance."""
     return _sweep(runs.vertical, "vertical", "horizontal")
 
 
 def fig11(runs: PaperRuns) -> Figure:
-    """Largest force of each point against the horizontal clearance."""
+    """Draw the largest force of each point as a function of the horizontal clearance."""
     return _sweep(runs.horizontal, "horizontal", "vertical")
 
 
@@ -53,7 +53,7 @@ def _sweep(sweep: Sweep, along: str, fixed: str) -> Figure:
 
 
 def fig13(runs: PaperRuns) -> Figure:
-    """Force on each inner face over two periods, with the contact states that the paper marks."""
+    """Draw the force on each inner face over two periods, with the contact states that the paper marks."""
     run, end = runs.faces, float(runs.faces.t[-1])
     since = max(end - 2.0 * PERIOD_S, 0.0)
     rows = run.t >= since
@@ -76,7 +76,7 @@ def fig13(runs: PaperRuns) -> Figure:
 
 
 def _mark(panels: Any, found: tuple[float, float], text: str, level: int) -> None:
-    """Shade a span (start and length in s) in all panels, and name it above the first."""
+    """Shade the span `found` (start and length [s]) in all panels, and write its name above the first panel."""
     for panel in panels:
         panel.axvspan(found[0], found[0] + found[1], color="#F0E442", alpha=0.85, linewidth=0.0)
     panels[0].annotate(
@@ -86,12 +86,12 @@ def _mark(panels: Any, found: tuple[float, float], text: str, level: int) -> Non
 
 
 def fig14(runs: PaperRuns) -> Figure:
-    """Inner faces at three vertical clearances."""
+    """Draw the forces on the inner faces at three vertical clearances."""
     return _faces(runs.faces_vertical, "vertical")
 
 
 def fig15(runs: PaperRuns) -> Figure:
-    """Inner faces at three horizontal clearances."""
+    """Draw the forces on the inner faces at three horizontal clearances."""
     return _faces(runs.faces_horizontal, "horizontal")
 
 
@@ -126,7 +126,7 @@ def _faces(runs: tuple[FaceRun, ...], along: str) -> Figure:
 
 
 def rotation_figure(rotation: Rotation) -> Figure:
-    """First seconds and largest forces under the three forms of the head's rotation."""
+    """Draw the first seconds and the largest forces for the three models of the head's rotation."""
     with sheet(11.0, 6.6) as figure:
         grid = figure.add_gridspec(3, 2, width_ratios=(1.5, 1))
         labels = ("x [mm]", "y [mm]", "theta [mrad]")

@@ -1,6 +1,7 @@
-"""A scene's run as a recording and as a rerun file, as the live node would leave them.
+"""A run of a scene as a recording and as a rerun file, in the format of the live node.
 
-The twin takes the loads of the scene as samples joined by straight lines, so that the recording has the load too.
+The twin receives the loads of the scene as samples, which are interpolated linearly. The recording therefore contains
+the load.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 #: Interval of the samples [s].
 SAMPLE_S: Final = 1e-3
-#: A message is written at every n-th sample; its peaks cover all samples since the last one.
+#: Number of samples per message. The peaks of a message cover all its samples.
 MESSAGE_EVERY: Final = 4
 _CHUNK_B: Final = 256 * 1024
 _MIN_FREE_B: Final = 64 * 1024 * 1024
@@ -37,7 +38,8 @@ _MIN_FREE_B: Final = 64 * 1024 * 1024
 
 @dataclass(frozen=True)
 class Recording:
-    """The files of a recorded run, and the pose of its head, shape (n, 3), at the samples t, shape (n,)."""
+    """The files of a recorded run, and the pose of the head, shape (n, 3), at the times t of the samples, shape (n,).
+    """
 
     mcap: Path
     rrd: Path
@@ -48,7 +50,7 @@ class Recording:
 def record(
     scene: Scene, t_end: float, folder: Path, on_progress: Callable[[float], object] = lambda share: None
 ) -> Recording:
-    """Run a scene; write `folder`/..._0.mcap and `folder`.rrd.
+    """Run a scene. Write `folder`/..._0.mcap and `folder`.rrd.
 
     Raises
     ------
@@ -76,7 +78,7 @@ def record(
 
 
 def _drive(scene: Scene, times: Array, writer: RunWriter, on_progress: Callable[[float], object]) -> Array:
-    """Feed the loads to a twin, write its inputs and outputs, and return its poses, shape (n, 3)."""
+    """Pass the loads to a twin and write its inputs and outputs. Return its poses, shape (n, 3)."""
     from plow_twin.record.outputs import publication_messages
 
     header, sequence = writer.header, -1

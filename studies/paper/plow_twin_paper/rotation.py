@@ -1,8 +1,9 @@
-"""The same scene with a constant moment of gravity, as in the paper, and as an exact rigid body.
+"""Three models of the head's rotation: a constant moment of gravity, as in the paper, and two exact rigid bodies.
 
-A centre of mass off the centre of the cavity couples translation and rotation in the mass matrix. The paper omits this
-coupling and keeps a constant moment -m g arm (its section 2). The equivalent offset is `com_offset_m = (arm, 0)`. The
-paper does not state the reference point of its inertia, so both readings are run.
+If the centre of mass is not at the centre of the cavity, the mass matrix couples translation and rotation. The paper
+omits this coupling and uses a constant moment -m g arm (section 2). The equivalent offset is `com_offset_m = (arm, 0)`.
+The paper does not state the reference point of the inertia I. One exact model therefore takes I about the centre of
+mass, and the other about the centre of the cavity.
 """
 
 from __future__ import annotations
@@ -18,14 +19,13 @@ from plow_twin.run.simulate import Result, simulate
 from plow_twin_paper import sets as paper_sets
 from plow_twin_paper.values import CORNERS, SENSE_NAMES
 
-#: Distance [m] of two motions that count as separated.
+#: Distance [m] above which two motions are treated as separated.
 PARTED_M = 1e-3
 
 
 @dataclass(frozen=True)
 class Rotation:
-    """Three runs: constant moment; exact, with I about the centre of mass; exact, with I about the centre of the
-    cavity.
+    """Results of the three models: constant moment, I about the centre of mass, and I about the centre of the cavity.
     """
 
     scenes: tuple[Scene, Scene, Scene]
@@ -34,7 +34,7 @@ class Rotation:
 
     @property
     def parted_s(self) -> float:
-        """Time in s from which the first two runs are more than `PARTED_M` apart, NaN if they never are."""
+        """Time [s] at which the distance of the first two motions first exceeds `PARTED_M`, or NaN."""
         first, second = self.results[:2]
         apart = np.hypot(*(first.q - second.q)[:, :2].T) > PARTED_M
         return float(first.t[np.argmax(apart)]) if apart.any() else float("nan")
@@ -42,7 +42,7 @@ class Rotation:
 
 @dataclass(frozen=True)
 class RotationRow:
-    """One quantity of the three runs."""
+    """A quantity of the three runs."""
 
     what: str
     unit: str
@@ -51,12 +51,12 @@ class RotationRow:
     consistent_centre: float
 
     def change(self, value: float) -> float | None:
-        """Return the relative difference from the value with the constant moment, or None if that is zero."""
+        """Return the relative difference from the value with the constant moment, or None if this value is zero."""
         return (value - self.constant) / abs(self.constant) if self.constant else None
 
 
 def rotation_scenes(scene: Scene, t_end: float, output_dt: float) -> Rotation | None:
-    """Run the three forms of rotation; return None if gravity has no arm or the inertia is too small."""
+    """Run the three models of rotation. Return None if gravity has no arm or if the inertia is too small."""
     head, gravity = scene.head, scene.gravity
     offset = gravity.arm_m if head.rotation == "paper" else head.com_offset_m[0]
     about_centre = head.inertia_kg_m2 - head.mass_kg * offset**2
@@ -79,7 +79,7 @@ def rotation_scenes(scene: Scene, t_end: float, output_dt: float) -> Rotation | 
 
 
 def rotation_rows(rotation: Rotation) -> list[RotationRow]:
-    """Return forces of the corners by sense, extent of the motion and share of four-point contact."""
+    """Return forces of the corners, extent of the motion and share of four-point contact for the three models."""
     return [*_forces(rotation), *_poses(rotation), *_sets(rotation)]
 
 

@@ -1,4 +1,4 @@
-"""Rows of Fig. 6 (the motion) and Fig. 7 (the force at each point)."""
+"""Rows of Fig. 6 (motion) and Fig. 7 (force at each point)."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def rows(scene: Scene, result: Result) -> list[Row]:
 
 
 def force_table(scene: Scene, result: Result) -> dict[tuple[Sense, str], dict[str, float]]:
-    """Return the statistics of each corner in each sense [N]."""
+    """Return the forces [N] of each corner for each direction of swing: largest force and means."""
     letters, pairs = paper_sets.letters_of_pairs(scene), list(result.statistics.values())
     return {
         (sense, letter): dict(pairs[pair])

@@ -1,4 +1,4 @@
-"""Rows of the close-ups, Figs 8 and 9: which points carry force together, how often, and when."""
+"""Rows of Figs 8 and 9: which points carry force at the same time, how often, and when."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _sizes(sense: Sense, timeline: Sequence[Hold]) -> Iterator[Row]:
 
 
 def shown_time(time_s: float, t_end: float) -> float:
-    """Return the quoted time or, in a shorter run, the last time at the same phase of the load."""
+    """Return the quoted time. If the run is shorter, return the last time of the run at the same phase of the load."""
     return time_s - PERIOD_S * max(0, math.ceil((time_s - t_end) / PERIOD_S))
 
 

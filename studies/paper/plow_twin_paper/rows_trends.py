@@ -1,4 +1,4 @@
-"""Rows of Figs 10, 11 (force against clearance) and of the check with RecurDyn, Figs 13 to 15."""
+"""Rows of Figs 10 and 11 (force as a function of clearance) and of Figs 13 to 15 (check with RecurDyn)."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ _RISES_THEN_FALLS: Final = (
 
 
 def rises(values: Array) -> bool:
-    """Return whether a curve rises; a step down below `TREND_SLACK` of its largest value does not count."""
+    """Return whether a curve rises. Decreases below the share `TREND_SLACK` of its largest value are ignored."""
     slack = TREND_SLACK * float(values.max())
     return bool((np.diff(values) > -slack).all() and values[-1] - values[0] > slack)
 
 
 def rises_then_falls(values: Array) -> bool:
-    """Return whether a curve rises to an inner value and then falls, judged as in `rises`."""
+    """Return whether a curve first rises and then falls, with the tolerance of `rises`."""
     slack, top = TREND_SLACK * float(values.max()), int(values.argmax())
     if not 0 < top < len(values) - 1:
         return False
@@ -87,10 +87,10 @@ def _trend(group: str, source: str, what: str, values: Array, at: str, falls: bo
 
 
 def longest_faces(runs: PaperRuns, mark: FaceMark, since_s: float = 0.0) -> tuple[float, float] | None:
-    """Return start and length [s] of the longest time with the mark's number of faces in contact, if any.
+    """Return start and length [s] of the longest time in which as many faces are in contact as `mark` states, or None.
 
-    The search goes from `since_s` to the end of section 5's 20 s. In each sense a corner has one pair, and different
-    corners touch different faces, so as many points as faces are in contact.
+    The search begins at `since_s` and ends after the 20 s of section 5. For one direction of swing, each corner has one
+    pair, and different corners touch different faces. The number of faces in contact is thus the number of points.
     """
     chosen = paper_sets.of_sense(mark.sense)
     faces = [face for pair, face in enumerate(face_of_pair()) if chosen[pair]]

@@ -1,4 +1,4 @@
-"""The runs behind the comparison with the paper, all computed from one scene."""
+"""The runs for the comparison with the paper, all computed from one scene."""
 
 from __future__ import annotations
 
@@ -32,31 +32,31 @@ from plow_twin_paper.values import (
 Array = NDArray[np.float64]
 OnProgress = Callable[[float], object]
 
-#: Shortest run [s]: two load periods, of which the second counts as settled.
+#: Length of the shortest run [s]: two load periods, of which the second is treated as settled.
 SHORTEST_S: Final = 2.0 * PERIOD_S
-#: Longest run [s]; the rows of its three forms of rotation take about a gigabyte.
+#: Length of the longest run [s]. Its output for the three models of rotation takes about one gigabyte.
 LONGEST_S: Final = 1000.0
-#: Interval of the rows in figures [s]; forces change over tens of milliseconds.
+#: Output interval for figures [s]. Forces change within tens of milliseconds.
 OUTPUT_DT_S: Final = 1e-3
-#: Steps of a computed curve between two of the five places at which the paper's curves are read.
+#: Number of steps of a computed curve between two of the five points that are read from the paper's curves.
 _FINE_STEPS: Final = 10
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """Largest force of each corner over both senses [N], shape (n, 4), by clearance [m], shape (n,)."""
+    """Largest force of each corner [N], shape (n, 4), as a function of the clearance [m], shape (n,)."""
 
     clearance_m: Array
     largest_n: Array
 
     def on_grid(self) -> Array:
-        """Return the forces at the five places, shape (5, 4)."""
+        """Return the forces at the five clearances of the paper, shape (5, 4)."""
         return self.largest_n[::_FINE_STEPS]
 
 
 @dataclass(frozen=True)
 class FaceRun:
-    """The force on each inner face [N], shape (n, 4) as `FACES`, at a clearance [m]; NaN if the run failed."""
+    """Force on each of the `FACES` [N], shape (n, 4), at a clearance [m]; NaN if the run failed."""
 
     clearance_m: float
     t: Array
@@ -64,19 +64,19 @@ class FaceRun:
 
     @property
     def failed(self) -> bool:
-        """Whether the motion could not be continued to the end."""
+        """True if the motion could not be continued to the end."""
         return bool(np.isnan(self.face_n).any())
 
 
 @dataclass(frozen=True)
 class PaperRuns:
-    """All runs, with the scene and the settings from which they were computed."""
+    """All runs, with their scene and settings."""
 
     scene: Scene
     t_end: float
-    #: ratio of the scene's clearances (horizontal, vertical) to the published clearances
+    #: Ratio of the scene's clearances (horizontal, vertical) to the published clearances.
     scale: tuple[float, float]
-    #: run of Figs 6 to 9, which is always complete
+    #: Run of Figs 6 to 9, which is always complete.
     case: Result
     vertical: Sweep
     horizontal: Sweep
@@ -84,12 +84,12 @@ class PaperRuns:
     faces_vertical: tuple[FaceRun, ...]
     faces_horizontal: tuple[FaceRun, ...]
     rotation: Rotation | None
-    #: number of runs that could not be completed
+    #: Number of runs that could not be completed.
     failed: int
 
 
 def _check_scene(scene: Scene) -> None:
-    """Raise a `SceneError` for a scene that cannot be compared with the paper."""
+    """Raise a `SceneError` if the scene cannot be compared with the paper."""
     problems = []
     if tuple(sorted(scene.frame.labels)) != CORNERS:
         problems.append(
@@ -110,14 +110,15 @@ def run_all(
 ) -> PaperRuns:
     """Run everything that the figures and the table need.
 
-    The scene has the clearance of the paper's Figs 6 to 9, measured by any convention; the other clearances are scaled
-    in proportion. The runs of section 5 end at 20 s, or at `t_end` if it is earlier. A run may fail; its rows are then
-    not computed.
+    The clearance of the scene corresponds to Figs 6 to 9 of the paper. All other clearances of the paper are multiplied
+    by the ratio of the scene's clearance to the published clearance. The runs of section 5 end at 20 s, or at `t_end`
+    if it is smaller. Rows whose run fails are not computed.
+
 
     Raises
     ------
     SceneError
-        The scene cannot be compared: labels, loads or clearances.
+        The labels, loads or clearances of the scene prevent a comparison.
     SolverError
         The run of Figs 6 to 9 could not be continued.
     """
@@ -142,7 +143,7 @@ def run_all(
 def _sweeps(
     scene: Scene, scale: tuple[float, float], t_end: float, workers: int | None, on_progress: OnProgress
 ) -> tuple[tuple[Sweep, Sweep], int]:
-    """Return the curves of Figs 10 and 11, and how many of their runs failed; failed runs have NaN forces."""
+    """Return the curves of Figs 10 and 11, and the number of failed runs, whose forces are NaN."""
     fine = np.linspace(GRID_M[0], GRID_M[-1], _FINE_STEPS * (len(GRID_M) - 1) + 1)
     cells = [(FIXED_M, value) for value in fine] + [(value, FIXED_M) for value in fine]
     scenes = [_at(scene, scale, *cell) for cell in cells]
@@ -166,7 +167,7 @@ def _at(scene: Scene, scale: tuple[float, float], horizontal_m: float, vertical_
 
 
 def _by_corner(scene: Scene, peak: Array) -> Array:
-    """Return the larger peak of each corner's two pairs, shape (m, 4)."""
+    """Return the larger peak of the two pairs at each corner, shape (m, 4)."""
     letters = letters_of_pairs(scene)
     pairs = [[pair for pair, letter in enumerate(letters) if letter == corner] for corner in CORNERS]
     return np.stack([peak[:, index].max(axis=1) for index in pairs], axis=1)
@@ -182,7 +183,7 @@ def _face_run(scene: Scene, clearance_m: float, t_end: float) -> FaceRun:
 
 
 def _rotation(scene: Scene, t_end: float) -> tuple[Rotation | None, int]:
-    """Return the three forms of rotation and the number of failures; one failure leaves no comparison."""
+    """Return the three models of rotation, or None if one fails, and the number of failures."""
     try:
         return rotation_scenes(scene, t_end, OUTPUT_DT_S), 0
     except SolverError:
@@ -195,7 +196,7 @@ def face_of_pair() -> list[str]:
 
 
 def _face_forces(force: Array) -> Array:
-    """Return the force on each inner face [N], shape (n, 4), from those of the pairs, shape (n, 8)."""
+    """Return the force on each inner face [N], shape (n, 4), given the forces of the pairs, shape (n, 8)."""
     faces = face_of_pair()
     pairs = [[pair for pair, name in enumerate(faces) if name == face] for face in FACES]
     return np.stack([force[:, chosen].sum(axis=1) for chosen in pairs], axis=1)

@@ -1,4 +1,4 @@
-"""Which corners carry force together, and for how long, exactly, from the contact events."""
+"""Sets of corners that carry force at the same time, and their exact durations, from the contact events."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from plow_twin.model.scene import Scene
 from plow_twin.run.simulate import Result
 from plow_twin_paper.values import SHORTEST_HOLD_S, Sense
 
-#: Mode of a pair that carries force; 0 is apart, and 2 is in contact with a force clipped at zero.
+#: Mode of a pair that carries force. Mode 0 is apart, and mode 2 is in contact with a force clipped at zero.
 _CARRIES = 1
 
 
 @dataclass(frozen=True)
 class Hold:
-    """A time in which the same corners carry force, e.g. `abd`; "" if no corner does."""
+    """A time in which exactly the corners `corners` carry force, e.g. `abd`; the text is empty if no corner does."""
 
     start_s: float
     end_s: float
@@ -27,13 +27,14 @@ class Hold:
 
     @property
     def duration_s(self) -> float:
-        """Length in s."""
+        """Length [s]."""
         return self.end_s - self.start_s
 
 
 @dataclass(frozen=True)
 class SetFigures:
-    """One set over a run: share of the contact time of its sense, total and longest hold [s], number of long holds."""
+    """Figures of one set: share of its direction's contact time, total and longest hold [s], and number of long holds.
+    """
 
     share: float
     total_s: float
@@ -48,14 +49,14 @@ def letters_of_pairs(scene: Scene) -> list[str]:
 
 
 def of_sense(sense: Sense) -> NDArray[np.bool_]:
-    """Return which pairs belong to a sense, shape (8,)."""
+    """Return a mask of the pairs that stop a direction of swing, shape (8,)."""
     return STOPS_COUNTER_CLOCKWISE if sense == "ccw" else ~STOPS_COUNTER_CLOCKWISE
 
 
 def holds(scene: Scene, result: Result, sense: Sense) -> list[Hold]:
-    """Return the sets of one sense in order of time, without gaps, to the end of the run."""
+    """Return the sets of one direction of swing in order of time, without gaps, to the end of the run."""
     letters, chosen = letters_of_pairs(scene), of_sense(sense)
-    carries = result.force[0] > 0.0  # a pair that penetrates at t = 0 is in contact without an event
+    carries = result.force[0] > 0.0  # a pair that penetrates at t = 0 is in contact without a contact event
     found: list[Hold] = []
     start, now = 0.0, _name(letters, carries & chosen)
     for event in result.events:
@@ -74,7 +75,7 @@ def _name(letters: Sequence[str], carries: NDArray[np.bool_]) -> str:
 
 
 def figures(timeline: Sequence[Hold]) -> dict[str, SetFigures]:
-    """Return the figures of every set that occurs, the largest share first."""
+    """Return the figures of each set that occurs, beginning with the largest share."""
     total = sum(hold.duration_s for hold in timeline if hold.corners)
     table = {}
     for name in {hold.corners for hold in timeline} - {""}:
@@ -85,18 +86,18 @@ def figures(timeline: Sequence[Hold]) -> dict[str, SetFigures]:
 
 
 def share_by_size(timeline: Sequence[Hold]) -> list[float]:
-    """Return the share of the contact time with one, two, three and four points, shape (4,)."""
+    """Return the shares of the contact time with one, two, three and four points, shape (4,)."""
     table = figures(timeline)
     return [sum(row.share for name, row in table.items() if len(name) == size) for size in (1, 2, 3, 4)]
 
 
 def at(timeline: Sequence[Hold], time_s: float) -> str:
-    """Return the set at a time."""
+    """Return the set at a time [s]."""
     return next((hold.corners for hold in timeline if hold.start_s <= time_s < hold.end_s), timeline[-1].corners)
 
 
 def nearest(timeline: Sequence[Hold], time_s: float, corners: str) -> tuple[float, Hold] | None:
-    """Return the distance in s (negative: earlier) from a time to the nearest hold of a set, and this hold."""
+    """Return the nearest hold of a set to a time, and its distance [s] from this time; earlier holds are negative."""
     found = [hold for hold in timeline if hold.corners == corners]
     if not found:
         return None

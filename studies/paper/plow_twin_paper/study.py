@@ -1,4 +1,4 @@
-"""The study of the paper: published figures and numbers are computed again, compared and written to a report."""
+"""The study of the paper: figures and numbers are computed, compared with the published values, and reported."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from plow_twin_paper.rows import FITTED, Row, Verdict
 from plow_twin_paper.runs import PaperRuns, run_all
 
 OnProgress = Callable[[float], object]
-#: The forms in words, in the order of `Rotation.scenes`.
+#: Names of the models of rotation, in the order of `Rotation.scenes`.
 FORMS = ("constant moment", "exact, I about the centre of mass", "exact, I about the cavity's centre")
 
 
 @dataclass(frozen=True)
 class Change:
-    """A statement whose verdict changes with another form of the head's rotation."""
+    """A statement whose verdict depends on the model of the head's rotation."""
 
     form: str
     row: Row
@@ -36,7 +36,7 @@ class Change:
 
 @dataclass(frozen=True)
 class PaperStudy:
-    """All results, and the files if they were written."""
+    """All results, and the paths of the files if they were written."""
 
     runs: PaperRuns
     rows: list[Row]
@@ -51,12 +51,12 @@ class PaperStudy:
 
     @property
     def verdicts(self) -> dict[str, int]:
-        """Number of rows by verdict."""
+        """The number of rows with each verdict."""
         return {verdict.value: sum(row.verdict is verdict for row in self.rows) for verdict in Verdict}
 
     @property
     def recording_error_m(self) -> float | None:
-        """Largest distance in m of the recorded head from the head of the report's run."""
+        """Largest distance [m] between the head in the recording and in the run of the report."""
         if self.recording is None:
             return None
         apart = self.recording.q[:, :2] - self.runs.case.q[:, :2]
@@ -66,7 +66,7 @@ class PaperStudy:
 def compare(
     scene: Scene, t_end: float, workers: int | None = None, on_progress: OnProgress = lambda share: None
 ) -> PaperStudy:
-    """Compute the whole comparison without a file; arguments and errors are those of `run_all`."""
+    """Compute the comparison without writing files. Arguments and errors are those of `run_all`."""
     begin = time.perf_counter()
     runs = run_all(scene, t_end, workers, on_progress)
     rotation = [] if runs.rotation is None else rotation_rows(runs.rotation)
@@ -83,15 +83,16 @@ def study_paper(
     recording: bool = True,
     on_progress: OnProgress = lambda share: None,
 ) -> PaperStudy:
-    """Compare a scene with the paper and leave report.html, table.json, table.csv, figures/, run/ and run.rrd in
-    `out`.
+    """Compare a scene with the paper, and write a report into the folder `out`.
+
+    The files are report.html, table.json, table.csv, figures/, run/ and run.rrd.
 
     Raises
     ------
     SceneError, SolverError
-        As in `run_all`.
+        The errors of `run_all`.
     ModuleNotFoundError
-        One of the extras `study`, `record`, `view` is not installed (the last two with `recording`).
+        One of the extras `study`, `record` and `view` is not installed. The last two are needed only with `recording`.
     OSError
         A file cannot be written.
     """

@@ -1,4 +1,4 @@
-"""Style of the report's figures, with colours for colour-blind readers too (Okabe and Ito)."""
+"""Style of the report's figures. The colours can be distinguished by colour-blind readers (Okabe and Ito)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _DPI: Final = 130
 
 @contextmanager
 def sheet(width: float, height: float) -> Iterator[Figure]:
-    """Yield an empty figure of a size [inch] in the report's style."""
+    """Yield an empty figure of the given size [inch] in the style of the report."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -48,7 +48,7 @@ def sheet(width: float, height: float) -> Iterator[Figure]:
 
 
 def save(figure: Figure, path: Path, heading: str, scene: str) -> None:
-    """Write a figure as PNG, with heading, scene and date above its own title."""
+    """Write a figure as PNG. Heading, scene and date are added above its title."""
     title = f"{heading}; scene {scene}, {datetime.now(UTC):%Y-%m-%d}"
     figure.suptitle("\n".join(filter(None, (title, figure.get_suptitle()))), fontsize=10)
     with whole_file(path) as stream:

@@ -1,7 +1,12 @@
-"""The paper's published values with their place in the text. In the terms of scenes, their mark is `given`.
+"""Published values of the paper, each with its place in the text. In scenes, their mark is `given`.
 
-Source: Mao, Zhang et al., "Dynamic characteristics of plough head under contact-impact with clearances", J. Vibration
-and Shock 34(19), 2015. Only its text describes the curves. The criteria of agreement at the end are ours.
+The curves are known only from the text of the paper. The criteria of agreement at the end of this module are not from
+the paper.
+
+References
+----------
+Mao, Zhang et al. (2015), Dynamic characteristics of plough head under contact-impact with clearances, J. Vibration and
+Shock 34(19).
 """
 
 from __future__ import annotations
@@ -15,15 +20,15 @@ SENSE_NAMES: Final[dict[Sense, str]] = {"ccw": "counter-clockwise", "cw": "clock
 CORNERS: Final = ("a", "b", "c", "d")
 FACES: Final = ("top", "right", "bottom", "left")
 
-#: Clearance of Figs 6 to 9 (section 3): horizontal, vertical [m].
+#: Clearances of Figs 6 to 9 (section 3): horizontal and vertical [m].
 CASE_M: Final = (0.025, 0.030)
-#: Fixed clearance of Figs 10 and 11 (section 4) [m].
+#: Clearance that is fixed in each of Figs 10 and 11 (section 4) [m].
 FIXED_M: Final = 0.020
-#: Values of the other clearance in Figs 10 and 11 [m].
+#: Values of the clearance that varies in Figs 10 and 11 [m].
 GRID_M: Final = (0.020, 0.0225, 0.025, 0.0275, 0.030)
-#: Values of both clearances in Figs 14 and 15, section 5 [m].
+#: Values of the clearance that varies in Figs 14 and 15 (section 5) [m].
 FACE_GRID_M: Final = (0.020, 0.025, 0.030)
-#: Length of the simulation of Figs 14 and 15 [s].
+#: Length of the simulations of Figs 14 and 15 [s].
 FACE_T_END_S: Final = 20.0
 OMEGA_RAD_S: Final = 2.0
 PERIOD_S: Final = 2.0 * math.pi / OMEGA_RAD_S
@@ -31,7 +36,7 @@ PERIOD_S: Final = 2.0 * math.pi / OMEGA_RAD_S
 
 @dataclass(frozen=True)
 class Force:
-    """A published force, the largest of its kind over the four points, and its point."""
+    """A published force: the largest of its kind at the four points, and the point where it occurs."""
 
     sense: Sense
     statistic: Literal["max", "mean_in_contact"]
@@ -70,7 +75,7 @@ MOMENTS: Final = (
 
 @dataclass(frozen=True)
 class FaceMark:
-    """A mark in Fig. 13 (section 5): `faces` inner faces touch at once in a sense."""
+    """A mark in Fig. 13 (section 5): the number of inner faces that touch at the same time in a direction of swing."""
 
     number: int
     sense: Sense
@@ -79,12 +84,12 @@ class FaceMark:
 
 FACE_MARKS: Final = (FaceMark(1, "ccw", 1), FaceMark(2, "cw", 2), FaceMark(3, "cw", 3))
 
-#: Largest relative difference of a force that agrees.
+#: Largest relative difference between a computed and a published force that agree.
 FORCE_TOLERANCE: Final = 0.05
-#: Shortest time of a contact set without a break [s] that counts as its occurrence.
+#: Shortest uninterrupted duration of a contact set [s] for which the set counts as observed.
 SHORTEST_HOLD_S: Final = 5e-3
-#: Smallest step against a trend that counts, as a share of the curve's largest value; a printed curve shows no smaller
-#: one.
+#: Smallest step against a trend that counts, as a share of the curve's largest value. Smaller steps are not visible in
+#: a printed curve.
 TREND_SLACK: Final = 0.005
-#: Largest share of the contact time of a set that counts as rare.
+#: Largest share of the contact time of a set that is rare.
 RARE_SHARE: Final = 0.10
