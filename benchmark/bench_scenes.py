@@ -1,4 +1,4 @@
-"""The two bench scenes, their reference trajectories, and their constants for solvers that cannot read a `Scene`."""
+"""The two bench scenes, their reference trajectories, and their constants for solvers without a `Scene` class."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from plow_twin.model.geometry import half_diagonal
 from plow_twin.scene_file import load_scene
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Folder of a reference on a 1 ms grid, outside the project and used only if it exists.
+#: Folder with references on a 1 ms grid. It is outside the repository and is used only if it exists.
 FINE_REFERENCE = ROOT.parent / "shared" / "reference"
 NAMES = ("kv", "hc")
 T_END = 20.0
-#: Intervals between rows of the two output grids [s].
+#: Intervals [s] between rows of the two output grids.
 SPARSE, DENSE = 0.1, 1e-3
 
 
@@ -25,13 +25,13 @@ def bench_scene(name: str) -> Scene:
 
 
 def error_scale(scene: Scene) -> tuple[float, float, float]:
-    """Return the scales of the errors of x, y and theta: gx, gy, and gx divided by the half diagonal."""
+    """Return the scales of the errors of x, y and theta: gx, gy, and gx divided by half the diagonal."""
     gx, gy = scene.clearance.horizontal_m, scene.clearance.vertical_m
     return gx, gy, gx / half_diagonal(scene)
 
 
 def reference_poses(name: str) -> tuple[Array, float]:
-    """Return the reference poses (n, 3) over 20 s and their interval in s."""
+    """Return the reference poses over 20 s, shape (n, 3), and the interval between them [s]."""
     fine = FINE_REFERENCE / f"bench_{name}.npz"
     path, dt = (fine, 1e-3) if fine.exists() else (ROOT / "test" / "data" / f"bench_{name}.npz", 1e-2)
     with np.load(path) as archive:
@@ -39,7 +39,7 @@ def reference_poses(name: str) -> tuple[Array, float]:
 
 
 def on_grid(name: str, output_dt: float) -> tuple[Array, int]:
-    """Return reference poses on a grid that the output contains, and the number of output rows per grid row."""
+    """Return the reference poses at the times that an output contains too, and the number of output rows per pose."""
     q, dt = reference_poses(name)
     if dt <= output_dt:
         return q[:: round(output_dt / dt)], 1
@@ -47,9 +47,10 @@ def on_grid(name: str, output_dt: float) -> tuple[Array, int]:
 
 
 def constants(scene: Scene) -> Array:
-    """Return the 15 constants of a bench scene, whose load must be one harmonic in phase with sin.
+    """Return the 15 constants of a bench scene: width, height, gx, gy, mass, inertia, gravity, arm, K, exponent, C or
+    lambda, Fx, Fy, M, omega.
 
-    They are width, height, gx, gy, mass, inertia, gravity, arm, K, exponent, C or lambda, Fx, Fy, M, omega.
+    The load of the scene must be a single harmonic with phase 0.
     """
     if len(scene.loads) != 1 or not isinstance(scene.loads[0], Harmonic) or scene.loads[0].phase_rad != 0.0:
         raise ValueError(f"loads: got {scene.loads!r}, expected one Harmonic without phase")

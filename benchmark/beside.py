@@ -1,10 +1,10 @@
-"""Compare this checkout with an earlier commit: two processes, one for each, do the same work in turn.
+"""Compare the speed of this checkout with an earlier commit.
 
     python benchmark/beside.py COMMIT [--rounds 5]
 
-Each round starts a process in a worktree of the commit and a process in this checkout. A process warms up, repeats each
-case and reports its fastest time. The medians over the rounds and their ratio are written to
-benchmark/results/beside.md.
+Each round runs the same work in two processes: one in a worktree of the commit, and one in this checkout. A process
+warms up, repeats each case, and reports the shortest time of the case. The medians over all rounds and their ratio are
+written to benchmark/results/beside.md.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import cases
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "benchmark" / "results" / "beside.md"
-#: Work of a process: the runs of README, with features that both commits have.
+#: Program of a process: the cases of the README that both commits support.
 _WORK = """
 import json, sys, time
 import numpy as np
@@ -61,7 +61,7 @@ print(json.dumps(found))
 
 
 def measure(tree: Path, cache: str) -> dict[str, float]:
-    """Return the time of each case in s, measured in a process of its own."""
+    """Return the time [s] of each case, measured in a separate process."""
     environment = os.environ | {"PYTHONPATH": str(tree), "NUMBA_CACHE_DIR": cache}
     done = subprocess.run(
         [sys.executable, "-c", _WORK, str(tree)], cwd=tree, env=environment, capture_output=True, text=True, check=True
@@ -94,7 +94,7 @@ def main() -> None:
             for number in range(chosen.rounds):
                 print(f"round {number + 1} of {chosen.rounds}", file=sys.stderr)
                 both = (before, tree, "before"), (now, ROOT, "now")
-                # the second process of a round runs on a warmer machine
+                # the second process of a round runs on a warmer machine, so the order alternates
                 for times, place, cache in both if number % 2 == 0 else reversed(both):
                     times.append(measure(place, f"{folder}/{cache}"))
         finally:

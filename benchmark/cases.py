@@ -1,4 +1,4 @@
-"""Measurement of cases in turn, and the rows of the table."""
+"""Measurement of cases in alternating order, and the rows of the result table."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sample:
-    """Result of one run; the poses have shape (rows, 3)."""
+    """Result of one run; `q` contains the poses, shape (rows, 3)."""
 
     wall_s: float
     q: Array | None = None
@@ -32,7 +32,7 @@ class Sample:
 
 @dataclass
 class Row:
-    """One line of the table, with the median and the least time of `runs` runs in ms; cells may be empty."""
+    """One row of the result table: the median and the shortest time of `runs` runs [ms], and other figures or None."""
 
     section: str
     scene: str
@@ -47,17 +47,17 @@ class Row:
     steps: int | None = None
     evaluations: int | None = None
     events: int | None = None
-    #: figure of the section: members beyond the listed error, multiple of real time, share of a core, error in
-    #: tolerances, ratio of times, or number of compiled kernels
+    #: Figure that is specific to the section: members beyond the listed error, multiple of real time, share of a core,
+    #: error in tolerances, ratio of times, or number of compiled kernels.
     value: float | None = None
-    #: factor by which a small displacement at t = 0 grows, in the random scenes and the ensemble
+    #: Factor by which a small displacement at t = 0 grows, for random scenes and the ensemble.
     amplification: float | None = None
     status: str = "ok"
 
 
 @dataclass
 class Case:
-    """A row to be measured. `prepare` builds and compiles the work, and returns the function that is timed."""
+    """A row to be measured. `prepare` builds and compiles the work, and returns the function to be timed."""
 
     row: Row
     prepare: Callable[[], Callable[[], Sample]]
@@ -65,11 +65,11 @@ class Case:
     samples: list[Sample] = field(default_factory=list)
 
 
-#: A case is repeated until its runs have taken this time together.
+#: A case is repeated until the sum of its run times reaches this value [s].
 TIME_PER_CASE_S = 1.0
-#: A first run shorter than this is a warm-up and does not count.
+#: A first run that is shorter than this [s] is a warm-up and is not counted.
 WARM_UP_BELOW_S = 0.05
-#: Cases with a shorter first run are repeated even if they were not chosen.
+#: Cases with a first run shorter than this [s] are repeated even if they were not chosen.
 SHORT_S = 0.02
 Choose = Callable[[Sequence[Row]], set[int]]
 
@@ -77,10 +77,10 @@ Choose = Callable[[Sequence[Row]], set[int]]
 def measure(
     cases: Sequence[Case], repeats: int, advance: Callable[[str], None], choose: Choose | None = None
 ) -> list[Row]:
-    """Run every case once, then the chosen cases in turn, up to `repeats` runs each.
+    """Run all cases once, then run the chosen cases in alternating order, up to `repeats` times each.
 
-    Turns spread a change of the machine's speed over all cases. `choose` returns the indices of the cases on which a
-    figure depends; without it, all cases are chosen.
+    In alternating order, a change of the machine's speed affects all cases. `choose` returns the indices of the cases
+    that determine a figure. Without `choose`, all cases are chosen.
     """
     rows = [case.row for case in cases]
     ready: dict[int, Callable[[], Sample]] = {}
@@ -126,14 +126,17 @@ def _summarise(case: Case) -> None:
 
 
 def timed(function: Callable[[], Any]) -> tuple[float, Any]:
-    """Return the time of a call in s, and its result."""
+    """Return the duration [s] of a call, and its result."""
     begin = time.perf_counter()
     result = function()
     return time.perf_counter() - begin, result
 
 
 def pose_error(reference: Array, scale: Sequence[float]) -> Callable[[Array], float]:
-    """Return a function for the largest |q - reference| / `scale` (3,), which is infinite if q is not comparable."""
+    """Return a function of poses q that computes the largest |q - reference| / `scale`, with `scale` of shape (3,).
+
+    The function returns infinity if q has another shape or is not finite.
+    """
 
     def error(q: Array) -> float:
         if q.shape != reference.shape or not np.isfinite(q).all():
@@ -179,7 +182,7 @@ def _text(value: Any) -> str:
 
 
 def machine_name() -> str:
-    """Return a name made of the CPU's model and the number of cores."""
+    """Return a name of this machine: the CPU model and the number of cores."""
     facts: dict[str, str] = {}
     try:
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0].splitlines():
@@ -188,6 +191,6 @@ def machine_name() -> str:
     except OSError:
         pass
     name = facts.get("model name", "unknown cpu")
-    # virtual machines often hide the number of the model
+    # virtual machines often hide the model number of the CPU
     known = name if re.search(r"\d", name) else f"{name} f{facts.get('cpu family', 0)}m{facts.get('model', 0)}"
     return re.sub(r"[^a-z0-9]+", "_", f"{known} {os.cpu_count()}core".lower()).strip("_")

@@ -1,7 +1,7 @@
-"""Largest memory of the commands that read a recording: `python benchmark/command_memory.py [MINUTES ...]`.
+"""Peak memory of the commands that read a recording: `python benchmark/command_memory.py [MINUTES ...]`.
 
-The paper's head with wear is recorded at 1 kHz in a temporary folder, with a measured pose at 100 Hz. Then each command
-runs in a process. One line of JSON is printed for each command and length.
+The program records the paper's head with wear at 1 kHz, with a measured pose at 100 Hz, in a temporary folder. Then it
+runs each command in a separate process. It prints one line of JSON for each command and length of the recording.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from plow_twin.scene_file.presets import scene_path
 from plow_twin.solve.state import ROW
 
 _BATCH = 8192
-#: Standard deviation of the measured pose: x, y [m], theta [rad].
+#: Standard deviations of the measured pose: x, y [m], theta [rad].
 _NOISE = (2e-5, 2e-5, 2e-5)
 COMMANDS = {
     "view --png": ("view", "run", "--png", "picture.png"),
@@ -38,7 +38,7 @@ COMMANDS = {
 
 
 def write_poses(path: Path, load: Path, count: int) -> None:
-    """Write each tenth pose of the motion under a load, with noise."""
+    """Write every tenth pose of the motion under a load, with noise."""
     twin, rng = Twin(load_scene(scene_path("paper")), excitation="sampled"), np.random.default_rng(1)
     rows = np.zeros(_BATCH, ROW)
     with load.open() as loads, path.open("w") as file:
@@ -55,7 +55,7 @@ def write_poses(path: Path, load: Path, count: int) -> None:
 
 
 def run(folder: Path, *words: str) -> tuple[float, float]:
-    """Run a command; return its largest memory [MB] and processor time [s]."""
+    """Run a command. Return its peak memory [MB] and processor time [s]."""
     command = [sys.executable, "-m", "plow_twin", *words, "--quiet"]
     _, status, used = os.wait4(os.spawnv(os.P_NOWAIT, sys.executable, command), 0)
     if os.waitstatus_to_exitcode(status) not in (0, 3):

@@ -1,8 +1,8 @@
-"""Time and memory of `compare` over a month: `python benchmark/compare_month.py FOLDER`.
+"""Time and memory of `compare` for a month of runs: `python benchmark/compare_month.py FOLDER`.
 
-With `--hours 0.5 --rate 100 --verb analyse` it measures `analyse` over many short runs. Ten minutes are computed once,
-and each day's run repeats them with its own stamps. The memory depends on the number of windows, not on the sampling
-rate.
+With `--hours 0.5 --rate 100 --verb analyse`, the program measures `analyse` for many short runs. It computes ten
+minutes of motion once, and the run of each day repeats them with its own stamps. The memory depends on the number of
+windows, but not on the sampling rate.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _DAY_S, _SPAN_S = 86_400, 600
 
 
 def write_days(folder: Path, days: int, hours: float, rate_hz: float) -> None:
-    """Write a run for each missing day."""
+    """Write the runs of all days that are missing in the folder."""
     scene = load_scene("paper")
     count = round(_SPAN_S * rate_hz)
     stamps = np.round(1e9 / rate_hz * np.arange(count)).astype(np.int64)

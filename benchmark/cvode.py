@@ -1,4 +1,4 @@
-"""CVODE, called from C by the program `cvode_bench.c`, which measures its own time."""
+"""CVODE, called from C by the program `cvode_bench.c`, which measures its own run time."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def version() -> str:
 
 
 def prepare(p: Array, law: str, method: str, roots: bool, rtol: float, output_dt: float) -> Callable[[], Sample]:
-    """Prepare one setting; each call starts a process, which measures its own time."""
+    """Prepare one setting. Each call of the result starts a process that measures its own time."""
     executable = program()
     numbers = " ".join(repr(float(number)) for number in p)
 

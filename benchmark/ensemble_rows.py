@@ -1,4 +1,4 @@
-"""Runs of many clearance pairs at once, compared with our own run at the tightest tolerance."""
+"""Ensembles with many pairs of clearances, compared with runs of our solver at the tightest tolerance."""
 
 from __future__ import annotations
 
@@ -22,13 +22,15 @@ LANES_SECTION = "ensemble_hc"
 BATCH = f"{HEYOKA}, batch"
 COLUMNS, ROWS = 40, 25
 PAIRS = f"kv, {COLUMNS * ROWS} clearance pairs"
-#: Tolerances from loose to tight; the first at which every pair is within `LISTED` is timed repeatedly.
+#: Tolerances from loose to tight. The first tolerance at which all pairs have an error below `LISTED` is timed
+#: repeatedly.
 TOLERANCES = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6)
 _BATCH_TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 EXACT = 1e-12
-#: Error in clearances beyond which a pair is listed.
+#: Error, relative to the clearance, above which a pair is listed.
 LISTED = 1e-4
-#: Displacement at t = 0 in clearances, much larger than rounding, whose growth is the amplification.
+#: Displacement at t = 0, relative to the clearance. It is much larger than rounding errors; its growth is the
+#: amplification.
 PERTURBATION = 1e-8
 
 
@@ -42,9 +44,10 @@ def clearance_pairs(columns: int, rows: int, name: str = "kv") -> list[Scene]:
 
 
 def ensemble_rows(columns: int, rows: int, lean_steps: Sequence[float], repeats: int, notify: Notify) -> Iterator[Row]:
-    """Yield rows for tolerances down to the one that all pairs need, then rows of the peers and of the listed pairs.
+    """Yield rows for tolerances down to the first that is tight enough for all pairs, then rows of peers and listed
+    pairs.
 
-    The peers run only with `lean_steps`.
+    The peers are run only if `lean_steps` are given.
     """
     scenes = clearance_pairs(columns, rows)
     name = f"kv, {len(scenes)} clearance pairs"
@@ -72,9 +75,10 @@ def ensemble_rows(columns: int, rows: int, lean_steps: Sequence[float], repeats:
 
 
 def lanes_rows(columns: int, rows: int, repeats: int, notify: Notify) -> Iterator[Row]:
-    """Yield rows of HC pairs on one core, in lanes and by the loop of a single scene in turns.
+    """Yield rows of pairs with the HC scene on one core, computed in SIMD lanes and one by one in alternating order.
 
-    The tolerance is the first from 1e-4 on at which all pairs are within `LISTED`. The value is the ratio of the times.
+    The tolerance is the first tolerance from 1e-4 on at which all pairs have an error below `LISTED`. The value of a
+    row is the ratio of the times.
     """
     scenes = clearance_pairs(columns, rows, "hc")
     name = f"hc, {len(scenes)} clearance pairs"
@@ -104,13 +108,13 @@ def lanes_rows(columns: int, rows: int, repeats: int, notify: Notify) -> Iterato
 
 
 def core_row(rows: Sequence[Row]) -> Row | None:
-    """Return the last row of one core, which is at the tolerance that all pairs need."""
+    """Return the row of one core at the tolerance that all pairs need."""
     own = [row for row in rows if row.section == SECTION and row.solver == OURS and row.setting.endswith(", threads=1")]
     return own[-1] if own else None
 
 
 def batch_row(rows: Sequence[Row]) -> Row | None:
-    """Return the row of heyoka in batches at the tolerance that all pairs need, if there is one."""
+    """Return the row of heyoka in batches at the tolerance that all pairs need, or None."""
     found = [row for row in rows if row.section == SECTION and row.solver == BATCH and row.error is not None]
     return next((row for row in found if (row.error or 0.0) <= LISTED), None)
 
@@ -135,7 +139,7 @@ def _member_errors(scenes: Sequence[Scene], q: Array, exact: Array) -> Array:
 
 
 def _amplification(scenes: Sequence[Scene], exact: Array) -> Array:
-    """Return the larger growth of a displacement along x and of one along theta."""
+    """Return the growth of a displacement along x or theta, whichever is larger."""
     growth = np.zeros(len(scenes))
     for axis in (0, 2):
         moved = []

@@ -1,13 +1,13 @@
-"""Errors, coverage, widths and flags of the estimate on fresh synthetic truths, for each group of truths.
+"""Errors, coverage, interval widths and flags of the estimate for synthetic truths that were not used for tuning.
 
-The errors are compared with those of the range of motion, the simplest estimate of a clearance.
+The errors are compared with the errors of the range of motion, the simplest estimate of a clearance.
 
     python benchmark/estimate.py --truths 50 --seed 5000          # all groups
     python benchmark/estimate.py --group plain --group hard --truths 20
 
-Each truth is written as soon as it is done, and truths in the file are not run again, so that a long benchmark can be
-stopped and continued. The thresholds of `plow_twin/estimate/tuning.py` were set on other seeds. `tools/pages.py` makes
-the table of the pages from the seeds in `estimate_pages.TRUTHS`.
+Each result is written as soon as it is computed, and truths that are in the file are skipped. A long benchmark can thus
+be stopped and continued. The thresholds of `plow_twin/estimate/tuning.py` were set with other seeds. `tools/pages.py`
+makes the tables of the pages from the seeds in `estimate_pages.TRUTHS`.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ RESULTS = Path(__file__).resolve().parent / "results"
 
 
 def run_one(name: str, seed: int, periods: float | None = None) -> dict[str, Any]:
-    """Run the estimate on one truth, and return its errors as a row."""
+    """Run the estimate on one truth. Return its errors as a row."""
     group = GROUPS[name]
     try:
         truth = draw(group if periods is None else type(group)(**{**vars(group), "periods": periods}), seed)
-    except SolverError as error:  # the head has passed through a wall, which no real machine does
+    except SolverError as error:  # the head has passed through a wall, which is impossible in a real machine
         return {"group": name, "seed": seed, "not_drawn": str(error)}
     begin = time.process_time()
     result = estimate(truth.nominal, truth.load, truth.poses, forces=truth.forces)
@@ -64,7 +64,7 @@ def run_one(name: str, seed: int, periods: float | None = None) -> dict[str, Any
 
 
 def summary(name: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the figures of a group; errors and coverage are those of the estimates that were not withdrawn."""
+    """Return the figures of a group. Withdrawn estimates are not used for errors and coverage."""
     out: dict[str, Any] = {"group": name, "truths": len(rows)}
     expected = GROUPS[name]
     out["as_expected"] = np.mean([(row["model"], row["sensor"]) == (expected.model, expected.sensor) for row in rows])
@@ -91,7 +91,7 @@ def summary(name: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def as_markdown(groups: Sequence[dict[str, Any]]) -> str:
-    """Return the table of the page."""
+    """Return the results as a Markdown table."""
     lines = [
         "| group | truths | RMSE gx, gy [mm] | coverage gx, gy | median width [mm] | flagged as it should be | "
         "range of motion [mm] | CPU [s] |",
@@ -113,7 +113,7 @@ def as_markdown(groups: Sequence[dict[str, Any]]) -> str:
 
 
 def load_rows(path: Path) -> list[dict[str, Any]]:
-    """Return the rows of a file with numbers converted, or an empty list if there is no file."""
+    """Return the rows of a JSON lines file, or an empty list if the file does not exist."""
     if not path.exists():
         return []
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
@@ -126,13 +126,13 @@ def load_rows(path: Path) -> list[dict[str, Any]]:
 @click.option("--periods", type=float, help="Load periods of data; the group's by default.")
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "estimate.jsonl", show_default=True)
 def main(groups: tuple[str, ...], truths: int, seed: int, periods: float | None, out: Path) -> None:
-    """Run the groups and write one line of JSON for each truth."""
+    """Run the groups, and write one line of JSON for each truth."""
     warm_up(draw(type(GROUPS["plain"])("start", periods=1.0), 0).nominal)
     rows = load_rows(out)
     done = {(row["group"], row["seed"]) for row in rows}
     names = groups or tuple(GROUPS)
     seeds = range(seed, seed + truths)
-    # the groups take turns, so that a run that is stopped early leaves groups of equal size
+    # the groups alternate, so that a run that is stopped early has groups of equal size
     for number in seeds:
         for name in names:
             if (name, number) not in done:

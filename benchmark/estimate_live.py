@@ -2,8 +2,9 @@
 
     python benchmark/estimate_live.py
 
-The load has samples at 1 kHz and is harmonic, harmonic with 1 % of white noise, or random in each sample. As in the
-node, the first window is estimated without a starting value, each later window from the previous estimate.
+Three loads are sampled at 1 kHz: a harmonic load, a harmonic load with 1 % of white noise, and a load that is random in
+each sample. As in the node, the first window is estimated without a starting value. Each later window starts from the
+previous estimate.
 """
 
 from __future__ import annotations

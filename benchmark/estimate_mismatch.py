@@ -1,11 +1,11 @@
-"""The estimate on machines that differ from the model: its errors, its coverage, and how often it gives a result.
+"""Errors and coverage of the estimate for machines that differ from the model, and the share of usable results.
 
     python benchmark/estimate_mismatch.py --truths 8 --seed 80000              # all kinds
     python benchmark/estimate_mismatch.py --kind friction_05 --truths 4
 
-Each kind of machine differs mildly in one respect; the kind `several` differs in most respects. The truth is simulated
-by `mismatched_machine.py`, which has its own equations and integrator. Each truth is written as soon as it is done, and
-truths in the file are not run again.
+Each kind of machine differs from the model in one respect; machines of the kind `several` differ in most respects. The
+true motion is simulated by `mismatched_machine.py`, which has its own equations and integrator. Each result is written
+as soon as it is computed, and truths that are in the file are skipped.
 """
 
 from __future__ import annotations
@@ -37,48 +37,50 @@ from plow_twin.scene_file import load_scene
 
 Array = NDArray[np.float64]
 
-#: Interval of the samples of the true load in s.
+#: Sampling interval of the true load [s].
 _FINE = 1e-3
-#: Penetration in m at which contacts of different exponents have the same force.
+#: Penetration [m] at which contacts with different exponents have equal forces.
 _COMMON_DEPTH = 8e-3
-#: If a component of the pose (rad or m) exceeds this, the head has passed through a wall.
+#: Largest plausible component of a pose (m or rad). A larger component shows that the head has passed through a wall.
 _LARGEST_TURN = 0.6
-#: States in which an estimated clearance is published.
+#: States of a clearance for which the estimate is published.
 PUBLISHED = {"estimated", "rough"}
-#: A published clearance is useful if its interval is narrower than this.
+#: A published clearance is useful if its interval is narrower than this [m].
 USEFUL_M = 4e-3
 
 
 @dataclass(frozen=True)
 class Kind:
-    """Differences of a machine from the model. A share or size that gets a random sign is a standard deviation."""
+    """Differences between a machine and the model. If the sign of a share or size is random, the number is a standard
+    deviation.
+    """
 
     title: str
     stiffness: tuple[float, float] = (5e6, 3e7)
     periods: float = 10.0
     noise_m: float = 5e-4
     rate_hz: float = 100.0
-    #: shape of the given load: paper, cutting (paper with a broad-band part), pressed, chatter, vertical
+    #: Shape of the given load: paper, cutting (paper with a broad-band part), pressed, chatter or vertical.
     shape: str = "paper"
     gain: float = 0.05
-    #: correlated error of the load, as a share of each component's range
+    #: Correlated error of the load, as a share of the range of each component.
     correlated: float = 0.0
-    #: third harmonic that is an error of the load, as a share of each component's range
+    #: Third harmonic in the error of the load, as a share of the range of each component.
     harmonic: float = 0.0
-    #: constant error of the load, as a share of each component's range
+    #: Constant error of the load, as a share of the range of each component.
     constant: float = 0.0
-    #: if positive, the given load consists of averages over this many seconds
+    #: Length [s] of the averages in the given load; 0 for samples.
     averaged_s: float = 0.0
-    #: if `averaged_s` is 0, the given load consists of samples at this interval in seconds
+    #: Interval [s] of the samples in the given load, if `averaged_s` is 0.
     sampled_s: float = 0.01
     friction: float = 0.0
     exponent: float = 1.0
     walls: float = 0.0
-    #: excess of the true over the assumed mass, as a share
+    #: Relative difference between the true and the assumed mass.
     mass: float = 0.0
-    #: excess of the true over the assumed inertia, as a share
+    #: Relative difference between the true and the assumed inertia.
     inertia: float = 0.0
-    #: excess of the true over the assumed frame size, in m
+    #: Difference [m] between the true and the assumed frame size.
     frame_m: float = 0.0
     spring: float = 0.0
     radius_m: float = 0.0
@@ -89,15 +91,15 @@ class Kind:
     theta_missing: bool = False
     theta_scale: float = 0.0
     clock: float = 0.0
-    #: nothing was tuned on this difference and those below; number of bursts without poses
+    #: Number of bursts without poses. No threshold was tuned on this difference or on the following differences.
     bursts: int = 0
-    #: largest pose that the sensor shows, as a share of the motion's largest pose
+    #: Largest pose that the sensor can measure, as a share of the largest pose in the motion.
     saturated: float = 0.0
-    #: error of gravity's arm
+    #: Error of the arm of gravity [m].
     arm_m: float = 0.0
-    #: delay of the load
+    #: Delay of the load [s].
     late_s: float = 0.0
-    #: drift of the bias of x and y over the window
+    #: Drift of the bias of x and y over the window [m].
     drift_m: float = 0.0
 
 
@@ -155,7 +157,7 @@ KINDS = {
 
 @dataclass(frozen=True, eq=False)
 class Mismatch:
-    """The truth and the estimate's inputs."""
+    """A true machine and the inputs of the estimate."""
 
     scene: Scene
     nominal: Scene
@@ -164,12 +166,12 @@ class Mismatch:
 
     @property
     def clearance(self) -> Array:
-        """The true clearances in m, shape (2,)."""
+        """The true clearances [m], shape (2,)."""
         return np.array([self.scene.clearance.horizontal_m, self.scene.clearance.vertical_m])
 
 
 def draw(kind: Kind, seed: int) -> Mismatch:
-    """Draw a machine whose head stays within its walls; the same seed gives the same machine."""
+    """Draw a machine whose head stays within its walls. A seed always gives the same machine."""
     attempts = (
         _draw(kind, np.random.default_rng([20261123, seed, *again])) for again in ((), *((i,) for i in range(1, 20)))
     )
@@ -204,7 +206,7 @@ def _believed(kind: Kind, nominal: Scene, rng: np.random.Generator, t: Array) ->
     if kind.shape == "cutting":
         return paper + noise * [8e3, 4e3, 1.1e4]
     if kind.shape == "pressed":
-        # this load is a steady push against one wall, plus broad-band noise
+        # a constant force against one wall, plus broad-band noise
         return noise * [8e3, 4e3, 1.1e4] + [6e4, -5e3, 2e4]
     if kind.shape == "chatter":
         turn = 2.0 * np.pi * 8.0 * t
@@ -243,7 +245,7 @@ def _true_scene(kind: Kind, nominal: Scene, rng: np.random.Generator) -> Scene:
 
 
 def _by_wall(rng: np.random.Generator) -> Array:
-    """Return -1 or 1 for each pair, equal for both pads of a wall but not for all walls."""
+    """Return a sign for each pair, shape (8,). The two pairs of a wall have equal signs; the four walls do not."""
     signs: Array = rng.permutation([-1.0, -1.0, 1.0, 1.0])
     wall = np.where(NORMAL_X != 0.0, np.where(CORNER_X > 0.0, 0, 1), np.where(CORNER_Y > 0.0, 2, 3))
     return np.asarray(signs[wall], np.float64)
@@ -309,7 +311,7 @@ def _telemetry(kind: Kind, fine: Array, believed: Array) -> tuple[Array, Array]:
 
 
 def run_one(name: str, seed: int) -> dict[str, Any]:
-    """Run the estimate on one machine, and return its errors as a row."""
+    """Run the estimate on one machine. Return its errors as a row."""
     truth = draw(KINDS[name], seed)
     begin = time.process_time()
     result = estimate(truth.nominal, truth.load, truth.poses)
@@ -334,7 +336,7 @@ def run_one(name: str, seed: int) -> dict[str, Any]:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Return the figures of a kind, for both clearances together."""
+    """Return the figures of a kind of machines, for both clearances together."""
     both = [
         {key: row[f"{axis}_{key}"] for key in ("error_m", "sd_m", "inside", "state")} for row in rows for axis in "hv"
     ]
@@ -357,7 +359,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
 
 
 def as_markdown(groups: dict[str, dict[str, float]]) -> str:
-    """Return the table of the page."""
+    """Return the results as a Markdown table."""
     lines = [
         "| what differs | clearances | published | interval below 4 mm | RMSE [mm] | coverage | median width [mm] | "
         "beyond 3 deviations | CPU [s] |",
@@ -377,7 +379,7 @@ def as_markdown(groups: dict[str, dict[str, float]]) -> str:
 @click.option("--seed", default=80000, show_default=True, help="First seed.")
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "estimate_mismatch.jsonl", show_default=True)
 def main(kinds: tuple[str, ...], truths: int, seed: int, out: Path) -> None:
-    """Run the kinds and write one line of JSON for each truth."""
+    """Run the kinds of machines, and write one line of JSON for each truth."""
     warm_up(load_scene(ROOT / "config" / "paper.yaml"))
     rows = load_rows(out)
     done = {(row["kind"], row["seed"]) for row in rows}

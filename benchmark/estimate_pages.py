@@ -1,6 +1,6 @@
-"""Tables of the estimate's results for the pages, from `benchmark/results/estimate.jsonl`.
+"""Tables of the pages about the estimate, from `benchmark/results/estimate.jsonl`.
 
-`TRUTHS` has the seeds of each group that were not used to set thresholds; the pages count only these truths.
+`TRUTHS` contains the seeds that were not used to set thresholds. Only these truths are counted on the pages.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scipy.stats import beta
 
 from plow_twin.estimate.result import NORMAL_P95, State
 
-#: For each group, in the order of the page: pairs of a first seed and a number of truths.
+#: Seeds of each group, in the order of the page: pairs of a first seed and a number of truths.
 TRUTHS: dict[str, tuple[tuple[int, int], ...]] = {
     "plain": ((54000, 50),),
     "sensor": ((54000, 50),),
@@ -39,9 +39,9 @@ TRUTHS: dict[str, tuple[tuple[int, int], ...]] = {
     "hard_shape": ((50000, 6),),
     "hard_kelvin_voigt": ((50000, 23), (54000, 10), (60000, 30)),
 }
-#: Truths of `plain` and `sensor` that were run by the present code: first seed and number.
+#: First seed and number of the truths of `plain` and `sensor` that were computed by the current version of the code.
 PRESENT = (54001, 8)
-#: RMSE of the clearances [mm] that is asked of each group.
+#: Target of each group for the RMSE of the clearances [mm].
 ASKED = {"plain": 0.05, "sensor": 0.06, "stochastic": 0.06, "middle": 0.05, "firm": 0.05, "hard": 0.1}
 _LEVEL = 0.95
 
@@ -55,7 +55,7 @@ def truths(group: str, seeds: Sequence[tuple[int, int]]) -> list[dict[str, Any]]
 
 
 def right_models() -> str:
-    """Return the table of errors and coverage for the truths that the model describes."""
+    """Return the table of errors and coverage for the truths to which the model applies."""
     lines = [
         "| group | truths | RMSE gx, gy [mm] | target | estimated gx, gy | 90 % interval contains gx | gy | "
         "median width [mm] | flagged | range of motion [mm] | CPU [s], most |",
@@ -82,14 +82,14 @@ def right_models() -> str:
 
 
 def narrowed(text: str, keep: Sequence[int]) -> list[list[str]]:
-    """Return the cells of some columns of a Markdown table, beginning with the head, without the bounds in brackets."""
+    """Return the given columns of a Markdown table as cells, beginning with the header, without bounds in brackets."""
     lines = [line for line in text.splitlines() if line.startswith("| ") and "---" not in line]
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     return [[row[column].partition(" (")[0] for column in keep] for row in rows]
 
 
 def right_sum() -> str:
-    """Return a table of the groups with an error target, without widths, bounds and cost, and the flagged truths."""
+    """Return the short table of all groups with an error target, and the number of truths that are flagged."""
     text = right_models()
     head, *rows = narrowed(text, (0, 1, 2, 3, 5, 6))
     lines = ["| " + " | ".join(row) + " |" for row in (head, *(row for row in rows if row[3]))]
@@ -97,7 +97,7 @@ def right_sum() -> str:
 
 
 def right_now() -> str:
-    """Return a sentence on the truths that were run by the present code."""
+    """Return a sentence about the truths that were computed by the current version of the code."""
     rows = [row for group in ("plain", "sensor") for row in truths(group, [PRESENT])]
     error, deviation, inside = (
         np.array([row[f"{axis}_{key}"] for row in rows for axis in "hv"]) for key in ("error_m", "sd_m", "inside")
@@ -110,7 +110,7 @@ def right_now() -> str:
 
 
 def wrong_models() -> str:
-    """Return the table of how often each deviation from the model is flagged."""
+    """Return the table of the shares of truths that are flagged, by deviation from the model."""
     lines = ["| deviation of the truth from the model | truths | flagged | share, 95 % interval |", "|---|---|---|---|"]
     for group, seeds in TRUTHS.items():
         if (GROUPS[group].model, GROUPS[group].sensor) != ("ok", "ok"):
@@ -121,7 +121,7 @@ def wrong_models() -> str:
 
 
 def wrong_sum() -> str:
-    """Return a sentence on how many truths outside the model are flagged, for soft and for hard contacts."""
+    """Return a sentence about the truths outside the model that are flagged, for soft and for hard contacts."""
     names = [name for name in TRUTHS if (GROUPS[name].model, GROUPS[name].sensor) != ("ok", "ok")]
     hard = "hard_kelvin_voigt"
     soft = [_flagged(row) for name in names if name != hard for row in truths(name, TRUTHS[name])]
@@ -169,7 +169,7 @@ def mismatch() -> str:
 
 
 def mismatch_sum() -> str:
-    """Return only the rows of `mismatch` for all machines and for machines without a difference."""
+    """Return the two rows of `mismatch` for all machines and for machines without a difference."""
     head, line, *rows = mismatch().splitlines()
     return "\n".join([head, line, *rows[:2]])
 
@@ -191,7 +191,7 @@ def filter_table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def filters() -> str:
-    """Return the table of the two filters on the estimate's truths."""
+    """Return the table of the two filters for the truths of the estimate."""
     return filter_table(load_rows(RESULTS / "filter_peers.jsonl"))
 
 

@@ -1,7 +1,7 @@
-"""Synthetic truths for the estimate: a scene, its motion, and the readings of a sensor and a load telemetry.
+"""Synthetic truths for the estimate: a scene, its motion, and measurements by a sensor and load telemetry.
 
-The truth is simulated with another tolerance and load sampling than the estimate's. In the groups outside the model its
-law, load shape, sensor or machine differs from the estimate's assumptions.
+The true motion is simulated with a tolerance and load samples that differ from those of the estimate. In the groups
+outside the model, the contact law, load shape, sensor or machine contradicts the assumptions of the estimate.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from plow_twin.stream.outputs import clearances
 Array = NDArray[np.float64]
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Load period of the paper's scene in s.
+#: Load period of the paper's scene [s].
 PERIOD = np.pi
-#: Interval of the samples of the true load in s.
+#: Sampling interval of the true load [s].
 _FINE = 1e-3
 #: Share of the window after which a shift, a jam or a fault of the sensor begins.
 _FROM = 0.55
@@ -34,7 +34,7 @@ _FROM = 0.55
 
 @dataclass(frozen=True)
 class Group:
-    """Parameters by which the truths of a group are drawn."""
+    """Parameters from which the truths of a group are drawn."""
 
     title: str
     noise_m: float = 5e-4
@@ -56,21 +56,21 @@ class Group:
     shift_m: float = 0.0
     stuck: bool = False
     noisier: float = 1.0
-    #: scale factors of the sensor for x, y and theta: the measured value divided by the true value
+    #: Ratio of the measured to the true value of x, y and theta.
     sensor_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    #: wear coefficient of the truth; the estimate assumes no wear
+    #: Wear coefficient of the truth [m^2/N]. The estimate assumes no wear.
     wear_m2_n: float = 0.0
-    #: sampling rate of the load cells, which measure at all pairs
+    #: Sampling rate [Hz] of the load cells at all pairs; 0 without load cells.
     forces_hz: float = 0.0
-    #: noise of the load cells
+    #: Standard deviation of the noise of the load cells [N].
     forces_noise_n: float = 1e3
-    #: standard deviation of each load cell's gain
+    #: Standard deviation of the gain error of each load cell.
     forces_gain: float = 0.05
-    #: largest delay of the load cells
+    #: Largest delay of the load cells [s].
     forces_delay_s: float = 0.05
-    #: expected verdict on the model
+    #: Expected verdict on the model.
     model: str = "ok"
-    #: expected verdict on the sensor
+    #: Expected verdict on the sensor.
     sensor: str = "ok"
 
 
@@ -122,7 +122,8 @@ GROUPS = {
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The truth and the estimate's inputs; `clearance`, shape (2,), is at the end of the window, in m."""
+    """A truth and the inputs of the estimate. `clearance`, shape (2,), is the clearance at the end of the window [m].
+    """
 
     group: Group
     scene: Scene
@@ -152,7 +153,7 @@ class Truth:
 
 
 def draw(group: Group, seed: int) -> Truth:
-    """Draw a truth; the same seed gives the same truth."""
+    """Draw a truth. A seed always gives the same truth."""
     rng = np.random.default_rng([20261121, seed])
     nominal = load_scene(ROOT / "config" / "paper.yaml")
     end = group.periods * PERIOD
@@ -193,14 +194,14 @@ def _contact(group: Group, rng: np.random.Generator) -> Contact:
     stiffness = float(np.exp(rng.uniform(low, high)))
     damping = 0.72 * float(np.exp(rng.normal(0.0, 0.4)))
     if group.law == "kelvin_voigt":
-        # above 3e7 N/m the damping grows with the root of the stiffness, so that hard contacts have the same damping
-        # ratio
+        # above 3e7 N/m, the damping grows with the root of the stiffness, so that the damping ratio is independent of
+        # the stiffness
         damping = 10.0 ** rng.uniform(4.5, 5.3) * max(1.0, np.sqrt(stiffness / 3e7))
     return Contact(law=group.law, stiffness=stiffness, exponent=group.exponent, damping=damping)
 
 
 def cutting(rng: np.random.Generator, t: Array) -> Array:
-    """Return skewed broad-band noise of unit variance, shape (n, 3), from white noise behind a low pass of 20 Hz."""
+    """Return skewed broad-band noise of unit variance, shape (n, 3): white noise after a low-pass filter of 20 Hz."""
     decay = np.exp(-2.0 * np.pi * 20.0 * (t[1] - t[0]))
     drive = rng.gamma(4.0, 0.5, (len(t), 3)) - 2.0
     out = np.zeros((len(t), 3))
@@ -210,7 +211,8 @@ def cutting(rng: np.random.Generator, t: Array) -> Array:
 
 
 def _motion(scene: Scene, group: Group, times: Array, end: float) -> tuple[Array, Array, Array]:
-    """Return the true poses at `times` (n, 3), the clearances at the end (2,), and the forces every `_FINE` s."""
+    """Return the true poses at `times`, shape (n, 3), the final clearances, shape (2,), and the forces every `_FINE` s.
+    """
     if not group.jam_m:
         run = simulate(scene, end, _FINE, 1e-6)
         q = np.stack([np.interp(times, run.t, column) for column in run.q.T], axis=1)
@@ -233,7 +235,7 @@ def _motion(scene: Scene, group: Group, times: Array, end: float) -> tuple[Array
 
 
 def _cells(group: Group, rng: np.random.Generator, force: Array, end: float) -> ContactForces:
-    """Return the readings of load cells from the true forces (n, 8) at intervals of `_FINE`."""
+    """Return the readings of load cells, given the true forces, shape (n, 8), at intervals of `_FINE`."""
     t = np.arange(0.0, end, 1.0 / group.forces_hz)
     late = np.maximum(t - group.forces_delay_s * rng.uniform(), 0.0)
     true = np.stack([np.interp(late, _FINE * np.arange(len(column)), column) for column in force.T], axis=1)
@@ -255,7 +257,7 @@ def _sensor(group: Group, rng: np.random.Generator, t: Array, q: Array) -> Array
 
 
 def _kept(group: Group, rng: np.random.Generator, t: Array, measured: Array) -> NDArray[np.bool_]:
-    """Return which rows arrive, and set single components of some rows to NaN in place."""
+    """Return a mask of the rows that arrive. Set single components of some rows to NaN in place."""
     keep = np.ones(len(t), dtype=bool)
     if group.gaps:
         for _ in range(4):

@@ -1,8 +1,9 @@
 """Exudyn on the bench scenes.
 
-Exudyn has no connector with this contact law. So each frame corner is a rigid-body spring-damper without stiffness, and
-its force is a *symbolic* user function (compiled, no Python in the loop) of the place and the velocity of the corner in
-head axes. The loads are symbolic user functions of time.
+Exudyn has no connector with this contact law. Therefore each corner of the frame is a rigid-body spring-damper without
+stiffness, whose force is a *symbolic* user function: it is compiled, and no Python code runs in the loop. The force
+depends on the position and the velocity of the corner in the axes of the head. The loads are symbolic user functions of
+time.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def _load_function(amplitude: float, constant: float, omega: float, esym: Any) -
 
 
 def _build(p: Array) -> tuple[Any, Any, list[Any]]:
-    sys.exudynFast = True  # type: ignore[attr-defined]  # its build without range checks
+    sys.exudynFast = True  # select the build without range checks
     import exudyn as exu
     from exudyn import itemInterface as items
     from exudyn.utilities import CreateSymbolicUserFunction
@@ -89,7 +90,9 @@ def _build(p: Array) -> tuple[Any, Any, list[Any]]:
 
 
 def prepare(p: Array, solver: str, dt: float, rtol: float | None, output_dt: float) -> Callable[[], Sample]:
-    """Prepare an explicit solver with a fixed step, or with step control to `rtol`; each run builds a new system."""
+    """Prepare an explicit solver with a fixed step or, if `rtol` is given, with step control. Each run builds a new
+    system.
+    """
 
     def run() -> Sample:
         mbs, exu, kept = _build(p)

@@ -1,4 +1,4 @@
-"""Tables of the pages, made from the files in `benchmark/results`; `tools/pages.py` writes them to the pages."""
+"""Tables of the pages, from the files in `benchmark/results`. `tools/pages.py` writes them to the pages."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from levels import OWN, PEERS, fastest
 from work_precision import OURS_BARE, OURS_CALL
 
 RESULTS = ROOT / "benchmark" / "results"
-#: File that names the machine of the newest complete run, which the pages quote.
+#: File with the name of the machine of the newest complete run, which the pages quote.
 NEWEST = RESULTS / "newest.txt"
 _PEERS = (
     "CVODE from C", "CVODE from C, rootfinding", "heyoka", "best of SciPy and scikit-sundae", "lean jitted RK4",
@@ -35,7 +35,8 @@ def solver_rows() -> list[Row]:
 
 
 def speed() -> str:
-    """Return times for 20 s of impacts at three errors, with the times of the peers as multiples."""
+    """Return a table of run times for 20 s of impacts at three errors. The times of peers are multiples of our times.
+    """
     rows = solver_rows()
     lines = []
     for level in (1e-3, 1e-6, 1e-9):
@@ -46,7 +47,7 @@ def speed() -> str:
 
 
 def located() -> str:
-    """Return times with output every 0.1 s, beside the two peers that locate every change of contact."""
+    """Return a table of run times with output every 0.1 s, with the two peers that locate each change of contact."""
     rows = solver_rows()
     lines = []
     for scene in ("kv", "hc"):
@@ -69,7 +70,7 @@ def work() -> str:
     starts = [row.wall_ms for row in rows if row.section == "start"]
     assert pairs is not None and pairs.wall_ms is not None and None not in starts
     lines = [
-        ["one live twin under samples at 1 kHz", f"{one.value:.0f} times as fast as real time"],
+        ["one live twin with load samples at 1 kHz", f"{one.value:.0f} times as fast as real time"],
         *([_many_twins(row.scene), f"{row.value:.2f} of a core"] for row in many),
         [
             "20 s of motion for 1,000 pairs of clearances, each pose within 1e-4 of the clearance",
@@ -162,7 +163,7 @@ def follow_sum() -> str:
 
 
 def siconos() -> str:
-    """Return this solver beside two references of Siconos for the slider of the literature."""
+    """Return a table that compares this solver with two references of Siconos for the slider of the literature."""
     with (RESULTS / "siconos.csv").open(newline="", encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if row["quantity"] != "largest gap function error"]
     names = [name for name in dict.fromkeys(row["reference"] for row in rows) if " against " not in name]

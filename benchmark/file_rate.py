@@ -2,7 +2,7 @@
 
     python benchmark/file_rate.py [--rows N]
 
-Prints a line of JSON for each case: the rows per second of CPU time and of elapsed time, without the start.
+The program prints a line of JSON for each case: rows per second of CPU time and of elapsed time, without the start.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ import time
 from pathlib import Path
 from typing import Final
 
-#: Number of rows of a short file, whose time is that of the start.
+#: Number of rows of a short file, in which the start dominates.
 FEW: Final = 1000
 
 
 def write_load(path: Path, rows: int) -> None:
-    """Write a load of the preset's size at 1 kHz."""
+    """Write a CSV file with a load at 1 kHz that is similar to the load of the preset."""
     with path.open("w") as file:
         file.write("t,fx,fy,m\n")
         for index in range(rows):
@@ -32,7 +32,7 @@ def write_load(path: Path, rows: int) -> None:
 
 
 def measure(path: Path, *options: str) -> tuple[float, float]:
-    """Return the CPU time and the elapsed time of a run in s."""
+    """Return the CPU time and the elapsed time of a run [s]."""
     command = [sys.executable, "-m", "plow_twin", "live", str(path), "--scene", "paper", "--quiet", *options]
     before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
     subprocess.run(command, check=True)
@@ -48,7 +48,7 @@ def main() -> None:
         few, many = Path(folder, "few.csv"), Path(folder, "many.csv")
         write_load(few, FEW)
         write_load(many, rows)
-        measure(few)  # may compile the solver
+        measure(few)  # this run may compile the solver, and is not measured
         for outputs in ("", "none", "all"):
             options = ["--set", f"record_outputs={outputs}", "--record"] if outputs else []
             start = measure(few, *options, *[f"{folder}/few_{outputs}"][: len(options)])

@@ -1,11 +1,11 @@
-"""A plain UKF and a plain EnKF (filterpy) on the data of the estimate's benchmark, beside the estimate itself.
+"""A UKF and an EnKF (filterpy) on the data of the estimate's benchmark, compared with the estimate.
 
     python benchmark/filter_peers.py --truths 5 --seed 5000 --group plain
 
-The state of both filters has the pose, its rate, the clearances, softness, damping, load gains, and the sensor's bias
-and delay. The solver of this project is their process model. Both know the noise of the sensor, and begin at the
-nominal scene with the prior of the estimate. Rows are appended to `results/filter_peers.jsonl`; truths in the file are
-not run again.
+The state of both filters contains the pose and its rate, the clearances, softness, damping, load gains, and the bias
+and delay of the sensor. The process model of both filters is the solver of this project. Their initial state is the
+nominal scene with the prior of the estimate, and their measurement noise is the true noise of the sensor. Rows are
+appended to `results/filter_peers.jsonl`, and truths that are in the file are skipped.
 """
 
 from __future__ import annotations
@@ -52,17 +52,18 @@ RESULTS = Path(__file__).resolve().parent / "results"
 
 TOLERANCE = 1e-4
 MEMBERS = 128
-#: Index of the first unknown of the estimate in the filters' state; pose and rates come before it.
+#: Index of the first unknown of the estimate in the state of the filters. The pose and its rates have lower indices.
 _FIRST = 6
-#: Process noise of x, y [m], theta [rad] and their rates in each step, set by trials on seeds 200 and 201.
+#: Process noise of x, y [m], theta [rad] and their rates per step. The values were set by trials on seeds 200 and 201.
 _STATE_NOISE = np.array([1e-5, 1e-5, 4e-5, 3e-3, 3e-3, 1e-2])
-#: Process noise of the unknowns in each step, as a share of the prior's standard deviation, set by the same trials.
+#: Process noise of the unknowns per step, as a share of the standard deviation of the prior. It was set by the same
+#: trials on seeds 200 and 201.
 _UNKNOWN_NOISE = 3e-4
 
 
 @kernel(entry=True)
 def move(params, parts, states, saved, work, totals, times, wrench, rows, pace):  # type: ignore[no-untyped-def]
-    """Choose the contact modes of all members and advance them."""
+    """Determine the contact modes of all members, and advance the members."""
     marks = np.zeros(0, np.int64)
     for m in range(states.size):
         settle_modes(params[m], states[m], parts.terms.stick)
@@ -73,7 +74,7 @@ def move(params, parts, states, saved, work, totals, times, wrench, rows, pace):
 
 
 class Members:
-    """Heads with different parameters, advanced together from states that a filter has changed."""
+    """Ensemble of heads with different parameters. A filter can change their states between two steps."""
 
     def __init__(self, truth: Truth, count: int) -> None:
         self.unknowns = Unknowns(truth.nominal)
@@ -84,7 +85,7 @@ class Members:
         self._params = new_records(PARAMS, count)
         self._params[:] = compiled.params
         clearance = scene.clearance
-        # the rows of the penetrations are linear in the clearances, so two other clearances give the slopes
+        # the rows of the penetrations are linear in the clearances, so a second value of each clearance gives the slope
         self._rows = np.array(compiled.params["penetration_rows"])
         wider = (
             Clearance(clearance.horizontal_m + 1e-3, clearance.vertical_m),
@@ -99,7 +100,7 @@ class Members:
         self._masses = inertias(scene)
 
     def move(self, points: Array, start: float, end: float) -> Array:
-        """Return points (m, 17) advanced from one time to another."""
+        """Return the points, shape (m, 17), advanced from one time to another [s]."""
         out = points.copy()
         unknown = out[:, _FIRST:]
         unknown[:] = np.array([self.unknowns.within(row) for row in unknown])
@@ -115,7 +116,7 @@ class Members:
         wrench = ends * unknown[:, None, 4:7] / self._masses
         result = np.zeros((len(out), 1), ROW)
         pace = new_record(PACE)
-        pace.slice = 2**62  # so large that all work is one slice
+        pace.slice = 2**62  # larger than any amount of work, so that one slice contains all work
         move(
             self._params, self._parts, states, new_records(STATE, 1), self._work, self._totals, np.array([end]), wrench,
             result, pace,
@@ -125,7 +126,7 @@ class Members:
         return out
 
     def begin(self, truth: Truth) -> tuple[Array, Array]:
-        """Return mean and standard deviations of the state at the first pose."""
+        """Return the mean and the standard deviations of the state at the first pose."""
         first = np.nan_to_num(truth.poses.q[0])
         mean = np.concatenate([first, np.zeros(3), self.unknowns.nominal()])
         spread = np.concatenate([[2e-3, 2e-3, 8e-3, 0.1, 0.1, 0.4], self.unknowns.deviations()])
@@ -133,14 +134,14 @@ class Members:
 
 
 def seen(point: Array) -> Array:
-    """Return the pose that the sensor would show at a state."""
+    """Return the pose that the sensor would measure in a state."""
     unknown = point[_FIRST:]
     pose: Array = point[:3] + unknown[7:10] - point[3:6] * unknown[10]
     return pose
 
 
 class Ukf(UnscentedKalmanFilter):  # type: ignore[misc]
-    """The UKF of filterpy, with all sigma points advanced in one call."""
+    """The UKF of filterpy. All sigma points are advanced in one call."""
 
     def __init__(self, truth: Truth) -> None:
         size = _FIRST + SIZE
@@ -152,14 +153,14 @@ class Ukf(UnscentedKalmanFilter):  # type: ignore[misc]
         self.now = float(truth.poses.t[0])
 
     def compute_process_sigmas(self, dt: float, fx: Any = None, **_: Any) -> None:
-        """Advance the sigma points by `dt` in s."""
+        """Advance the sigma points by `dt` [s]."""
         self.P = 0.5 * (self.P + self.P.T) + 1e-14 * np.eye(len(self.P))
         self.sigmas_f = self.members.move(self.points_fn.sigma_points(self.x, self.P), self.now, self.now + dt)
         self.now += dt
 
 
 class Enkf(EnsembleKalmanFilter):  # type: ignore[misc]
-    """The EnKF of filterpy, with all members advanced in one call."""
+    """The EnKF of filterpy. All members are advanced in one call."""
 
     sigmas: Array
 
@@ -171,7 +172,7 @@ class Enkf(EnsembleKalmanFilter):  # type: ignore[misc]
         self.now = float(truth.poses.t[0])
 
     def predict(self, dt: float) -> None:
-        """Advance the members by `dt` in s."""
+        """Advance the members by `dt` [s]."""
         self.sigmas = self.members.move(self.sigmas, self.now, self.now + dt)
         self.sigmas += np.random.standard_normal(self.sigmas.shape) * np.sqrt(np.diag(self.Q))  # noqa: NPY002
         self.x = self.sigmas.mean(axis=0)
@@ -191,7 +192,7 @@ def run_one(name: str, method: str, seed: int) -> dict[str, Any]:
     try:
         for t, q in zip(truth.poses.t[1:], truth.poses.q[1:], strict=True):
             one.predict(float(t) - one.now)
-            # a component that was not measured gets so much noise that it has no effect
+            # a component that was not measured gets so much noise that it has practically no effect
             there = np.isfinite(q)
             one.update(np.where(there, q, 0.0), np.diag(np.where(there, noise, 1e3) ** 2))
     except np.linalg.LinAlgError as error:

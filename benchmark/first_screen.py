@@ -2,7 +2,7 @@
 
     python benchmark/first_screen.py [FOLDER]
 
-Prints the time of each step of docs/how_to_screen.md in s as JSON.
+The program prints the time [s] of each step of docs/how_to_screen.md as JSON.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PORT = 8079
 
 
 def grow(path: Path, stop: threading.Event) -> None:
-    """Append a load of the preset's size at 100 Hz."""
+    """Append rows at 100 Hz to a CSV file with a load similar to the load of the preset."""
     begin, count = time.time(), 0
     with path.open("w") as file:
         file.write("t,fx,fy,m\n")
@@ -42,7 +42,7 @@ def main() -> None:
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else tempfile.mkdtemp())
     took: dict[str, Any] = {}
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    # an empty cache, so that no other installation has compiled the code
+    # an empty cache: no other installation has compiled the code
     environment["NUMBA_CACHE_DIR"] = environment["PLOW_TWIN_CACHE"] = str(folder / "cache")
 
     def step(name: str) -> None:

@@ -1,11 +1,11 @@
-"""The twin that follows its machine, on fresh truths: its forces, peaks, impulses and clearances.
+"""Errors of the twin that follows its machine: forces, peaks, impulses and clearances of synthetic truths.
 
     python benchmark/follow.py --group soft --group hard --truths 12 --seed 72000
     python benchmark/follow.py --table                       # table of the truths in the file
 
-The errors are compared with those of the nominal twin. At each time the result uses only measurements up to that time.
-All thresholds were set on seeds below 72000. Each truth is written as soon as it is done, and truths in the file are
-not run again.
+The errors are compared with those of the nominal twin. At each time, the result depends only on measurements up to this
+time. All thresholds were set on seeds below 72000. Each result is written as soon as it is computed, and truths that
+are in the file are skipped.
 """
 
 from __future__ import annotations
@@ -33,24 +33,23 @@ RESULTS = Path(__file__).resolve().parent / "results" / "follow.jsonl"
 GROUPS = {
     "soft": Group("K 3e6 .. 3e8", stiffness=(3e6, 3e8)),
     "hard": Group("K 1e9 .. 1e11", stiffness=(1e9, 1e11)),
-    # the machines of the following groups differ from the model
+    # machines of the following groups differ from the model
     "friction": Group("friction 0.1", friction=0.1),
     "law": Group("law: Kelvin-Voigt", law="kelvin_voigt"),
     "shape": Group("load: third harmonic of 10 %", third_harmonic=0.1),
 }
-#: `FIRST_PERIOD` is the index, counted from 0, of the first load period in which forces are compared.
-#: `LEAST_SHARE`: pairs with less than this share of the largest impulse are not compared.
+# index of the first load period in which forces are compared, and least share of the largest impulse of a compared pair
 FIRST_PERIOD, LEAST_SHARE = 4, 0.01
-#: Interval in s between the rows from which the truth's peaks and impulses are computed. It is a fifth of the duration
-#: of the shortest contact.
+#: Interval [s] of the rows from which the true peaks and impulses are computed: a fifth of the duration of the shortest
+#: contact.
 _FINE = 1e-4
 
 
 def run_one(name: str, seed: int, members: int) -> dict[str, Any]:
-    """Follow one truth, and return the errors as a row."""
+    """Follow one truth. Return the errors as a row."""
     try:
         truth = draw(GROUPS[name], seed)
-    except SolverError as error:  # the head has passed through a wall, which no real machine does
+    except SolverError as error:  # the head has passed through a wall, which is impossible in a real machine
         return {"group": name, "seed": seed, "not_drawn": str(error)}
     true, nominal = (Motion(scene, truth) for scene in (truth.scene, truth.nominal))
     begin = time.process_time()
@@ -162,7 +161,7 @@ def as_markdown(rows: Sequence[dict[str, Any]]) -> str:
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS, show_default=True)
 @click.option("--table", "alone", is_flag=True, help="Run nothing.")
 def main(groups: tuple[str, ...], truths: int, seed: int, members: int, out: Path, alone: bool) -> None:
-    """Run the groups and write one line of JSON for each truth."""
+    """Run the groups, and write one line of JSON for each truth."""
     rows = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
     done = {(row["group"], row["seed"]) for row in rows}
     warm_up(draw(Group("start", periods=1.0), 0).nominal)

@@ -1,8 +1,8 @@
-"""CPU time of a live sample at 1 kHz, until its forces are sent and in total, with `follow` off and on.
+"""CPU time of a live sample at 1 kHz until its forces are sent, and in total, with `follow` off and on.
 
     python benchmark/follow_latency.py
 
-A runtime of the node without its transport gets the load, poses at 100 Hz, and an estimate after half a second.
+The runtime of the node is driven without ROS by the load, poses at 100 Hz, and an estimate after half a second.
 """
 
 from __future__ import annotations
@@ -27,10 +27,8 @@ from plow_twin.stream.journal import Estimated
 from plow_twin.stream.topics import TOPICS
 
 _T0 = 1_795_000_000_000_000_000
-#: `_STEP` is the sampling interval [s].
-#: `_END` is the end of the run [s].
-#: `_FIRST` is the end of the warm-up [s], before which nothing is measured.
-#: `_ESTIMATED` is the time of the estimate [s].
+#: Sampling interval, end of the run, end of the warm-up, and time of the estimate [s]. Samples in the warm-up are not
+#: measured.
 _STEP, _END, _FIRST, _ESTIMATED = 1e-3, 6.0, 1.0, 0.5
 
 
@@ -48,7 +46,7 @@ class _Front:
 
 
 def _known(truth: Truth) -> Estimated:
-    """Return an estimate as accurate as an estimate from ten load periods."""
+    """Return an estimate with the accuracy of an estimate from ten load periods."""
     contact = truth.scene.contact
     assert contact.damping is not None
     horizontal, vertical = (Interval.normal(value, 3e-5) for value in truth.clearance)
@@ -62,11 +60,11 @@ def _known(truth: Truth) -> Estimated:
 
 
 def measured(truth: Truth, follow: str) -> tuple[list[int], list[int]]:
-    """Return the CPU times of samples in ns, until the first message and until the last message."""
+    """Return two lists of CPU times of samples [ns]: until the first message, and until the last message."""
     with tempfile.TemporaryDirectory() as folder:
         scene = Path(folder, "believed.yaml")
         scene.write_text(dump_scene(truth.nominal), encoding="utf-8")
-        # windows and intervals are so long that the runtime makes no estimate of its own
+        # with these long windows and intervals, the runtime makes no estimate of its own
         given = parameters.settings(
             {"scene": str(scene), "estimate": True, "estimate_window": 600.0, "estimate_interval": 600.0}
             | {"follow": follow}

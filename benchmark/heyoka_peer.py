@@ -1,9 +1,9 @@
-"""heyoka, the most similar peer: compiled Taylor series with event detection, called from Python.
+"""heyoka, the peer that is most similar to this solver: compiled Taylor series with event detection.
 
-The modes of the eight pairs are parameters of the equations. Python callbacks of two terminal events for each pair set
-its mode: the penetration changes sign, or the force would begin to pull. The Hunt-Crossley force d^1.5 has no Taylor
-series at a touch, so here the force begins at a small penetration, where it is negligible. The batch integrator
-computes as many scenes at once as a SIMD vector has lanes.
+The contact modes of the eight pairs are parameters of the equations. Each pair has two terminal events, whose Python
+callbacks set its mode: the penetration changes sign, or the force becomes attractive. The Hunt-Crossley force d^1.5 has
+no Taylor series at d = 0, so the force begins here at a small penetration, at which it is negligible. The batch
+integrator computes as many scenes at the same time as a SIMD vector has lanes.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ import numpy as np
 from bench_scenes import T_END
 from cases import Array, Sample, timed
 
-#: Time [s] after an event during which heyoka ignores the same event; its default would miss the next touch.
+#: Time [s] after an event in which heyoka ignores the same event. With the default time, it would miss the next touch.
 _COOLDOWN = 1e-7
-#: Indices of the clearances in heyoka's parameters, after the modes of the pairs.
+#: Indices of the clearances in the parameters of heyoka, after the modes of the pairs.
 _GX, _GY = 8, 9
 
 
 def _pairs(p: Array, state: Sequence[Any], hy: Any) -> list[tuple[Any, ...]]:
-    """Return for each pair the penetration, its rate, and the wrench in body axes of a force of 1 N."""
+    """Return for each pair the penetration, its rate, and the wrench of a unit force in body axes."""
     a, b, far_x, far_y = 0.5 * p[0], 0.5 * p[1], 0.5 * (p[0] + hy.par[_GX]), 0.5 * (p[1] + hy.par[_GY])
     x, y, th, vx, vy, om = state
     c, s = hy.cos(th), hy.sin(th)
@@ -38,7 +38,9 @@ def _pairs(p: Array, state: Sequence[Any], hy: Any) -> list[tuple[Any, ...]]:
 
 
 def _equations(p: Array, begin: float) -> tuple[list[tuple[Any, Any]], list[tuple[Any, Any]]]:
-    """Return the rates of the state, and for each pair a function that is positive until its force would pull."""
+    """Return the rates of the state, and for each pair the penetration and a function that is positive until its force
+    pulls.
+    """
     import heyoka as hy
 
     names = ("x", "y", "th", "vx", "vy", "om")
@@ -55,7 +57,7 @@ def _equations(p: Array, begin: float) -> tuple[list[tuple[Any, Any]], list[tupl
             force = hy.par[i] * law
         else:
             law = 1.0 + p[10] * rate
-            # a negative penetration has no real power, so the base is 1 if the pair does not act
+            # the power of a negative penetration is not real, so the base is 1 if the pair is not in contact
             force = hy.par[i] * p[8] * (hy.par[i] * d + (1.0 - hy.par[i])) ** p[9] * law
             d = d - begin
         fx, fy, torque = fx + along_x * force, fy + along_y * force, torque + arm * force
@@ -70,14 +72,15 @@ def _equations(p: Array, begin: float) -> tuple[list[tuple[Any, Any]], list[tupl
 
 
 def _begin_of(tol: float) -> float:
-    """Return the penetration in m at which a force d^1.5 begins; the impulse of smaller penetrations is lost."""
+    """Return the penetration [m] at which a force d^1.5 begins. The impulse of smaller penetrations is neglected."""
     return min(1e-6, max(1e-9, 1e-4 * math.pow(tol, 2.0 / 3.0)))
 
 
 def _events(guards: list[tuple[Any, Any]], inside: Array, event: Any) -> list[Any]:
-    """Return the terminal events that set the modes: whether a pair touches, and whether its force would pull.
+    """Return the terminal events that set the modes: begin and end of a touch, and begin and end of an attractive
+    force.
 
-    A batch passes the lane of the event to its callbacks; `inside` has the shape of the modes.
+    In a batch, the callbacks receive the lane of the event. `inside` has the shape of the modes.
     """
 
     def touches(pair: int) -> Callable[..., bool]:
@@ -106,7 +109,7 @@ def _events(guards: list[tuple[Any, Any]], inside: Array, event: Any) -> list[An
 
 @cache
 def _integrator(numbers: tuple[float, ...], tol: float) -> Any:
-    """Return an integrator, compiled once for both outputs, and the array of pairs inside their walls."""
+    """Return an integrator, compiled once for both output grids, and the array of pairs inside their walls."""
     import heyoka as hy
 
     p = np.array(numbers)
@@ -139,7 +142,10 @@ def prepare(p: Array, tol: float, output_dt: float) -> Callable[[], Sample]:
 
 
 def prepare_batch(p: Array, clearances: Array, tol: float, output_dt: float) -> Callable[[], Sample]:
-    """Prepare runs with many clearances (n, 2), in batches of heyoka's recommended size; poses are (rows, 3, n)."""
+    """Prepare runs with many clearances, shape (n, 2), in batches of heyoka's recommended size.
+
+    The poses of a run have shape (rows, 3, n).
+    """
     import heyoka as hy
 
     width = int(hy.recommended_simd_size())
@@ -153,7 +159,7 @@ def prepare_batch(p: Array, clearances: Array, tol: float, output_dt: float) -> 
     grid = np.arange(round(T_END / output_dt) + 1) * output_dt
     grids = np.ascontiguousarray(np.repeat(grid[:, None], width, axis=1))
     groups = -(-len(clearances) // width)
-    # copies of the last pair fill the last batch
+    # copies of the last pair of clearances fill the last batch
     filled = np.concatenate([clearances, np.repeat(clearances[-1:], groups * width - len(clearances), axis=0)])
     poses = np.zeros((len(grid), 3, len(filled)))
 

@@ -1,8 +1,9 @@
-"""Share of each kernel in the time of a run, by Linux `perf` with the symbols of numba's compiled code.
+"""Share of each kernel in the time of a run, measured by Linux `perf`.
 
     python benchmark/kernel_profile.py bench_kv 1e-3 [--seconds 5]
 
-perf reads symbols from /tmp/perf-<pid>.map, which this program writes from the object code of each library.
+perf reads the symbols of the code that numba has compiled from /tmp/perf-<pid>.map. This program writes the file from
+the object code of each library.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ SHOWN = 24
 
 
 def _collect() -> None:
-    """Keep the object code of every library, compiled or read from the cache."""
+    """Store the object code of every library that is compiled or read from the cache."""
     kind: Any = codegen.JITCodeLibrary
     fresh, cached = kind._finalize_specific, kind._unserialize.__func__
 

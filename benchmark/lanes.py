@@ -1,8 +1,8 @@
-"""Compare runs in the lanes of `plow_twin.solve.lanes`, alone and eight at a time, with the loop of a single scene.
+"""Compare runs in the SIMD lanes of `plow_twin.solve.lanes`, one or eight at a time, with the loop of a single scene.
 
     python benchmark/lanes.py [--tol 1e-6] [--rounds 9]
 
-The runs take turns, so that other programs disturb all of them alike; the least CPU time of each is printed.
+The runs alternate, so that other programs disturb all of them equally. The shortest CPU time of each is printed.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from typing import Any, Final
 from cases import Array
 from numba import njit
 
-#: numba's decorators with types of our own: those of numba do not declare compiled functions as callable.
+#: Decorators of numba with other types, because the types of numba do not declare compiled functions as callable.
 compiled: Final[Callable[[Any], Any]] = njit
 fast: Final[Callable[[Any], Any]] = njit(fastmath=True)
 inlined: Final[Callable[[Any], Any]] = njit(inline="always", fastmath=True)
@@ -54,14 +54,14 @@ def accelerations(t: float, x: float, y: float, th: float, vx: float, vy: float,
 
 @compiled
 def rhs_into(t: float, y: Array, out: Array, p: Array) -> None:
-    """Write the rate of y = (x, y, theta, vx, vy, omega)."""
+    """Write the time derivative of y = (x, y, theta, vx, vy, omega) to `out`."""
     out[0], out[1], out[2] = y[3], y[4], y[5]
     out[3], out[4], out[5] = accelerations(t, y[0], y[1], y[2], y[3], y[4], y[5], p)
 
 
 @fast
 def rk4(p: Array, dt: float, steps: int, stride: int, q: Array) -> None:
-    """Integrate from rest at the origin; row i of `q` is the pose after i * stride steps."""
+    """Integrate from rest at the origin. Row i of `q` becomes the pose after i * stride steps."""
     x = y = th = vx = vy = om = 0.0
     half = 0.5 * dt
     for n in range(steps):

@@ -1,4 +1,4 @@
-"""Times at equal error: the time in which a solver reaches an error, found from its runs with different settings."""
+"""Run time of each solver at a given error, from its runs with different settings."""
 
 from __future__ import annotations
 
@@ -25,14 +25,15 @@ PEERS: dict[str, Member] = {
     "our RK4": lambda solver: solver == OURS_RK4,
 }
 OWN: dict[str, Member] = {name: name.__eq__ for name in (OURS_BARE, OURS, OURS_CALL)}
-#: A solver that takes this many times as long as the fastest of its group is not measured again, nor is a setting that
-#: takes this many times as long as the fastest of its solver.
+#: Ratio of times. A solver is not measured again if it is slower than the fastest of its group by this ratio, and a
+#: setting if it is slower than the fastest of its solver by this ratio.
 _NEAR = 1.4
 
 
 @dataclass(frozen=True)
 class Reached:
-    """The time in ms in which a solver reaches an error, with its setting or the two settings around it."""
+    """The time [ms] in which a solver reaches an error, and its setting, or the two settings for an interpolated time.
+    """
 
     wall_ms: float
     solver: str
@@ -48,10 +49,10 @@ def ladders(rows: Sequence[Row], scene: str, output_s: float, member: Member) ->
 
 
 def reach(ladder: Sequence[Row], level: float) -> Reached | None:
-    """Return the least time for an error of at most `level`, of one setting or interpolated between two.
+    """Return the shortest time for an error of at most `level`.
 
-    The interpolation is linear in the logarithms of time and error, between neighbouring settings of which the looser
-    misses the level and the tighter reaches it.
+    The time is that of one setting, or is interpolated between two neighbouring settings, linearly in the logarithms of
+    time and error. Of these two settings, the looser misses the level and the tighter reaches it.
     """
     done = [row for row in ladder if row.status == "ok" and row.error is not None and row.wall_ms is not None]
     times = [Reached(_wall(row), row.solver, row.setting) for row in done if _error(row) <= level]
@@ -69,7 +70,7 @@ def fastest(rows: Sequence[Row], scene: str, output_s: float, level: float, memb
 
 
 def contenders(rows: Sequence[Row]) -> set[int]:
-    """Return the indices of the rows that can change a figure of the tables, judged by one run of each row."""
+    """Return the indices of the rows that can change a figure of the tables, according to one run of each row."""
     picked: list[Row] = []
     for scene in {row.scene for row in rows}:
         for output_s in OUTPUTS:

@@ -1,15 +1,15 @@
-"""The live node under load: loss, share of a core and age at a subscriber, compared with a bare rclpy echo.
+"""The live node under load: loss, share of a core and age of messages, compared with a bare rclpy echo.
 
-`python benchmark/live_load.py [--seconds N] [--repeats N]` runs every case once in each repeat, prints a line of JSON
+`python benchmark/live_load.py [--seconds N] [--repeats N]` runs all cases once in each repeat. It prints a line of JSON
 for each case, then the medians and the targets. Other options replace these cases:
 
-    --minutes N   the node with its recorder at 1 kHz (or `--rate`) for N minutes; prints a line every ten seconds, the
-                  growth of each figure, and whether each message sent was used or counted
-    --beside      the echo, the node and a recording node at once under the same samples; other programs disturb all
-                  of them alike, so the ratios are valid on a busy machine too
-    --estimate    the node without and with the estimate and its 256 twins in turn, under the paper's load and a
-                  synthetic pose at 100 Hz, for `--seconds` after the first window has been formed
-    --opcua       `plow-twin live` beside an OPC UA server for `--minutes` (10): see `opcua_load.py`
+    --minutes N   run the node with its recorder at 1 kHz (or `--rate`) for N minutes; print a line every ten seconds,
+                  the growth of each figure, and whether each sent message was used or counted
+    --beside      run the echo, the node and a recording node at the same time with the same samples; other programs
+                  disturb all of them equally, so the ratios are valid on a busy machine too
+    --estimate    run the node alternately without and with the estimate and its 256 twins, under the paper's load and
+                  a synthetic pose at 100 Hz, for `--seconds` after the first window has been formed
+    --opcua       run `plow-twin live` with an OPC UA server for `--minutes` (10): see `opcua_load.py`
 
 Publisher, node and subscriber share the machine, so only figures of the same run can be compared.
 """
@@ -35,12 +35,12 @@ from typing import Any, NamedTuple
 ROOT = Path(__file__).resolve().parent.parent
 NS_PER_S = 1_000_000_000
 PERIOD_S = 10.0
-#: Time from the first published message until the first window of an estimate has been formed [s].
+#: Time [s] from the first published message until the first window of an estimate has been formed.
 FORMED_S = 34.0
 
 
 class Case(NamedTuple):
-    """Publish mode of the node (or `echo`, `raw_echo`), rate of the samples [Hz], whether the node records."""
+    """A case: publish mode of the node (or `echo`, `raw_echo`), sample rate [Hz], and whether the node records."""
 
     mode: str
     rate_hz: float
@@ -54,9 +54,9 @@ CASES = (ECHO, RAW_ECHO, ON_SAMPLE, RECORDED, FIXED, FIXED_RECORDED, Case("fixed
 
 
 def echo(raw: bool = False, namespace: str = "live_load") -> None:
-    """Answer each sample with three messages as large as those of the node.
+    """Answer each sample with three messages of the size of the node's messages.
 
-    With `raw`, the messages are serialised in advance, and only the stamp of the sample is written into their bytes:
+    With `raw`, the messages are serialised in advance, and only the stamp of the sample is written into them. This is
     the least work of an rclpy node.
     """
     import rclpy
@@ -97,7 +97,7 @@ def echo(raw: bool = False, namespace: str = "live_load") -> None:
 
 
 def send(rate_hz: float, seconds: float) -> None:
-    """Publish samples stamped with the time of sending."""
+    """Publish samples. Each stamp is the time of sending."""
     import rclpy
     from geometry_msgs.msg import WrenchStamped
 
@@ -132,9 +132,9 @@ class Probe:
         self.node = rclpy.create_node("probe", context=self.context)
         self._executor = EventsExecutor(context=self.context)
         self._executor.add_node(self.node)
-        #: age of each message [ms]
+        #: Age of each message [ms].
         self.ages: list[float] = []
-        #: figures of the newest report
+        #: Values of the newest diagnostics.
         self.figures: dict[str, str] = {}
         self.node.create_subscription(JointState, "/live_load/contact_forces", self._heard, 5000, raw=True)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._report, 10)
@@ -147,7 +147,7 @@ class Probe:
             self.figures.update({item.key: item.value for item in status.values})
 
     def spin(self, reached: Callable[[], bool], timeout_s: float) -> None:
-        """Listen until `reached` returns true, or until the timeout."""
+        """Process messages until `reached` returns True, or until the timeout."""
         give_up = time.monotonic() + timeout_s
         while not reached() and time.monotonic() < give_up:
             self._executor.spin_once(timeout_sec=0.02)
@@ -161,7 +161,7 @@ class Probe:
 
 @contextmanager
 def running(answerer: list[str]) -> Iterator[tuple[Probe, int]]:
-    """Start an answering process; yield a probe and the process id after the first answer."""
+    """Start an answering process. Yield a probe and the process id after the first answer."""
     probe = Probe()
     process = subprocess.Popen(answerer, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
@@ -180,7 +180,9 @@ def source(rate_hz: float, seconds: float) -> subprocess.Popen[bytes]:
 
 
 def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, float]:
-    """Run an answering process; return samples sent, used and lost, its CPU time and the ages of messages."""
+    """Run an answering process. Return the samples sent, used and lost, its share of a core, and the ages of its
+    messages.
+    """
     with running(answerer) as (probe, process_id):
         sender, ages, figures = source(rate_hz, seconds), probe.ages, probe.figures
         try:
@@ -191,7 +193,7 @@ def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, fl
             probe.spin(lambda: sender.poll() is not None, seconds + 30.0)
             share = (cpu_s(process_id) - busy) / (time.monotonic() - begin)
         finally:
-            sender.kill()  # otherwise it would send to the next case
+            sender.kill()  # otherwise the sender would send to the next case
             sender.wait()
         figures.pop("samples_used", None)
         if "published" in figures:
@@ -353,15 +355,17 @@ def _append_age(ages: list[float], data: bytes) -> None:
 
 
 def cpu_s(process_id: int) -> float:
-    """Return the CPU time of all threads in s from the scheduler, which is finer than the 10 ms ticks of `stat`."""
+    """Return the CPU time [s] of all threads of a process. The scheduler's file is more precise than the ticks of
+    `stat`.
+    """
     tasks = Path(f"/proc/{process_id}/task").iterdir()
     return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) * 1e-9
 
 
 def soak(minutes: float, rate_hz: float) -> bool:
-    """Run the node with its recorder; print its figures, their growth in the last half, and the account.
+    """Run the node with its recorder. Print its figures, their growth, and the account of the messages.
 
-    Return whether each sent message was used, dropped for a reason or counted as lost.
+    Return whether each sent message was used, dropped for a reason, or counted as lost.
     """
     rows: list[dict[str, float | None]] = []
     with tempfile.TemporaryDirectory() as folder, running(_twin("on_sample", f"{folder}/soak")) as (probe, process_id):
@@ -376,7 +380,7 @@ def soak(minutes: float, rate_hz: float) -> bool:
                 "threads": _status(process_id, "Threads"),
                 "files": len(os.listdir(f"/proc/{process_id}/fd")),
                 "core": round((cpu_s(process_id) - busy) / PERIOD_S, 3),
-                **_quantiles(ages, None),  # without a clock there are no ages
+                **_quantiles(ages, None),  # None instead of NaN if no message arrived
                 "queued": int(figures.get("queued") or 0),
                 **_account(figures),
             })  # fmt: skip
@@ -401,8 +405,8 @@ def soak(minutes: float, rate_hz: float) -> bool:
 def _growth(minutes: list[float], sizes: list[float]) -> tuple[float, float]:
     """Return the slope per hour after the first quarter, and the half-width of its 95 % interval.
 
-    Memory grows in steps, and neighbouring samples depend on each other, so the slope is fitted to the means of six
-    blocks.
+    Memory grows in steps, so that neighbouring samples are correlated. The slope is therefore fitted to the means of
+    six blocks.
     """
     import numpy as np
 

@@ -1,4 +1,4 @@
-"""Rows of live twins: one twin and many twins under loads sampled at 1 kHz, and starts with and without a cache."""
+"""Rows of live twins with loads sampled at 1 kHz, and rows of starts with an empty and with a filled cache."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _TWIN, _TWINS = "plow_twin Twin", "plow_twin TwinBatch"
 
 
 def sampled_rows(repeats: int, notify: Notify) -> Iterator[Row]:
-    """Yield a row for one twin (`value`: times real time), then rows for 256 twins (`value`: share of a core)."""
+    """Yield a row for one twin (`value`: multiple of real time), then rows for 256 twins (`value`: share of a core)."""
     scene, t = bench_scene("kv"), 1e-3 * np.arange(1.0, 20_001.0)
     p = constants(scene)
     wrench = np.sin(p[14] * t)[:, None] * p[11:14]
@@ -74,7 +74,8 @@ def _many_twins(scene: Scene, t: Array, wrench: Array, samples: int) -> float:
     return timed(run)[0]
 
 
-#: Program that prepares a live twin and prints how long this takes, and how many kernels it compiles or reads.
+#: Program that prepares a live twin, and prints the duration and the numbers of kernels compiled and read from the
+#: cache.
 _START = """
 import json, sys, time
 begin = time.perf_counter()
@@ -99,7 +100,9 @@ print(json.dumps({
 
 
 def start_rows(notify: Notify) -> Iterator[Row]:
-    """Yield rows for the start of a process with an empty cache and for the next start; `value`: compiled kernels."""
+    """Yield a row for the start of a process with an empty cache, and a row for the next start (`value`: compiled
+    kernels).
+    """
     with tempfile.TemporaryDirectory() as cache:
         for name in ("cold start", "second start"):
             notify(name)

@@ -1,13 +1,15 @@
-"""Forecasts on synthetic lives: accuracy within 20 %, coverage of 80 % and 90 % intervals, CRPS, horizon.
+"""Forecasts of synthetic lives: accuracy within 20 %, coverage of 80 % and 90 % intervals, CRPS, and horizon.
 
     python benchmark/lives.py --lives 8
 
-The wear coefficient of each life is drawn from the prior, and the forecast does not know the size of the load. The
-clearances are measured with noise at each visit. The true wear is computed in steps a quarter as long as the
-forecast's.
+The wear coefficient of each life is drawn from the prior, and the load has a gain that the forecast does not get. The
+clearances are measured with noise at each visit. The true wear is computed with steps that are a quarter as long as the
+steps of the forecast.
 
-Alpha-lambda accuracy and prognostic horizon: Saxena et al., Int. J. Prognostics Health Management 1 (2010) 1. CRPS:
-Gneiting and Raftery, J. Am. Stat. Assoc. 102 (2007) 359.
+References
+----------
+Saxena et al. (2010), Int. J. Prognostics Health Management 1, 1: alpha-lambda accuracy and prognostic horizon.
+Gneiting, Raftery (2007), J. Am. Stat. Assoc. 102, 359: CRPS.
 """
 
 from __future__ import annotations
@@ -29,19 +31,19 @@ from plow_twin.estimate.forecast import HOUR_S, Plan, forecast, with_clearances
 from plow_twin.model.scene import Harmonic
 
 Array = NDArray[np.float64]
-#: 5 % and 95 % points [m^2/N] of the prior, from which the true coefficient is drawn.
+#: 5 % and 95 % points of the prior [m^2/N]. The true coefficient is drawn from this prior.
 PRIOR = (1e-15, 1e-14)
-#: Growth of a clearance that ends a life [m], standard deviation of an estimated clearance [m], visits in a life,
-#: shares of the life at which it is forecast.
+#: Growth of a clearance at which a life ends [m], standard deviation of an estimated clearance [m], number of visits in
+#: a life, and shares of the life at which forecasts are made.
 GROWTH, NOISE, VISITS, SHARES = 3e-3, 5e-5, 20, (0.3, 0.5, 0.7)
-#: Quantiles of the inner 80 % and 90 % of a distribution.
+#: Quantiles at the ends of the central 80 % and 90 % intervals.
 _INNER, _INNER_90 = (0.1, 0.9), (0.05, 0.95)
-#: Largest relative error of a right forecast.
+#: Largest relative error of a forecast that counts as right.
 ALPHA = 0.2
 
 
 def truth(rng: np.random.Generator) -> tuple[Scene, float, life.Path]:
-    """Draw a machine; return its scene, its wear coefficient and the path of its wear."""
+    """Draw a machine. Return its scene, its wear coefficient and the path of its wear."""
     paper = load_scene("paper")
     gain = 1.0 + 0.05 * rng.standard_normal()
     loads = tuple(
@@ -62,12 +64,12 @@ def truth(rng: np.random.Generator) -> tuple[Scene, float, life.Path]:
 
 
 def limits(scene: Scene) -> tuple[float, float]:
-    """Return the clearances at which a life ends [m]."""
+    """Return the clearances [m] at which a life ends."""
     return scene.clearance.horizontal_m + GROWTH, scene.clearance.vertical_m + GROWTH
 
 
 def one_life(seed: int) -> list[dict[str, Any]]:
-    """Forecast one life at each of `SHARES`, and return a row for each."""
+    """Forecast one life at each of the `SHARES`. Return a row for each forecast."""
     rng = np.random.default_rng([20261121, seed])
     scene, k_s, path = truth(rng)
     wear = scene.wear

@@ -1,8 +1,8 @@
-"""DOP853 compiled by numba, which locates every change of contact on its dense output and restarts there.
+"""DOP853 compiled by numba. It locates each change of contact on its dense output, and restarts at this time.
 
-This is the solver that an expert would write. It uses the method and the step control of Hairer, Norsett and Wanner,
-Solving ODEs I, sec. II.5 and II.6, with SciPy's coefficients. Contact modes are frozen within a step, and rows are read
-from the dense output.
+An expert would write such a solver for this problem. Method and step control are those of Hairer, Norsett and Wanner,
+Solving ODEs I, sec. II.5 and II.6, with the coefficients of SciPy. Contact modes are constant within a step. Output
+rows are read from the dense output.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ _A = np.ascontiguousarray(table.A)
 _B, _C = np.ascontiguousarray(table.B), np.ascontiguousarray(table.C)
 _E3, _E5, _D = np.ascontiguousarray(table.E3), np.ascontiguousarray(table.E5), np.ascontiguousarray(table.D)
 _ROWS = len(_C)
-#: Absolute tolerances divided by rtol, a tenth of the usual size of poses (1e-2) and velocities (1).
+#: Absolute tolerances divided by rtol: a tenth of the usual magnitude of poses (1e-2) and velocities (1).
 _ATOL = np.array([1e-3, 1e-3, 1e-3, 1e-1, 1e-1, 1e-1])
 _OFF, _ON, _CLIPPED = 0, 1, 2
-#: Guards are checked at the end of each of this number of equal parts of a step.
+#: Number of equal parts of a step. The guards are checked at the end of each part.
 _LOOKS = 4
 _AT_ONE_INSTANT = 64
 
@@ -46,7 +46,7 @@ def _pair(i, c, s, bx, by, bvx, bvy, om, p):  # type: ignore[no-untyped-def]
 
 @fast
 def _rate(t: float, y: Array, mode: Indexes, p: Array, out: Array) -> None:
-    """Write the rate of y = (x, y, theta, vx, vy, omega); pairs that are on act by their law even where it pulls."""
+    """Write the time derivative of y = (x, y, theta, vx, vy, omega). Forces of pairs in mode ON may pull."""
     c, s, om = math.cos(y[2]), math.sin(y[2]), y[5]
     bx, by, bvx, bvy = c * y[0] + s * y[1], c * y[1] - s * y[0], c * y[3] + s * y[4], c * y[4] - s * y[3]
     fx = fy = torque = 0.0
@@ -67,7 +67,7 @@ def _rate(t: float, y: Array, mode: Indexes, p: Array, out: Array) -> None:
 
 @fast
 def _guards(y: Array, mode: Indexes, p: Array, out: Array) -> None:
-    """Write two guards of each pair, which are positive as long as its mode lasts."""
+    """Write two guards of each pair, which are positive as long as its mode is unchanged."""
     c, s, om = math.cos(y[2]), math.sin(y[2]), y[5]
     bx, by, bvx, bvy = c * y[0] + s * y[1], c * y[1] - s * y[0], c * y[3] + s * y[4], c * y[4] - s * y[3]
     for i in range(8):
@@ -84,7 +84,7 @@ def _guards(y: Array, mode: Indexes, p: Array, out: Array) -> None:
 
 @fast
 def _dense(f: Array, y: Array, x: float, out: Array) -> None:
-    """Write the state at the share x of a step, from its seven interpolation terms, shape (7, 6)."""
+    """Write the state at the share x of a step, from the seven interpolation terms `f`, shape (7, 6)."""
     for j in range(6):
         value = 0.0
         for i in range(6, -1, -1):
@@ -136,7 +136,7 @@ def _interpolate(y: Array, new: Array, h: float, k: Array, f: Array) -> None:
 
 @compiled
 def _first_change(y: Array, f: Array, mode: Indexes, p: Array, at: Array, guards: Array):  # type: ignore[no-untyped-def]
-    """Return the share of the step at which a guard first turns negative and the guard's number, or (2, -1)."""
+    """Return the share of the step at which a guard first becomes negative, and the index of the guard, or (2, -1)."""
     for look in range(_LOOKS):
         low, high = look / _LOOKS, (look + 1) / _LOOKS
         _dense(f, y, high, at)
@@ -159,7 +159,7 @@ def _first_change(y: Array, f: Array, mode: Indexes, p: Array, at: Array, guards
 
 @compiled
 def integrate(p: Array, rtol: float, output_dt: float, q: Array) -> tuple[int, int, int]:
-    """Integrate from rest at the origin into the rows of q; return the numbers of steps, evaluations and events."""
+    """Integrate from rest at the origin into the rows of q. Return the numbers of steps, evaluations and events."""
     k, f = np.zeros((_ROWS, 6)), np.zeros((7, 6))
     y, new, trial, at, guards = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(16)
     mode = np.zeros(8, np.int64)

@@ -1,12 +1,12 @@
-"""The contact model compared with measured impacts of an ellipse and drops of a square (`benchmark/data/measured`).
+"""Comparison of the contact model with measured impacts of an ellipse and drops of a square.
 
-    python benchmark/measured.py            fits, errors, coverage: benchmark/results/measured.json
-    python benchmark/measured.py --only square
-    python benchmark/measured.py --only fit      the square fitted to each half of its drops, errors on the other
-    python benchmark/measured.py --only table    height of the table by the estimate of each drop
-    python benchmark/measured.py --plot     pictures of it in docs/images
+    python benchmark/measured.py                 compute all: benchmark/results/measured.json
+    python benchmark/measured.py --only square   compute the drops of the square only
+    python benchmark/measured.py --only fit      fit the square to each half of its drops; errors on the other half
+    python benchmark/measured.py --only table    estimate the height of the table from each drop
+    python benchmark/measured.py --plot          draw the stored results to docs/images
 
-Parameters are fitted to each half of the data; errors are those on the other half.
+Parameters are fitted to each half of the data in `benchmark/data/measured`. Errors are computed on the other half.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ FOLDER = Path(__file__).resolve().parent
 DATA = FOLDER / "data" / "measured"
 RESULTS = FOLDER / "results" / "measured.json"
 IMAGES = FOLDER.parent / "docs" / "images"
-#: First step of a fit in each unknown.
+#: First step of each unknown in a fit.
 STEPS = {"tilt": 0.004, "fall": 0.1, "fall_along": 0.05, "slip_speed": 0.05, "restitution": 0.05, "friction": 0.03}
 PLAIN = replace(ELLIPSE, fall=0.0, fall_along=0.0, tilt=0.0, restitution=0.54)
 FRICTIONS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
@@ -63,7 +63,7 @@ FALLING = ("fall", "fall_along", "tilt")
 
 
 class Impacts:
-    """The measured impacts of the ellipse, in two halves."""
+    """The measured impacts of the ellipse, divided into two halves."""
 
     def __init__(self) -> None:
         with np.load(DATA / "ellipse_impacts.npz") as data:
@@ -71,11 +71,11 @@ class Impacts:
         self.half = np.random.default_rng(1).permutation(len(self.before)) % 2
 
     def missed(self, found: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-        """Return the norm of the velocities' error in m/s, where omega is multiplied by the radius of gyration."""
+        """Return the norm of the velocity error [m/s]. Angular velocities are multiplied by the radius of gyration."""
         return np.asarray(np.linalg.norm((found - self.after[chosen])[:, 3:] * [1.0, 1.0, GYRATION], axis=1))
 
     def fit(self, start: EllipseContact, names: tuple[str, ...], chosen: np.ndarray) -> EllipseContact:
-        """Fit the named parameters to the chosen impacts by the root mean square of their errors."""
+        """Fit the named parameters to the chosen impacts. The fit minimises the root mean square of the errors."""
         first = np.array([getattr(start, name) for name in names])
         steps = [STEPS.get(name, 0.2 * getattr(start, name) + 0.02) for name in names]
 
@@ -94,7 +94,7 @@ class Impacts:
         return contact(minimize(cost, first, method="Nelder-Mead", options=options).x)
 
     def held_out(self, start: EllipseContact, names: tuple[str, ...]) -> dict[str, Any]:
-        """Fit to each half and return the errors on the other half."""
+        """Fit the named parameters to each half of the impacts. Return the errors on the other half."""
         missed, fitted = [], []
         for half in (0, 1):
             contact = self.fit(start, names, np.flatnonzero(self.half != half))
@@ -104,7 +104,7 @@ class Impacts:
         return {**errors(np.concatenate(missed)), "fitted": fitted}
 
     def rigid(self, model: Any) -> dict[str, Any]:
-        """Fit e and mu of a rigid impact to each half; return the errors on the other half."""
+        """Fit e and mu of a rigid impact to each half of the impacts. Return the errors on the other half."""
         missed = []
         for half in (0, 1):
             fit, held = np.flatnonzero(self.half != half), np.flatnonzero(self.half == half)
@@ -118,7 +118,7 @@ class Impacts:
         return errors(np.concatenate(missed))
 
     def floor(self) -> dict[str, Any]:
-        """Return the error of the best possible impulse at the lowest point."""
+        """Return the error of the best possible impulse at the lowest point. No contact law can have a smaller error."""
         arm, up = contact_arms(self.before[:, 2])
         change = (self.after - self.before)[:, 3:] * [-1.0, 1.0, GYRATION]
         rows = np.zeros((len(change), 3, 2))
@@ -133,7 +133,7 @@ def errors(missed: np.ndarray) -> dict[str, Any]:
 
 
 def rigid_impact(before: np.ndarray, model: Any, e: float, mu: float) -> np.ndarray:
-    """Return the states after rigid impacts at the lowest point; `model` gives the impulses (p_t, p_n)."""
+    """Return the states after rigid impacts at the lowest point; `model` returns the impulses (p_t, p_n)."""
     arm, up = contact_arms(before[:, 2])
     inertia, found = GYRATION**2, before.copy()
     slip, rate = -before[:, 3] - before[:, 5] * up, before[:, 4] + before[:, 5] * arm
@@ -146,11 +146,15 @@ def rigid_impact(before: np.ndarray, model: Any, e: float, mu: float) -> np.ndar
 
 
 def routh(slip, rate, tt, nn, tn, e, mu, bit=2e-3, energetic=False):  # type: ignore[no-untyped-def]
-    """Return impulses by Routh's method: Coulomb's friction acts on each increment of the normal impulse.
+    """Return impulses by Routh's method: Coulomb friction acts on each increment of the normal impulse.
 
-    Poisson's restitution (ratio of impulses) or Stronge's (ratio of the normal force's work) determines the end. Routh,
-    Dynamics of a system of rigid bodies, 1860; Wang and Mason, J. Appl. Mech. 59 (1992) 635; Mirtich, thesis, Berkeley
-    1996.
+    The impact ends by Poisson's restitution, a ratio of impulses, or with `energetic` by Stronge's restitution, a ratio
+    of works of the normal force.
+
+    References
+    ----------
+    Routh (1860), Dynamics of a system of rigid bodies. Wang, Mason (1992), J. Appl. Mech. 59, 635. Mirtich (1996),
+    thesis, Berkeley.
     """
     along, away, end = np.zeros_like(slip), np.zeros_like(slip), np.full_like(slip, np.inf)
     work, least = np.zeros_like(slip), np.zeros_like(slip)
@@ -176,16 +180,18 @@ def mirtich(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
 
 
 def drumwright_shell(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
-    """Return the impulses within Coulomb's cone that leave the least kinetic energy, with Poisson's restitution.
+    """Return the impulses in the friction cone with the least remaining kinetic energy, and Poisson's restitution.
 
-    Drumwright and Shell, Algorithmic Foundations of Robotics IX (2010) 249.
+    References
+    ----------
+    Drumwright, Shell (2010), Algorithmic Foundations of Robotics IX, 249.
     """
     determinant = tt * nn - tn**2
     away, along = (tn * slip - tt * rate) / determinant, (tn * rate - nn * slip) / determinant
     slides = np.abs(along) > mu * away
     side = np.sign(along)
-    # on the edge of the friction cone, along (side mu, 1), the larger impulse counts: the one that leaves the least
-    # energy, or the one that stops the approach
+    # on the edge of the friction cone, (side mu, 1), the impulse is the larger of two: the impulse with the least
+    # remaining energy, and the impulse that stops the approach
     least = -(side * mu * slip + rate) / (tt * mu**2 + 2.0 * side * mu * tn + nn)
     stopped = -rate / (nn + tn * mu * side)
     away = np.where(slides, np.maximum(least, stopped), away)
@@ -193,13 +199,13 @@ def drumwright_shell(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-
 
 
 def anitescu_potra_newton(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
-    """Return the impulses of `newton` without restitution, times 1 + e."""
+    """Return the impulses of `newton` without restitution, multiplied by 1 + e."""
     along, away = newton(slip, rate, tt, nn, tn, 0.0, mu)  # type: ignore[no-untyped-call]
     return (1.0 + e) * along, (1.0 + e) * away
 
 
 def newton(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
-    """Return impulses that stop the slip or lie on Coulomb's cone, with Newton's restitution (Whittaker, 1904)."""
+    """Return impulses that stop the slip or lie on the friction cone, with Newton's restitution (Whittaker, 1904)."""
     wanted = -(1.0 + e) * rate
     determinant = tt * nn - tn**2
     away, along = (tt * wanted + tn * slip) / determinant, (-nn * slip - tn * wanted) / determinant
@@ -210,9 +216,11 @@ def newton(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
 
 
 def anitescu_potra(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
-    """Return impulses of a complementarity problem with Poisson's restitution of the normal impulse.
+    """Return the impulses of a complementarity problem, with Poisson's restitution of the normal impulse.
 
-    Anitescu and Potra, Nonlinear Dyn. 14 (1997) 231.
+    References
+    ----------
+    Anitescu, Potra (1997), Nonlinear Dyn. 14, 231.
     """
     along, away = newton(slip, rate, tt, nn, tn, 0.0, mu)  # type: ignore[no-untyped-call]
     return along, (1.0 + e) * away
@@ -253,7 +261,7 @@ def by_law(impacts: Impacts) -> dict[str, Any]:
 
 
 def crps(members: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Return the continuous ranked probability score of an ensemble (m, ...) at each row."""
+    """Return the continuous ranked probability score of an ensemble, shape (m, ...), at each row."""
     count = len(members)
     weights = (2 * np.arange(1, count + 1) - count - 1).reshape(-1, *[1] * measured.ndim)
     return np.asarray(
@@ -273,7 +281,7 @@ def sharp() -> np.ndarray:
 
 
 def without_drag() -> np.ndarray:
-    """Return a block with the outline of the preset `measured_square`, without drag, with constant friction."""
+    """Return a block with the outline of the preset `measured_square`, constant friction and no drag."""
     frame, block = load_scene("measured_square").frame, SQUARE.copy()
     block["radius"] = frame.corner_radius_m
     block["half"] = 0.5 * frame.width_m - float(block["radius"])
@@ -282,7 +290,7 @@ def without_drag() -> np.ndarray:
     return block
 
 
-#: Parameters of the block that are fitted together with the marker's.
+#: Parameters of the block that are fitted together with the marker.
 FITTED = (
     "half", "radius", "gyration", "table", "restitution", "restitution_fall", "friction", "friction_fall", "mass_power",
     "tangential", "tangential_damping", "drag", "spin_drag",
@@ -294,20 +302,21 @@ PRESET_FITTED = (
     "gyration", "stiffness", "restitution", "restitution_fall", "mass_power", "friction", "tangential",
     "tangential_damping", "gravity",
 )  # fmt: skip
-#: Largest differences between first flights that count as nearly the same: angle [rad], rates [m/s, m/s, rad/s].
+#: Largest differences between two first flights that are treated as equal: angle [rad], and rates [m/s, m/s, rad/s].
 NEAR_TWINS = (0.05, 0.15, 0.15, 1.5)
-#: Two corners hit at the same time if their touches are at most this far apart [s].
+#: Largest time [s] between the touches of two corners that are treated as simultaneous.
 TWO_AT_ONCE_S = 1e-3
 
 
 class Square:
-    """The measured drops, and their simulation as drops of a block with a marker."""
+    """The measured drops, and simulated drops of a block with a marker."""
 
     def __init__(self, drops: Drops) -> None:
         self.drops, self.usable = drops, np.array(drops.usable())
         self.first = drops.flight_rows[self.usable] - 1
         bounces = [drops.bounces[i] for i in self.usable]
-        #: number of rows from the end of the first flight to each of the next bounces, 0 without such a bounce, (n, 3)
+        #: Number of rows from the end of the first flight to each of the next three bounces, shape (n, 3); 0 if there
+        #: is no such bounce.
         self.rows = np.array(
             [
                 [its[k] - first if k < len(its) else 0 for k in (1, 2, 3)]
@@ -317,8 +326,9 @@ class Square:
         self.flights = np.array([fit_flight(drops.pose[i, : drops.flight_rows[i]]).state for i in self.usable])
 
     def errors(self, block: np.ndarray, marker: Marker, chosen: np.ndarray, bounces: int) -> np.ndarray:
-        """Return the mean distance in m and angle in rad over `bounces` bounces, shape (k, 2), of drops with as many
-        bounces.
+        """Return the mean distance [m] and angle [rad] over `bounces` bounces, shape (k, 2).
+
+        Drops with fewer bounces are omitted.
         """
         enough = chosen[self.rows[chosen, bounces - 1] > 0]
         states = marker.state_of_block(self.flights[enough])
@@ -326,7 +336,8 @@ class Square:
         return self.off(marker.measured(tossed[:, :, :3]), enough, bounces)
 
     def off(self, poses: Iterable[np.ndarray], chosen: np.ndarray, bounces: int) -> np.ndarray:
-        """Return the mean distance [m] and angle [rad], shape (k, 2), of poses (k, rows, 3) from the chosen drops."""
+        """Return the mean distance [m] and angle [rad], shape (k, 2), between poses (k, rows, 3) and the chosen drops.
+        """
         found = []
         for n, motion in zip(chosen, poses, strict=True):
             rows, first = self.rows[n, bounces - 1], self.first[n]
@@ -335,9 +346,11 @@ class Square:
         return np.array(found)
 
     def against_rigid(self) -> dict[str, Any]:
-        """Return the errors over one bounce of rigid and of compliant impacts: all, two corners at once, the others.
+        """Return the errors of rigid and of compliant impacts over one bounce.
 
-        Both have the marker, the rounded corners and the drag; e and mu of the rigid impacts are fitted to all drops.
+        The errors are given for all drops, for drops with two corners that touch simultaneously, and for all other
+        drops. Both models have the marker, the rounded corners and the drag. e and mu of the rigid impacts are fitted
+        to all drops.
         """
         every = np.flatnonzero(self.rows[:, 0] > 0)
         states, rows = MARKER.state_of_block(self.flights[every]), int(self.rows[every, 0].max()) + 1
@@ -365,7 +378,9 @@ class Square:
     def fit(
         self, chosen: np.ndarray, start: np.ndarray, names: tuple[str, ...], rounds: int = 3
     ) -> tuple[np.ndarray, Marker]:
-        """Fit block and marker to bounded distances of the chosen drops, over one bounce and, with less weight, two."""
+        """Fit block and marker to the chosen drops. Large distances are bounded, and the second bounce has a smaller
+        weight.
+        """
 
         def numbers(x: np.ndarray) -> tuple[np.ndarray, Marker]:
             block = start.copy()
@@ -381,7 +396,7 @@ class Square:
             distance = sum(share * (d / (1.0 + d / 0.02)).mean() for share, d in ((1.0, one), (0.3, two)))
             return float(1e3 * distance + 0.3 * np.minimum(angle, 1.0).mean())
 
-        # the first values of the marker come from the angles and heights at rest
+        # the first values of the marker follow from the angles and heights at rest
         x = np.array([-0.0335, 3.4e-4, 5.2e-4, *(float(start[name]) for name in names)])
         step = np.array([0.005, 3e-4, 3e-4, *(0.12 * abs(float(start[name])) + 1e-4 for name in names)])
         for turn in range(rounds):
@@ -390,7 +405,7 @@ class Square:
         return numbers(x)
 
     def of_preset(self) -> dict[str, Any]:
-        """Return the errors of the preset `measured_square` over 1, 2, 3 bounces."""
+        """Return the errors of the preset `measured_square` over one, two and three bounces."""
         scene, far = load_scene("measured_square"), []
         for bounces in (1, 2, 3):
             chosen, poses = np.flatnonzero(self.rows[:, bounces - 1] > 0), []
@@ -403,10 +418,10 @@ class Square:
         return medians(far)
 
     def near_twins(self) -> dict[str, Any]:
-        """Return the distance over one bounce between measured drops with nearly the same first flight.
+        """Return the distance over one bounce between pairs of measured drops with nearly equal first flights.
 
-        The drops are compared from the time when the centre is 50 mm above the table. Differences in x and whole
-        quarter turns are removed.
+        The drops are compared from the time at which the centre is 50 mm above the table. Differences in x and whole
+        quarter turns are subtracted.
         """
         gravity, height = float(SQUARE["gravity"]), 0.05
         # time from the last row of the flight until the centre is 50 mm above the table
@@ -428,7 +443,9 @@ class Square:
         return {"pairs": len(apart), "distance_mm": round(1e3 * float(np.median(apart)), 1)}
 
     def held_out(self, start: np.ndarray = SQUARE, names: tuple[str, ...] = FITTED) -> dict[str, Any]:
-        """Fit to each half and return the errors on the other half over 1, 2, 3 bounces."""
+        """Fit block and marker to each half of the drops. Return the errors on the other half over one, two and three
+        bounces.
+        """
         half = np.random.default_rng(1).permutation(len(self.usable)) % 2
         far: list[list[np.ndarray]] = [[], [], []]
         fitted = []
@@ -442,7 +459,7 @@ class Square:
 
 
 def medians(far: list[np.ndarray]) -> dict[str, Any]:
-    """Return the medians of distances in m and angles in rad, shape (n, 2) each, over 1, 2, 3 bounces."""
+    """Return the medians of distances [m] and angles [rad], shape (n, 2) each, over one, two and three bounces."""
     return {
         "drops": [len(one) for one in far],
         "distance_mm": [round(1e3 * float(np.median(one[:, 0])), 1) for one in far],
@@ -451,7 +468,7 @@ def medians(far: list[np.ndarray]) -> dict[str, Any]:
 
 
 def of_drops(drops: Drops) -> dict[str, Any]:
-    """Return for both blocks the distances over 1, 2, 3 bounces, and coverage and score of the bands by bounce."""
+    """Return the distances of both blocks over one, two and three bounces, and coverage and score of the bands."""
     found: dict[str, Any] = {}
     kinds = {
         "rounded corners, falling restitution and friction, marker": (SQUARE, MARKER),
@@ -512,7 +529,7 @@ def of_table(drops: Drops) -> dict[str, Any]:
 
 
 def of_heights(drops: Drops) -> dict[str, Any]:
-    """Return how much the height of the table differs between drops, by the heights at rest and at impacts."""
+    """Return the spread of the table's height between drops, from the heights at rest and at impacts."""
     square, t = load_scene("measured_square"), np.arange(drops.pose.shape[1]) / RATE_HZ
     nothing = Load(t[[0, -1]], np.zeros((2, 3)))
     places, rests, hits = [], [], []

@@ -19,7 +19,7 @@ def _part(name: str) -> dict[str, Any]:
 
 
 def measured_laws() -> str:
-    """Return RMS and median errors in m/s of each law with each friction."""
+    """Return the table of RMS and median errors [m/s] of each contact law with each friction model."""
     found = _part("ellipse")
 
     def figures(name: str) -> str:
@@ -32,7 +32,7 @@ def measured_laws() -> str:
 
 
 def measured_drops() -> str:
-    """Return distances, angles, coverage and scores of the drops."""
+    """Return the table of distances, angles, coverage and scores of the drops."""
     rows = []
     for name, one in _part("square").items():
         coverage = ["x {:.2f}, z {:.2f}, theta {:.2f}".format(*each) for each in one["coverage"]]
@@ -53,7 +53,9 @@ def measured_drops() -> str:
 
 
 def measured_rigid() -> str:
-    """Return errors of rigid and compliant impacts, with and without two corners that hit at once."""
+    """Return the table of errors of rigid and compliant impacts, with and without two corners that touch
+    simultaneously.
+    """
     found = _part("square_rigid")
     e, mu = found["e, mu"]
     names = {
@@ -65,7 +67,7 @@ def measured_rigid() -> str:
 
 
 def measured_table() -> str:
-    """Return errors of the estimated height of the drop table."""
+    """Return the table of errors of the estimated height of the table."""
     found = _part("table")
     rows = {
         "estimated": f"{found['estimated']} of {found['drops']} drops",

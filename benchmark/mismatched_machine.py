@@ -1,7 +1,7 @@
-"""A machine with properties that a scene lacks: its own equations, integrated with fixed Runge-Kutta steps.
+"""A machine with properties that a scene does not have, integrated by fixed Runge-Kutta steps.
 
-It does not use the solver. Walls may differ in stiffness, corners may be round and rub, pads may be displaced, and the
-frame may stand on a spring. Only heads with `rotation: paper` are modelled.
+The equations are independent of the solver. Walls may differ in stiffness, corners may be rounded and have friction,
+pads may be displaced, and the frame may be on a spring. The rotation of the head is that of `rotation: paper`.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from plow_twin.model.scene import Scene
 
 Array = NDArray[np.float64]
 
-#: Steps in the shortest period of a contact's oscillation, and longest step [s].
+#: Number of steps in the shortest period of a contact oscillation, and longest step [s].
 _STEPS_A_PERIOD, _LONGEST_STEP = 60.0, 1e-4
-#: Mass [kg] and damping ratio of a frame that stands on a spring.
+#: Mass [kg] and damping ratio of a frame on a spring.
 _FRAME_MASS, _FRAME_DAMPING = 500.0, 0.1
-#: Speed in m/s below which friction is viscous.
+#: Speed [m/s] below which friction is viscous.
 _CREEP = 0.005
 
 
 @dataclass(frozen=True)
 class Machine:
-    """Properties of the machine that a scene lacks."""
+    """Properties of the machine that a scene does not have."""
 
-    #: stiffness of each pair relative to the contact's, shape (8,)
+    #: Stiffness of each pair, relative to the stiffness of the contact, shape (8,).
     stiffness_share: Array
-    #: distance by which the wall of each pair lies farther out [m], shape (8,)
+    #: Outward displacement of the wall of each pair [m], shape (8,).
     depth: Array
     radius: float = 0.0
     friction: float = 0.0
-    #: stiffness of the spring under the frame, along x and along y [N/m]; 0 for a fixed frame
+    #: Stiffness of the spring under the frame along x and y [N/m]; 0 for a fixed frame.
     spring: float = 0.0
 
 

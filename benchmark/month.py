@@ -1,9 +1,9 @@
-"""The wear coefficient after a simulated month: `python benchmark/month.py --truths 20`.
+"""Estimate of the wear coefficient after a simulated month: `python benchmark/month.py --truths 20`.
 
-A head works for a month under a broad-band load. On some days, a noisy, biased and late sensor measures its pose over
-ten load periods; the given load is 5 % off. `estimate` finds the clearances from these data, and their growth gives the
-coefficient. The true wear is computed in steps a quarter as long as the estimate's, with means over four times as many
-periods.
+A head works for a month under a broad-band load. On some days, a sensor with noise, bias and delay measures its pose
+over ten load periods. The load that the estimate gets has an error of 5 %. `estimate` estimates the clearances from
+these data, and their growth gives the coefficient. The true wear is computed with shorter steps (a quarter) and with
+means over more periods (four times as many) than the wear of the estimate.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from plow_twin.stream.outputs import clearances
 Array = NDArray[np.float64]
 DAYS = np.linspace(0.0, 30.0, 7)
 SPEED_M_S, PAD_AREA_M2 = 2.0, 0.06
-#: 5 % and 95 % points [m^2/N] of the prior, from which the true coefficient is drawn.
+#: 5 % and 95 % points of the prior [m^2/N]. The true coefficient is drawn from this prior.
 PRIOR = (3e-16, 3e-15)
-#: The coefficient should be right within this factor.
+#: Largest factor between the estimated and the true coefficient that is acceptable.
 FACTOR = 1.3
 #: Sampling intervals [s] of the true load, of the given load and of the pose.
 _FINE, _LOAD_STEP, _POSE_STEP = 1e-3, 2e-3, 1e-2
 _SPAN = 10.0 * PERIOD
-#: Standard deviations of the broad-band part of the load [N, N, N m] and of the sensor's noise [m, m, rad].
+#: Standard deviations of the broad-band part of the load [N, N, N m], and of the noise of the sensor [m, m, rad].
 _BROAD, _NOISE = np.array([8e3, 4e3, 1.1e4]), np.array([5e-4, 5e-4, 2e-3])
 
 
@@ -67,13 +67,13 @@ def machine(rng: np.random.Generator) -> Machine:
 
 
 def load_of(one: Machine, rng: np.random.Generator, span: float) -> tuple[Array, Array]:
-    """Return the times and the samples of the load that the estimate gets."""
+    """Return the times and samples of the load that the estimate gets."""
     t = np.arange(0.0, span + _FINE, _FINE)
     return t, compile_loads(one.believed.loads).at(t) + cutting(rng, t) * _BROAD
 
 
 def visit(one: Machine, worn: Scene, rng: np.random.Generator) -> tuple[Load, Poses]:
-    """Return the measurements of a worn machine: the load given to the estimate, and the poses of the sensor."""
+    """Return the measurements of a worn machine: the load for the estimate, and the poses of the sensor."""
     t, believed = load_of(one, rng, _SPAN)
     motion = simulate(replace(worn, loads=(Table("cutting", t, believed * one.gain),)), _SPAN, _FINE, 1e-6)
     at = np.arange(0.0, _SPAN, _POSE_STEP)
@@ -85,7 +85,9 @@ def visit(one: Machine, worn: Scene, rng: np.random.Generator) -> tuple[Load, Po
 
 
 def one_month(seed: int, day_m: float) -> dict[str, Any]:
-    """Estimate the clearances on each of `DAYS`, with `day_m` of travel along the face per day, and the coefficient."""
+    """Estimate the clearances on each of the `DAYS`, and the coefficient, with `day_m` of travel along the face per
+    day.
+    """
     rng = np.random.default_rng([20261123, seed])
     one = machine(rng)
     path = true_path(one, rng, day_m)

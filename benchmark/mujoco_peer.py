@@ -1,10 +1,10 @@
 """MuJoCo on the Kelvin-Voigt bench scene.
 
-Each frame corner is a fixed sphere of radius r, and the walls of the cavity are boxes on the head, moved outwards by r.
-A negative `solref` sets the stiffness and damping of a constraint, scaled by the bodies' inverse weight A and the
-impedance d. The force is K d + C d' if d is small and solref = -(K, C) A (1 - d), with A so large (times 1e6) that the
-regularisation of the constraint outweighs the coupling of the contacts. Contacts never pull, as in F = max(0, K d + C
-d'). A law with d^1.5 cannot be expressed in this way.
+Each corner of the frame is a fixed sphere of radius r. The walls of the cavity are boxes on the head, displaced
+outwards by r. A negative `solref` sets the stiffness and damping of a constraint. MuJoCo scales them by the inverse
+weight A of the bodies and the impedance d. With a small d and solref = -(K, C) A (1 - d), the force is K d + C d'. A is
+multiplied by 1e6, so that the regularisation of the constraint outweighs the coupling of the contacts. Contacts never
+pull, as in F = max(0, K d + C d'). A law with d^1.5 is not possible.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def _model(p: Array, integrator: str, dt: float) -> Any:
 
 
 def prepare(p: Array, integrator: str, dt: float, output_dt: float) -> Callable[[], Sample]:
-    """Prepare a run with `mujoco.rollout` (the loop is compiled); loads are sampled at the middle of each step."""
+    """Prepare a run with `mujoco.rollout`, whose loop is compiled. Loads are sampled at the middle of each step."""
     import mujoco
     from mujoco import rollout
 
@@ -68,7 +68,8 @@ def prepare(p: Array, integrator: str, dt: float, output_dt: float) -> Callable[
     applied[0] = load[:, None] * p[11:14] - np.array([0.0, 0.0, p[4] * p[6] * p[7]])
     start = np.zeros((1, mujoco.mj_stateSize(model, full)))
     mujoco.mj_getState(model, mujoco.MjData(model), start[0], full)
-    # the states of all steps take much memory, so the run is cut into pieces, of which only the engine's part is timed
+    # the states of all steps need much memory, so the run is divided into pieces; only the time in the engine is
+    # measured
     piece = max(stride, 20_000 // stride * stride)
 
     def run() -> Sample:

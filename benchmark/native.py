@@ -1,4 +1,4 @@
-"""Compile the benchmark's C programs, again only after a change of their source."""
+"""Compilation of the benchmark's C programs, repeated only if their source has changed."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ FLAGS = ("-O3", "-march=native", "-std=gnu11", "-Wall")
 
 
 class NotInstalled(Exception):
-    """A program or library that a peer needs is missing."""
+    """A program or library that a peer needs is not installed."""
 
 
 def compile_c(source: str, libraries: Sequence[str], flags: Sequence[str] = FLAGS) -> str:
-    """Compile the file `source` of this folder, and return the path of the program, or raise `NotInstalled`."""
+    """Compile the file `source` of this folder. Return the path of the program, or raise `NotInstalled`."""
     compiler = shutil.which("gcc")
     if compiler is None:
         raise NotInstalled("no gcc on PATH")

@@ -1,8 +1,8 @@
-"""`plow-twin live` on an OPC UA server that writes three values at 1 kHz: loss, share of a core, age at the twin.
+"""`plow-twin live` with an OPC UA server that writes three values at 1 kHz: loss, share of a core, and age.
 
-`python benchmark/live_load.py --opcua [--minutes 10]` first connects a bare asyncua client for a tenth of the time. It
-shows the age that the server and the loopback connection cause alone. Both processes ask for SCHED_FIFO, so that other
-programs do not delay them. The load of the machine is printed with the figures.
+`python benchmark/live_load.py --opcua [--minutes 10]` first connects a bare asyncua client for a tenth of the time. The
+age at this client is the part that the server and the loopback connection cause. Both processes request SCHED_FIFO, so
+that other programs do not delay them. The load of the machine is printed with the results.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from live_load import ROOT, cpu_s
 
 NODES = ("Load.Fx", "Load.Fy", "Load.M")
 NAMESPACE = 2
-#: Publishing interval [ms] and queue length that the bare client requests, as the twin does.
+#: Publishing interval [ms] and queue length that the bare client requests, which are those of the twin.
 PUBLISHING_MS, QUEUE = 10.0, 10_000
-#: Time without a value after which the bare client ends [s].
+#: Time [s] without a value after which the bare client ends.
 SILENCE_S = 3.0
 MAP = "excitation: {fx: {node: ns=2;s=Load.Fx}, fy: {node: ns=2;s=Load.Fy}, m: {node: ns=2;s=Load.M}}\n"
-#: Targets: 99th percentile of the age [ms], share of a core.
+#: Targets: largest 99th percentile of the age [ms], and largest share of a core.
 MOST_AGE_MS, MOST_CORE = 15.0, 0.5
 
 
 def at_once() -> bool:
-    """Ask for SCHED_FIFO; return whether the system grants it."""
+    """Request SCHED_FIFO. Return whether the system grants it."""
     with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
         return True
@@ -45,7 +45,7 @@ def at_once() -> bool:
 
 
 async def serve(port: int, rate_hz: float, seconds: float) -> None:
-    """Serve three nodes; when a client subscribes, write values stamped with the time of writing."""
+    """Serve three nodes. When a client subscribes, write values whose stamps are the time of writing."""
     from asyncua import ua
     from asyncua.server.server import Server
     from asyncua.ua.status_codes import StatusCodes
@@ -106,7 +106,7 @@ def _quantiles(ages: list[float]) -> dict[str, float]:
 
 
 def measure(minutes: float, rate_hz: float) -> bool:
-    """Print the figures of the bare client and of the twin; return whether each sample was used or counted."""
+    """Print the results of the bare client and of the twin. Return whether each sample was used or counted."""
     seconds = 60.0 * minutes
     with _server(rate_hz, 0.1 * seconds) as (_, port):
         bare = subprocess.run(
@@ -131,7 +131,7 @@ def measure(minutes: float, rate_hz: float) -> bool:
 def _live(
     folder: Path, server: subprocess.Popen[str], port: int, rate_hz: float, seconds: float
 ) -> tuple[dict[str, float], float]:
-    """Run the twin until the server has written all values; return its figures, and the load of other programs."""
+    """Run the twin until the server has written all values. Return its figures, and the load by other programs."""
     (folder / "map.yaml").write_text(MAP)
     settings = [word for text in ("priority=10", f"expected_rate={rate_hz}") for word in ("--set", text)]
     twin = subprocess.Popen(
@@ -182,7 +182,7 @@ def _server(rate_hz: float, seconds: float) -> Iterator[tuple[subprocess.Popen[s
 
 
 def _machine_s() -> float:
-    """Return the busy time of all processors in s."""
+    """Return the busy time of all processors [s]."""
     fields = list(map(int, Path("/proc/stat").read_text().splitlines()[0].split()[1:9]))
     return (sum(fields) - fields[3] - fields[4]) / os.sysconf("SC_CLK_TCK")
 

@@ -30,12 +30,12 @@ STYLES: dict[str, tuple[str, str]] = {
     "MuJoCo RK4": ("#8c510a", ">"),
     "Exudyn RK44": ("#dfa526", "h"),
 }
-#: Engines that have only rows 1 ms apart, drawn together with the sparse rows of the other solvers.
+#: Engines that have only dense rows, 1 ms apart. They are drawn together with the sparse rows of the other solvers.
 _DENSE_ONLY = ("MuJoCo", "Exudyn")
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Draw error against time for both bench scenes."""
+    """Draw error against run time for both bench scenes."""
     figure, panels = plt.subplots(1, 2, figsize=(12.5, 5.6), sharey=True, layout="constrained")
     titles = {"kv": "Kelvin-Voigt, F = max(0, K d + C d')", "hc": "Hunt-Crossley, F = max(0, K d$^{1.5}$ (1 + λ d'))"}
     for panel, (scene, title) in zip(panels, titles.items(), strict=True):

@@ -22,13 +22,13 @@ STYLES = {
     "plain": "#1f4e9c", "sensor": "#5aae61", "stochastic": "#dfa526", "middle": "#8c510a", "firm": "#35978f",
     "hard": "#d62728", "hard_sensor": "#9970ab",
 }  # fmt: skip
-#: First seed that no tuning used.
+#: First seed that was not used for tuning.
 _FRESH = 50_000
 _MOST_MM = 0.5
 
 
 def draw(rows: Sequence[dict[str, Any]], lives: Sequence[dict[str, Any]], path: Path) -> None:
-    """Draw errors with intervals over the stiffness, the coverage of intervals, and forecasts over a life."""
+    """Draw the errors with intervals against the stiffness, the coverage of intervals, and the forecasts of lives."""
     figure, panels = plt.subplots(2, 2, figsize=(12.5, 8.2), layout="constrained")
     for panel, axis, name in zip(panels[0], "hv", ("horizontal", "vertical"), strict=True):
         for group, color in STYLES.items():
@@ -45,7 +45,7 @@ def draw(rows: Sequence[dict[str, Any]], lives: Sequence[dict[str, Any]], path: 
 
 
 def fresh(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the newest row of each held-out truth."""
+    """Return the newest row of each truth that was not used for tuning."""
     newest = {(row["group"], row["seed"]): row for row in rows if row["seed"] >= _FRESH and "not_drawn" not in row}
     return list(newest.values())
 
@@ -57,7 +57,7 @@ def _draw_errors(panel: Any, rows: Sequence[dict[str, Any]], axis: str, color: s
     bars = np.array([1e3 * NORMAL_P95 * row[f"{axis}_sd_m"] for row in known])
     panel.errorbar(stiffness, errors, bars, fmt=".", color=color, label=title, linewidth=0.8, markersize=4)
     unknown = [row["stiffness"] for row in rows if row[f"{axis}_state"] != State.ESTIMATED.value]
-    # a truth without an estimate is a tick at the lower edge
+    # a truth without an estimate is marked at the lower edge
     panel.plot(unknown, [-0.98 * _MOST_MM] * len(unknown), "|", color=color, markersize=9)
 
 

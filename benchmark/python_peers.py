@@ -1,4 +1,5 @@
-"""Peers called from Python: SciPy's solvers and scikit-sundae's CVODE, with the jitted right-hand side of `lean`."""
+"""Peers that are called from Python: solvers of SciPy, and CVODE from scikit-sundae, with the compiled rates of `lean`.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ from bench_scenes import T_END
 from cases import Array, Sample, timed
 from lean import rhs_into
 
-#: Absolute tolerances divided by rtol, a tenth of the usual size of poses (1e-2) and velocities (1).
+#: Absolute tolerances divided by rtol: a tenth of the usual magnitude of poses (1e-2) and velocities (1).
 _ATOL = np.array([1e-3, 1e-3, 1e-3, 1e-1, 1e-1, 1e-1])
 
 
@@ -22,7 +23,7 @@ def _grid(output_dt: float) -> Array:
 
 
 def _rhs(p: Array) -> Rhs:
-    """Return a compiled function for the rate of the state."""
+    """Return a compiled function for the time derivative of the state."""
 
     def rhs(t: float, y: Array) -> Array:
         out = np.empty(6)

@@ -12,7 +12,7 @@ from work_precision import OURS_BARE, prepare_bare
 from plow_twin import Scene, SolverError
 
 TOLERANCES = (1e-3, 1e-6, 1e-9)
-#: Growth of a displacement at t = 0 above which no step control can keep a tolerance; such scenes are listed
+#: Growth of a displacement at t = 0 above which no step control can keep a tolerance. Scenes above it are listed
 #: separately.
 AMPLIFIES = 1e4
 QUICK_COUNT = 10
@@ -21,7 +21,7 @@ QUICK_COUNT = 10
 def random_rows(few: bool, notify: Callable[[str], None]) -> Iterator[Row]:
     """Yield a row for each random scene with its error in tolerances (`value`) and its amplification.
 
-    With `few`, only scenes are run that use the kernel of the KV bench scene.
+    With `few`, only scenes that use the same kernel as the KV bench scene are run.
     """
     saved = random_scenes.load()
     chosen = [index for index, scene in enumerate(saved.scenes) if not few or _is_plain(scene)]
@@ -33,7 +33,7 @@ def random_rows(few: bool, notify: Callable[[str], None]) -> Iterator[Row]:
 
 
 def exponent_of(row: Row) -> float:
-    """Return the exponent of the contact law, from the name of the row's scene."""
+    """Return the exponent of the contact law, parsed from the name of the row's scene."""
     found = re.search(r" n=(\S+)", row.scene)
     assert found is not None
     return float(found[1])

@@ -1,6 +1,6 @@
-"""Seeded random scenes and their reference trajectories, made by `reference.c` in extended precision.
+"""Random scenes from a seed, and their reference trajectories, computed by `reference.c` in extended precision.
 
-`python benchmark/random_scenes.py` draws the scenes and runs the references again; it needs gcc with libquadmath.
+`python benchmark/random_scenes.py` draws the scenes and computes the references again. It needs gcc with libquadmath.
 """
 
 from __future__ import annotations
@@ -27,10 +27,11 @@ HERE = Path(__file__).resolve().parent
 DATA = HERE / "data" / "random_scenes.npz"
 COUNT, SEED = 200, 20150419
 T_END, OUTPUT_DT = 1.0, 0.02
-#: Tolerance of a step and longest step in contact, for two reference runs in each arithmetic.
+#: Tolerance of a step, and longest step in contact, of the two reference runs in each arithmetic.
 LONG_DOUBLE = (1e-16, 0.6), (1e-15, 1.0)
 QUAD = (1e-21, 0.6), (1e-19, 1.0)
-#: If the two runs differ by more than this multiple of the clearance, both are repeated in 113-bit arithmetic.
+#: Largest difference between the two runs, relative to the clearance. If it is larger, both runs are repeated in
+#: 113-bit arithmetic.
 AGREED = 1e-11
 PERTURBATION = 1e-12
 _KINDS = {"kelvin_voigt": 0, "hunt_crossley": 1, "exact_restitution": 2}
@@ -38,7 +39,7 @@ _KINDS = {"kelvin_voigt": 0, "hunt_crossley": 1, "exact_restitution": 2}
 
 @dataclass(frozen=True)
 class ReferenceRun:
-    """A reference trajectory with poses `q` (rows, 3), and its cost."""
+    """A reference trajectory with poses `q`, shape (rows, 3), and its cost."""
 
     q: NDArray[np.float64]
     finished: bool
@@ -49,10 +50,10 @@ class ReferenceRun:
 
 @dataclass(frozen=True)
 class RandomScenes:
-    """The scenes with reference poses `q` (n, rows, 3) at the times `t` (rows,).
+    """The scenes with reference poses `q`, shape (n, rows, 3), at the times `t`, shape (rows,).
 
-    `disagreement` (n,) is the largest distance between the two reference runs in clearances (see `distance`).
-    `amplification` (n,) is the growth of a displacement of 1e-12 clearances at t = 0.
+    `disagreement`, shape (n,), is the largest distance between the two reference runs (see `distance`).
+    `amplification`, shape (n,), is the growth of a displacement of 1e-12 clearances at t = 0.
     """
 
     scenes: Sequence[Scene]
@@ -63,12 +64,14 @@ class RandomScenes:
     events: NDArray[np.int64]
 
     def chaotic(self, tol: float) -> NDArray[np.bool_]:
-        """Return which scenes have no reference for `tol`, because their two runs differ by a tenth of it or more."""
+        """Return a mask of the scenes without a reference for `tol`: their two runs differ by at least a tenth of
+        `tol`.
+        """
         return ~(self.disagreement <= 0.1 * tol)
 
 
 def distance(scene: Scene, q: NDArray[np.float64], reference: NDArray[np.float64]) -> float:
-    """Return the largest pose error relative to the smaller clearance; angles are multiplied by the half diagonal."""
+    """Return the largest pose error relative to the smaller clearance. Angles are multiplied by half the diagonal."""
     scale = np.array([1.0, 1.0, half_diagonal(scene)]) / length_scale(scene)
     return float((np.abs(q - reference) * scale).max())
 
@@ -125,7 +128,7 @@ def _draw_contact(rng: np.random.Generator, mass: float) -> Contact:
 
 
 def reference_line(scene: Scene, t_end: float, output_dt: float) -> str:
-    """Return the scene as the line of numbers that `reference.c` reads."""
+    """Return the scene as a line of numbers for `reference.c`."""
     contact, law = scene.contact, LAWS[scene.contact.law]
     kind = _KINDS[contact.law]
     damping = contact.damping if contact.restitution is None else law.damping_number(contact.restitution)
@@ -169,7 +172,7 @@ def reference_run(
 
 
 def make() -> None:
-    """Draw the scenes, run their references and save both to `DATA`."""
+    """Draw the scenes, compute their references, and write both to `DATA`."""
     rng = np.random.default_rng(SEED)
     scenes = [draw_scene(rng) for _ in range(COUNT)]
     rows = round(T_END / OUTPUT_DT) + 1
@@ -198,7 +201,7 @@ def make() -> None:
 
 
 def load() -> RandomScenes:
-    """Read the saved scenes and references; no scene is drawn again."""
+    """Read the stored scenes and references."""
     with np.load(DATA) as saved:
         restitution = json.loads(str(saved["restitution"]))
         scenes = [_scene_of(line, e) for line, e in zip(saved["lines"], restitution, strict=True)]
@@ -208,7 +211,7 @@ def load() -> RandomScenes:
 
 
 def _scene_of(line: str, restitution: float | None) -> Scene:
-    """Build a scene from its `reference_line`, which has every parameter except the restitution."""
+    """Return the scene of a line from `reference_line`, which contains all parameters except the restitution."""
     n = [float(word) for word in line.split()]
     law = list(_KINDS)[int(n[14])]
     damping = n[12] if restitution is None else None

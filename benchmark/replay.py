@@ -1,12 +1,13 @@
 """Speed of replay and of reading the same file, and size of a recording: `python benchmark/replay.py [SECONDS]`.
 
-The paper's head is recorded at 1 kHz with all outputs. The program prints the size; the speed of replay as a multiple
-of real time, of all messages and of digests alone; its upper bounds, the motion alone and decompression alone; and the
-speed of a drawing thinned like that of an hour, and of reading the file with `mcap` and `rosbags`. Times are processor
-times of one thread, the least of some runs.
+The paper's head is recorded at 1 kHz with all outputs. The program prints the size of the recording, and speeds as
+multiples of real time:
 
-The start of a replay (scene, twin, loading of compiled code) has its own row. The other times include it; the last
-column does not.
+- replay of all messages, and replay of digests alone - upper bounds of the replay: the motion alone, and decompression
+alone - drawing of a long run, and reading of the file with `mcap` and `rosbags`
+
+Times are processor times of one thread, the shortest of several runs. The start of a replay (scene, twin, and loading
+of compiled code) has its own row. The last column of a replay excludes the start.
 """
 
 from __future__ import annotations
@@ -38,12 +39,12 @@ _AMPLITUDE = np.array([32_000.0, -11_000.0, -45_495.0])
 _START_NS = 1_800_000_000_000_000_000
 _REPEATS = 5
 _BATCH = 8192
-#: Length of a recording whose replay is hardly more than its start [s].
+#: Length [s] of a recording whose replay takes hardly longer than its start.
 _SHORT_S = 0.1
 
 
 def record(folder: Path, seconds: float, outputs: bool) -> int:
-    """Record a run and return its size in bytes."""
+    """Record a run. Return its size [B]."""
     scene = load_scene(scene_path("paper"))
     kind = "all" if outputs else "none"
     header = RunHeader(dump_scene(scene), record_outputs=kind)
@@ -64,7 +65,7 @@ def record(folder: Path, seconds: float, outputs: bool) -> int:
 
 
 def least(work: Callable[[], object]) -> float:
-    """Return the least processor time of some runs [s]."""
+    """Return the shortest processor time of several runs [s]."""
     times = []
     for _ in range(_REPEATS):
         begin = time.thread_time()
@@ -79,7 +80,7 @@ def _wrenches(index: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def move(seconds: float, rows: bool) -> None:
-    """Advance a twin by the samples of the recording, with or without the rows of its publications."""
+    """Advance a twin by the samples of the recording, with or without computing the rows of its publications."""
     twin = Twin(load_scene(scene_path("paper")), excitation="sampled")
     index, memory = np.arange(round(1000 * seconds)), np.zeros(_BATCH, ROW)
     for begin in range(0, len(index), _BATCH):
@@ -108,14 +109,14 @@ def read_rosbags(folder: Path) -> None:
 @click.command()
 @click.argument("seconds", type=click.FloatRange(min=_SHORT_S), default=60.0)
 def main(seconds: float) -> None:
-    """Record SECONDS (60) of the paper's head, replay them, and print times real time."""
+    """Record SECONDS (60) of the paper's head, replay the recording, and print all speeds."""
     with tempfile.TemporaryDirectory() as name:
         full, bare, short = (Path(name) / folder for folder in ("full", "bare", "short"))
         for folder, outputs in ((full, True), (bare, False)):
             size = record(folder, seconds, outputs)
             print(f"{folder.name:8} {size / seconds / 1e3:8.1f} kB/s {size / seconds * 3.6e-3:8.0f} MB/h")
         record(short, _SHORT_S, True)
-        replay(short)  # compiles
+        replay(short)  # this call compiles the code
         replay(short, digests_only=True)
         start = least(lambda: replay(short))
         print(f"{'start of a replay':26} {start:8.3f} s")
@@ -130,7 +131,7 @@ def main(seconds: float) -> None:
             "read with mcap": lambda: read_mcap(full / "full_0.mcap"),
             "read with rosbags": lambda: read_rosbags(full),
         }
-        to_rrd(full, Path(name) / "full.rrd")  # compiles
+        to_rrd(full, Path(name) / "full.rrd")  # this call compiles the code
         for title, work in works.items():
             spent = least(work)
             apart = f", {seconds / (spent - start):.0f} x without its start" if title.startswith("replay") else ""

@@ -1,7 +1,7 @@
-"""Nominal restitution of each contact law, compared with that of a free impact that our solver computes.
+"""Nominal restitution of each contact law, compared with the restitution of a free impact that our solver computes.
 
 `python benchmark/restitution.py` writes `benchmark/results/restitution.csv`, the picture `docs/images/restitution.png`
-and the measured part of `benchmark/results/restitution.md`.
+and the generated part of `benchmark/results/restitution.md`.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ PICTURE = ROOT / "docs" / "images" / "restitution.png"
 PAGE = ROOT / "benchmark" / "results" / "restitution.md"
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 
-#: Nominal restitutions in the CSV file and on the page, and damping ratios C / (2 sqrt(K m)) of Kelvin-Voigt.
+#: Nominal restitutions in the CSV file and on the page, and damping ratios C / (2 sqrt(K m)) of Kelvin-Voigt contacts.
 ASKED = tuple(round(0.01 * k, 2) for k in range(101))
 SHOWN = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 RATIOS = (0.0, 0.01, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0)
-#: Lengths of the ramp, as multiples of the depth v sqrt(m/K) of the undamped impact.
+#: Lengths of the ramp, as multiples of the penetration v sqrt(m/K) of the undamped impact.
 RAMPS = (0.001, 0.01, 0.1, 0.3, 1.0, 3.0, 10.0)
-#: Largest relative difference between delivered and nominal restitution of a valid law.
+#: Largest relative difference between the computed and the nominal restitution for which a law is valid.
 VALID = 0.05
 
 MASS_KG, SPEED_M_S, STIFFNESS, EXPONENT = 2.0, 1.0, 1e9, 1.5
-#: Stiffness of the laws that add C d' to a linear spring [N/m].
+#: Stiffness [N/m] of the laws that add C d' to a linear spring.
 LINEAR_STIFFNESS = 1e6
-#: Floor of the impact speed [m/s], so low that all restitutions below 1 share compiled kernels.
+#: Lower limit of the impact speed [m/s]. It is so low that all restitutions below 1 use the same compiled kernels.
 FLOOR = 1e-6
 
 
@@ -45,7 +45,7 @@ class Row:
     """One free impact.
 
     `asked` is a restitution, or a damping ratio for laws that add C d'. `ramp` is the length of the ramp, divided by
-    the depth of the undamped impact.
+    the penetration of the undamped impact.
     """
 
     law: str
@@ -56,7 +56,7 @@ class Row:
 
 def free_impact(contact: Contact, mass: float = MASS_KG, speed: float = SPEED_M_S) -> float:
     """Return the ratio of the speeds after and before the impact of a point mass on a wall."""
-    # the head does not turn because of its inertia; with a harmonic, it uses the kernels of the presets
+    # a large inertia prevents rotation; the harmonic load selects the compiled kernels of the presets
     scene = Scene(
         head=Head(mass, 1e18),
         frame=Frame(0.2, 0.2),
@@ -67,7 +67,7 @@ def free_impact(contact: Contact, mass: float = MASS_KG, speed: float = SPEED_M_
         initial=Initial((0.0, 0.0, 0.0), (0.0, -speed, 0.0)),
         pairs=("top_left_top",),
     )
-    # at 1 m/s the mass reaches the wall after 5 ms and, with D at its largest, rebounds within some 50 ms
+    # at 1 m/s, the mass reaches the wall after 5 ms; with the largest D, it rebounds within some 50 ms
     result = simulate(scene, 0.2 / speed, output_dt=0.2 / speed, tol=1e-11)
     if result.penetration[-1, 0] > 0.0 or result.statistics["top_left_top"]["makes"] != 1:
         raise RuntimeError(f"{contact}: not one whole impact")
@@ -75,7 +75,7 @@ def free_impact(contact: Contact, mass: float = MASS_KG, speed: float = SPEED_M_
 
 
 def damped(ratio: float, ramp: float, stiffness: float, mass: float, speed: float) -> Contact:
-    """Return a Kelvin-Voigt contact with a damping ratio; if `ramp` > 0, C is ramped over `ramp` undamped depths."""
+    """Return a Kelvin-Voigt contact with a damping ratio. If `ramp` > 0, the damping is ramped (see `Row`)."""
     damping = 2.0 * ratio * math.sqrt(stiffness * mass)
     if ramp == 0.0:
         return Contact("kelvin_voigt", stiffness, damping=damping)
@@ -83,7 +83,7 @@ def damped(ratio: float, ramp: float, stiffness: float, mass: float, speed: floa
 
 
 def measure(law: str, asked: Iterable[float], ramp: float = 0.0) -> list[Row]:
-    """Measure one law for nominal restitutions, or for damping ratios if it adds C d'; Hertz has neither."""
+    """Measure one law for nominal restitutions, or for damping ratios if it adds C d'. Hertz contacts have neither."""
     rows = []
     for value in asked:
         if LAWS[law].takes_restitution:
@@ -177,7 +177,7 @@ def write_csv(rows: Sequence[Row], path: Path) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["law", "asked", "ramp", "delivered"])
-        # nine digits are the same on every machine
+        # nine digits are equal on all machines
         writer.writerows([row.law, f"{row.asked:g}", f"{row.ramp:g}", f"{row.delivered:.9f}"] for row in rows)
 
 

@@ -1,6 +1,6 @@
-"""The square as a rigid body whose corners hit one at a time: Routh's impacts with Poisson's restitution.
+"""The square as a rigid body: impacts of one corner at a time by Routh's method, with Poisson's restitution.
 
-Flights, rounded corners and marker are those of the compliant block, so that only the contact differs.
+Flights, rounded corners and marker are those of the compliant block, so that the two models differ only in the contact.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ import numpy as np
 
 from plow_twin.study.measured.square import RATE_HZ
 
-#: Time step in s, in which a corner moves at most 0.5 mm.
+#: Time step [s], in which a corner moves at most 0.5 mm.
 STEP = 2e-4
-#: Increment of the normal impulse per mass in Routh's integration, in m/s.
+#: Increment of the normal impulse per mass in Routh's integration [m/s].
 BIT = 5e-3
 Impact = Callable[..., tuple[np.ndarray, np.ndarray]]
 
 
 def rigid_toss(initial: np.ndarray, rows: int, block: np.ndarray, impact: Impact, e: float, mu: float) -> np.ndarray:
-    """Return the motions of rigid blocks from their initial states (m, 6), shape (m, rows, 6), at 250 Hz."""
+    """Return the motions of m rigid blocks at 250 Hz, shape (m, rows, 6), given their initial states, shape (m, 6)."""
     z = initial.copy()
     found = np.zeros((len(z), rows, 6))
     found[:, 0] = z
@@ -37,7 +37,9 @@ def rigid_toss(initial: np.ndarray, rows: int, block: np.ndarray, impact: Impact
 
 
 def deepest(z: np.ndarray, block: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return each corner's depth in m and the arms (across, up) from the centre to its lowest point, (m, 4) each."""
+    """Return the depth of each corner [m] and the arms (across, up) from the centre to its lowest point, shape (m, 4)
+    each.
+    """
     signs = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0]]) * float(block["half"])
     c, s = np.cos(z[:, 2:3]), np.sin(z[:, 2:3])
     across, up = c * signs[0] - s * signs[1], s * signs[0] + c * signs[1] - float(block["radius"])
@@ -45,7 +47,7 @@ def deepest(z: np.ndarray, block: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _hit(z: np.ndarray, block: np.ndarray, impact: Impact, e: float, mu: float) -> None:
-    """Apply an impact to each corner that is below the table's surface and moves down, the deepest first."""
+    """Apply an impact to each corner below the table's surface that moves down, in order of decreasing depth."""
     inertia = float(block["gyration"]) ** 2
     for _ in range(4):
         depth, across, up = deepest(z, block)
@@ -66,7 +68,8 @@ def _hit(z: np.ndarray, block: np.ndarray, impact: Impact, e: float, mu: float) 
 
 
 def two_at_once(tossed: np.ndarray, rows: np.ndarray, block: np.ndarray, within: float) -> np.ndarray:
-    """Return which motions (rows at intervals of 0.25 ms) have two corners in contact within `within` s."""
+    """Return a mask of the motions, rows every 0.25 ms, in which two corners are in contact within a time `within` [s].
+    """
     found = np.zeros(len(tossed), bool)
     width = math.ceil(within * 16.0 * RATE_HZ)
     for index, motion in enumerate(tossed):

@@ -1,6 +1,6 @@
-"""Measure run time against error of this solver and its peers; write the table, the picture and the pages' figures.
+"""Measure run time against error of this solver and its peers. Write the table, the picture and the pages' figures.
 
-`make bench` is one run. Rows are measured on one core unless they say otherwise.
+`make bench` is one run. Rows are measured on one core unless they state otherwise.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def _run(chosen: set[str], repeats: int, quick: bool, notify: Notify) -> list[Ro
 
 
 def _publish(rows: list[Row], measured: str) -> None:
-    """Draw the picture, write all tables to the results, and renew the figures of the pages."""
+    """Draw the picture, write all tables to the results, and update the figures of the pages."""
     import figures
     import plot
 

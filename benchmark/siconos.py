@@ -1,14 +1,14 @@
 """A slider with clearance in its guide, compared with the reference data of Siconos.
 
 The slider is that of Flores, Leine and Glocker, Multibody Syst. Dyn. 23 (2010) 165, table 1. Siconos computes it with
-rigid contact and time stepping. Its reference data are github.com/siconos/siconos-tutorials,
-examples/mechanics/SliderCrank/*.ref (Apache-2.0, INRIA), and not a part of this project. `python benchmark/siconos.py
-FOLDER` compares the `.ref` files of a copy of that folder and writes `benchmark/results/siconos.csv`.
+rigid contact and time stepping. The reference data are not part of this project. They are in
+github.com/siconos/siconos-tutorials, examples/mechanics/SliderCrank/*.ref (Apache-2.0, INRIA). `python
+benchmark/siconos.py FOLDER` compares the `.ref` files in a copy of that folder, and writes
+`benchmark/results/siconos.csv`.
 
-Both models have four corners in a guide. The slider of Siconos is driven by a crank and a rod, ours is a free body
-under loads. So the mechanism acts on our slider as a load m a(t). Here a(t) is the acceleration of the slider across
-the guide without contact, in the state of the reference at that time. Our solver then computes touches, restitution and
-rests.
+Both models have four corners in a guide. The slider of Siconos is driven by a crank and a rod. Our slider is a free
+body, on which the mechanism acts as a load m a(t). Here a(t) is the acceleration of the slider across the guide without
+contact, in the state of the reference at time t. Our solver computes touches, restitution and rests.
 """
 
 from __future__ import annotations
@@ -29,20 +29,21 @@ from plow_twin import Clearance, Contact, Frame, Gravity, Head, Initial, Result,
 Array = NDArray[np.float64]
 
 TABLE = Path(__file__).resolve().parent / "results" / "siconos.csv"
-# lengths of crank and rod, half length and half height of the slider, clearance on each side, in m
+# lengths of crank and rod, half length and half height of the slider, and clearance on each side [m]
 CRANK, ROD, HALF_LENGTH, HALF_HEIGHT, GAP = 0.153, 0.306, 0.05, 0.025, 0.001
 MASSES = (0.038, 0.038, 0.076)  # kg
 INERTIAS = (7.4e-5, 5.9e-4, 2.7e-6)  # kg m^2
 GRAVITY, RESTITUTION = 9.81, 0.4
-#: Angular velocities of crank and rod at the start in rad/s; all angles are 0.
+#: Angular velocities of crank and rod at the start [rad/s]. All angles are 0.
 START = (150.0, -75.0)
 PAIRS = ("top_left_top", "top_right_top", "bottom_right_bottom", "bottom_left_bottom")
-#: Columns of the reference: time, crank revolutions, rod angle, rates, height divided by clearance, four impulses.
+#: Columns of the reference: time, revolutions of the crank, angle of the rod, rates, height divided by clearance, and
+#: four impulses.
 _TIME, _TURNS, _ROD, _RATES, _HEIGHT, _IMPULSES = 0, 1, 2, slice(4, 6), 12, slice(21, 25)
 
 
 def gaps(y: Array, theta: Array) -> Array:
-    """Return the gap functions g1 .. g4 of the source, shape (n, 4), in m."""
+    """Return the gap functions g1 .. g4 of the source [m], shape (n, 4)."""
     s, c = HALF_LENGTH * np.sin(theta), HALF_HEIGHT * np.cos(theta)
     half = HALF_HEIGHT + GAP
     return np.stack([half - (y - s + c), half - (y + s + c), half + (y - s - c), half + (y + s - c)], axis=-1)
@@ -64,12 +65,12 @@ def inertia_and_force(angles: Array, rates: Array) -> tuple[Array, Array]:
 
 
 def across(angles: Array) -> Array:
-    """Return the derivatives of the slider's height by the angles, shape (2,)."""
+    """Return the derivatives of the slider's height with respect to the angles, shape (2,)."""
     return np.array([CRANK * math.cos(angles[0]), ROD * math.cos(angles[1])])
 
 
 def free_acceleration(angles: Array, rates: Array) -> tuple[float, float]:
-    """Return the acceleration across the guide without contact in m/s^2, and the effective mass in a contact in kg."""
+    """Return the acceleration [m/s^2] across the guide without contact, and the effective mass [kg] in a contact."""
     mass, force = inertia_and_force(angles, rates)
     row = across(angles)
     bent = CRANK * math.sin(angles[0]) * rates[0] ** 2 + ROD * math.sin(angles[1]) * rates[1] ** 2
@@ -78,7 +79,7 @@ def free_acceleration(angles: Array, rates: Array) -> tuple[float, float]:
 
 
 def rigid_motion(t_end: float, impacts: int) -> tuple[Array, Array, list[float]]:
-    """Integrate the mechanism with rigid, frictionless impacts that are located in time.
+    """Integrate the mechanism with rigid, frictionless impacts, located by event detection.
 
     Return times (n,), states (n, 4) of angles and rates, and the times of the first impacts.
     """
@@ -106,16 +107,16 @@ def rigid_motion(t_end: float, impacts: int) -> tuple[Array, Array, list[float]]
             row = across(state[:2])
             weight = np.linalg.solve(mass, row)
             state[2:] -= weight * (1.0 + RESTITUTION) * (row @ state[2:]) / (row @ weight)
-            # the rates jump, so a second row follows the impact
+            # the rates jump, so the state after the impact is a second row
             times.append(math.nextafter(time, math.inf))
             states.append(state)
     return np.array(times), np.array(states), found
 
 
 def our_slider(t: Array, angles: Array, rates: Array, stiffness: float, output_dt: float) -> Result:
-    """Simulate our head in the guide under the load of the mechanism at `angles` and `rates`, (n, 2) each.
+    """Simulate our head in the guide under the load of the mechanism at `angles` and `rates`, shape (n, 2) each.
 
-    Our head is a cavity that moves about a fixed block, so its height is minus that of the slider.
+    Our head is a cavity that moves about a fixed block, so its height is minus the height of the slider.
     """
     free = np.array([free_acceleration(q, v)[0] for q, v in zip(angles, rates, strict=True)])
     wrench = np.stack([np.zeros_like(free), -free, np.zeros_like(free)], axis=1)
@@ -130,7 +131,7 @@ def our_slider(t: Array, angles: Array, rates: Array, stiffness: float, output_d
 
 @dataclass(frozen=True)
 class Comparison:
-    """One quantity of one reference, by Siconos (`theirs`) and by our solver (`ours`)."""
+    """A quantity of a reference, computed by Siconos (`theirs`) and by our solver (`ours`)."""
 
     reference: str
     quantity: str
@@ -140,7 +141,7 @@ class Comparison:
 
 
 def phases(touching: NDArray[np.bool_], t: Array) -> list[tuple[float, float]]:
-    """Return begin and end of each rest, a contact of at least 1 ms without a break."""
+    """Return begin and end of each rest, which is an uninterrupted contact of at least 1 ms."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], touching.astype(int), [0]]))).reshape(-1, 2)
     whole = [(float(t[first]), float(t[last - 1])) for first, last in edges.tolist()]
     return [(begin, end) for begin, end in whole if end - begin >= 1e-3]

@@ -15,7 +15,7 @@ from workloads import HOUR_S
 
 @dataclass(frozen=True)
 class Verdict:
-    """One line of the table of targets."""
+    """One row of the table of targets."""
 
     work: str
     measured: str
@@ -25,7 +25,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Ratio:
-    """Target to be `times` as fast as a group of peers at equal error."""
+    """A target: to be `times` as fast as a group of peers at equal error."""
 
     scene: str
     output_s: float
@@ -60,7 +60,7 @@ RATIOS = (
 )
 ENSEMBLE_S, WITHIN, REAL_TIME, CORE_SHARE = 0.5, 10.0, 1000.0, 0.25
 BATCH_TIMES = 5.0
-#: Largest cost of an hour almost without events, as a share of an hour of the driven scene.
+#: Largest run time of an hour almost without events, relative to an hour of the driven scene.
 IDLE_SHARE = 0.01
 
 

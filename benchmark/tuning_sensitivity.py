@@ -1,10 +1,10 @@
-"""Sensitivity of the estimate to each tuned number, at half and twice its value, on a few held-out truths.
+"""Sensitivity of the estimate to each tuned number, at half and twice its value, on a few truths.
 
     python benchmark/tuning_sensitivity.py                     # runs that results/tuning.jsonl lacks
     python benchmark/tuning_sensitivity.py --number HUBER
 
-For each truth, only the numbers that its estimate reads are varied. The truths have four load periods and seeds that no
-tuning used. `tools/pages.py` makes the table of `benchmark/results/tuning.md`.
+For each truth, only the numbers that its estimate reads are varied. The truths have four load periods, and their seeds
+were not used for tuning. `tools/pages.py` makes the table of `benchmark/results/tuning.md`.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class _Watched(ModuleType):
 
 
 def scaled(value: tuning.Value, factor: float, unit: str) -> tuning.Value:
-    """Return a number, or all numbers of a tuple, times a factor; of a quantile, the distance from 1 is scaled."""
+    """Return a number, or all numbers of a tuple, times a factor. For a quantile, its distance from 1 is multiplied."""
     if isinstance(value, tuple):
         return tuple(scaled(part, factor, unit) for part in value)
     if unit == "quantiles":
@@ -53,7 +53,7 @@ def scaled(value: tuning.Value, factor: float, unit: str) -> tuning.Value:
 
 @contextmanager
 def varied(name: str, value: tuning.Value) -> Iterator[None]:
-    """Change the value of a number within a context."""
+    """Change the value of a tuned number within a context."""
     before = getattr(tuning, name)
     setattr(tuning, name, value)
     try:
@@ -63,7 +63,9 @@ def varied(name: str, value: tuning.Value) -> Iterator[None]:
 
 
 def run(truth: Truth) -> dict[str, Any]:
-    """Return errors, intervals and states of one estimate, or the error as `failed` if it raises."""
+    """Return errors, intervals and states of one estimate. If the estimate raises an error, return the error as
+    `failed`.
+    """
     try:
         found = estimate(truth.nominal, truth.load, truth.poses, forces=truth.forces)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
@@ -80,16 +82,16 @@ def known(row: dict[str, Any], axis: str) -> bool:
 
 
 def verdict(row: dict[str, Any]) -> list[Any]:
-    """Return the verdicts of an estimate, apart from its figures."""
+    """Return the verdicts of an estimate without its figures."""
     return [row.get("failed"), row.get("model"), row.get("sensor"), *(row[axis][3] for axis in "hv" if axis in row)]
 
 
 def summary(name: str, factor: float, rows: list[dict[str, Any]]) -> str:
-    """Return the effect of one variation on the clearances and verdicts.
+    """Return a summary of the effect of one variation on the clearances and verdicts.
 
-    The parts are the largest change of a clearance in its standard deviations, the RMSE and the width relative to those
-    of the chosen value, the number of known clearances whose interval contains the truth, and the number of changed
-    verdicts.
+    The summary contains the largest change of a clearance in units of its standard deviation, and the RMSE and the
+    width relative to those of the chosen value. It also contains the number of estimated clearances whose interval
+    contains the truth, and the number of changed verdicts.
     """
     base = {row["group"]: row for row in rows if row["name"] == ""}
     own = [row for row in rows if row["name"] == name and row["factor"] == factor]
@@ -159,7 +161,7 @@ def main(numbers: tuple[str, ...], cases: tuple[str, ...], out: Path) -> None:
 
 
 def watched(truth: Truth) -> tuple[dict[str, Any], list[str]]:
-    """Run with the chosen values, and return also the names of the numbers that were read."""
+    """Run the estimate with the chosen values. Return its row and the names of the numbers that it read."""
     _Watched.read.clear()
     before, tuning.__class__ = tuning.__class__, _Watched
     try:

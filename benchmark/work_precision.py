@@ -1,4 +1,4 @@
-"""Run time against error on the bench scenes: the project's solvers and all peers."""
+"""Run time against error on the bench scenes, for the solvers of this project and all peers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ HEYOKA, LOCATED = "heyoka (Taylor, events)", "DOP853 (numba, events located)"
 
 
 def _decades(loosest: int, tightest: int, per_decade: int = 2) -> tuple[float, ...]:
-    """Return tolerances from 10^-loosest to 10^-tightest, loosest first."""
+    """Return tolerances from 10^-loosest to 10^-tightest, beginning with the loosest."""
     return tuple(10.0 ** (-i / per_decade) for i in range(per_decade * loosest, per_decade * tightest + 1))
 
 
@@ -41,8 +41,8 @@ FIXED_STEPS = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5)
 LEAN_STEPS = (*FIXED_STEPS, 5e-6, 2e-6, 1e-6)
 _LADDER = _decades(2, 13)
 _C_LADDER = _decades(2, 14)
-#: Tolerances of `solve_ivp`, whose loop in Python is run with sparse output only. Radau and BDF take seconds, so they
-#: have whole decades only.
+#: Tolerances of `solve_ivp`. Its loop is in Python, so it is run with sparse output only. Radau and BDF take seconds
+#: and are run at whole decades only.
 _SOLVE_IVP = {"LSODA": _decades(3, 12), "DOP853": _decades(3, 12), "Radau": _decades(3, 8, 1), "BDF": _decades(3, 8, 1)}
 _MUJOCO = {"Euler": (1e-3, 5e-4, 2e-4, 1e-4), "implicitfast": (1e-3, 5e-4), "RK4": (1e-3, 5e-4, 2e-4)}
 _EXUDYN = {"VelocityVerlet": (1e-3, 5e-4, 2e-4, 1e-4), "RK44": (1e-3, 5e-4, 2e-4), "RK67": (1e-3, 5e-4)}
@@ -71,7 +71,7 @@ def prepare_simulate(
 ) -> Callable[[], Sample]:
     """Prepare `simulate` with all its outputs.
 
-    The time is the one that `simulate` reports, or with `whole_call` the time from call to return.
+    The measured time is the time that `simulate` reports or, with `whole_call`, the time from call to return.
     """
     method: Method = "events" if dt is None else "rk4"
 
@@ -79,7 +79,7 @@ def prepare_simulate(
         return simulate(scene, end, output_dt, tol, method, dt, energy_balance, sensitivity=sensitivity)
 
     if sensitivity or whole_call:
-        call(output_dt or t_end)  # compiles
+        call(output_dt or t_end)  # this call compiles the code
 
     def run() -> Sample:
         wall, result = timed(lambda: call(t_end))
@@ -92,7 +92,7 @@ def prepare_simulate(
 
 
 def prepare_bare(scene: Scene, output_dt: float, tol: float, t_end: float = T_END) -> Callable[[], Sample]:
-    """Prepare the compiled loop alone, whose only outputs are poses and rates, as those of the peers."""
+    """Prepare the compiled loop alone. Its only outputs are poses and rates, as for the peers."""
     compiled, work, times = compile_scene(scene, tol), new_work(), output_times(t_end, output_dt)
 
     def solve() -> tuple[int, Motion]:
@@ -107,7 +107,7 @@ def prepare_bare(scene: Scene, output_dt: float, tol: float, t_end: float = T_EN
         return Sample(wall, motion.q, int(state.steps), int(state.evaluations), int(motion.totals.logged))
 
     nothing = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)))
-    run_events(compiled, nothing, np.zeros(1), 0.0, work, BUDGET)  # compiles
+    run_events(compiled, nothing, np.zeros(1), 0.0, work, BUDGET)  # this call compiles the code
     return run
 
 
@@ -215,7 +215,7 @@ def multibody_cases(scene_name: str) -> Iterator[Case]:
 
 
 def unmodelled(scene_name: str) -> Iterator[Row]:
-    """Yield rows that say which scene a peer cannot model."""
+    """Yield a row for each peer that cannot model the scene."""
     if scene_name == "hc":
         yield Row(
             SECTION, "hc", "MuJoCo", "", DENSE, T_END, status="not run: no contact force with d^1.5 (1 + lambda d')"

@@ -1,4 +1,4 @@
-"""Cases for the cost of stiff walls, of long motions, of contact events and of features."""
+"""Cases for the cost of stiff walls, long motions, contact events and features."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HOUR_S = 3600.0
 
 
 def stiffness_cases() -> Iterator[Case]:
-    """Yield the KV scene with stiffnesses from soft to stiff and a constant damping ratio.
+    """Yield cases of the KV scene with soft to stiff walls and a constant damping ratio.
 
     The errors over 2 s are relative to our own run at a tolerance of 1e-12.
     """
@@ -48,7 +48,7 @@ def still_scene() -> Scene:
 
 
 def flight_scene() -> Scene:
-    """Return the KV scene without load and weight, with a head so slow that it meets no wall within hours."""
+    """Return the KV scene without load and weight. The head is so slow that it reaches no wall within hours."""
     return dataclasses.replace(still_scene(), gravity=Gravity(0.0), initial=Initial(v=(1e-7, 1e-7, 0.0)))
 
 
@@ -59,7 +59,7 @@ def _harmonic(scene: Scene) -> Harmonic:
 
 
 def swaying_scene() -> Scene:
-    """Return the KV scene without weight under a load too small to move the head to a wall (driven flight)."""
+    """Return the KV scene without weight, with a load that is too small to move the head to a wall."""
     scene = bench_scene("kv")
     load = _harmonic(scene)
     omega = 20.0
@@ -72,7 +72,7 @@ def swaying_scene() -> Scene:
 
 
 def horizon_cases(longest: float) -> Iterator[Case]:
-    """Yield the KV scene over increasing times, and scenes with hours almost without events."""
+    """Yield cases of the KV scene with increasing length, and of scenes with hours almost without events."""
     scenes = [(bench_scene("kv"), "kv", t_end) for t_end in (1.0, 10.0, 60.0, 600.0, HOUR_S)]
     scenes += [
         (still_scene(), "at rest after the fall", HOUR_S),
@@ -92,7 +92,7 @@ def add_steps_per_hour(rows: Sequence[Row]) -> None:
 
 
 def event_cases(quick: bool) -> Iterator[Case]:
-    """Yield scenes with few and many contact events over the same 20 s."""
+    """Yield cases with few and with many contact events in the same 20 s."""
     scene = bench_scene("kv")
     load = _harmonic(scene)
     if not quick:
@@ -115,7 +115,7 @@ def add_steps_per_event(rows: Sequence[Row]) -> None:
 
 
 def feature_cases() -> Iterator[Case]:
-    """Yield the KV scene plain, with the balance of energy, with friction, with both, and with derivatives."""
+    """Yield cases of the KV scene: plain, with energy balance, with friction, with both, and with derivatives."""
     scene = bench_scene("kv")
     rubbing = dataclasses.replace(scene, friction=Friction(coefficient=0.1))
     features = (("plain", scene, False), ("energy balance", scene, True), ("friction 0.1", rubbing, False))
@@ -131,7 +131,7 @@ def feature_cases() -> Iterator[Case]:
 
 
 def _shared_load_scene() -> Scene:
-    """Return the KV scene with its load split into six parts, which has ten parameters for derivatives."""
+    """Return the KV scene with its load divided into six parts, which gives ten parameters for derivatives."""
     scene = bench_scene("kv")
     load = _harmonic(scene)
     x, y = load.force_n
@@ -140,7 +140,7 @@ def _shared_load_scene() -> Scene:
 
 
 def add_ratios(rows: Sequence[Row]) -> None:
-    """Fill `value` of the feature rows with the time relative to the first row."""
+    """Set the `value` of each feature row to its time relative to the first row."""
     plain = rows[0].wall_ms
     for row in rows:
         if plain and row.wall_ms is not None:
