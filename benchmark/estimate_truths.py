@@ -122,8 +122,7 @@ GROUPS = {
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """A truth and the inputs of the estimate. `clearance`, shape (2,), is the clearance at the end of the window [m].
-    """
+    """A truth and the inputs of the estimate. `clearance` [m], shape (2,), is that at the end of the window."""
 
     group: Group
     scene: Scene
@@ -211,7 +210,7 @@ def cutting(rng: np.random.Generator, t: Array) -> Array:
 
 
 def _motion(scene: Scene, group: Group, times: Array, end: float) -> tuple[Array, Array, Array]:
-    """Return the true poses at `times`, shape (n, 3), the final clearances, shape (2,), and the forces every `_FINE` s.
+    """Return the true poses at `times`, (n, 3), the final clearances, (2,), and the forces every `_FINE` [s], (k, 8).
     """
     if not group.jam_m:
         run = simulate(scene, end, _FINE, 1e-6)

@@ -50,7 +50,7 @@ def _load_function(amplitude: float, constant: float, omega: float, esym: Any) -
 
 
 def _build(p: Array) -> tuple[Any, Any, list[Any]]:
-    sys.exudynFast = True  # select the build without range checks
+    sys.exudynFast = True  # type: ignore[attr-defined]  # select the build without range checks
     import exudyn as exu
     from exudyn import itemInterface as items
     from exudyn.utilities import CreateSymbolicUserFunction

@@ -35,8 +35,7 @@ def solver_rows() -> list[Row]:
 
 
 def speed() -> str:
-    """Return a table of run times for 20 s of impacts at three errors. The times of peers are multiples of our times.
-    """
+    """Return a table of run times for 20 s of impacts at three errors. Times of peers are multiples of our times."""
     rows = solver_rows()
     lines = []
     for level in (1e-3, 1e-6, 1e-9):

@@ -1,6 +1,6 @@
 """Coverage of the true peaks and impulses by the intervals of forces, and cost of 256 twins with samples at 1 kHz.
 
-    python benchmark/force_intervals.py --truths 6 --seed 7000
+python benchmark/force_intervals.py --truths 6 --seed 7000
 """
 
 from __future__ import annotations

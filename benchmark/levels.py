@@ -32,8 +32,7 @@ _NEAR = 1.4
 
 @dataclass(frozen=True)
 class Reached:
-    """The time [ms] in which a solver reaches an error, and its setting, or the two settings for an interpolated time.
-    """
+    """The time [ms] in which a solver reaches an error, and its setting, or two settings for an interpolated time."""
 
     wall_ms: float
     solver: str

@@ -118,7 +118,7 @@ class Impacts:
         return errors(np.concatenate(missed))
 
     def floor(self) -> dict[str, Any]:
-        """Return the error of the best possible impulse at the lowest point. No contact law can have a smaller error."""
+        """Return the error of the best possible impulse at the lowest point, a lower bound for all contact laws."""
         arm, up = contact_arms(self.before[:, 2])
         change = (self.after - self.before)[:, 3:] * [-1.0, 1.0, GYRATION]
         rows = np.zeros((len(change), 3, 2))
@@ -336,8 +336,7 @@ class Square:
         return self.off(marker.measured(tossed[:, :, :3]), enough, bounces)
 
     def off(self, poses: Iterable[np.ndarray], chosen: np.ndarray, bounces: int) -> np.ndarray:
-        """Return the mean distance [m] and angle [rad], shape (k, 2), between poses (k, rows, 3) and the chosen drops.
-        """
+        """Return the mean distance [m] and angle [rad], shape (k, 2), of poses (k, rows, 3) from the chosen drops."""
         found = []
         for n, motion in zip(chosen, poses, strict=True):
             rows, first = self.rows[n, bounces - 1], self.first[n]

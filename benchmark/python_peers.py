@@ -1,5 +1,4 @@
-"""Peers that are called from Python: solvers of SciPy, and CVODE from scikit-sundae, with the compiled rates of `lean`.
-"""
+"""Peers that are called from Python: solvers of SciPy, and scikit-sundae's CVODE, with the compiled rates of `lean`."""
 
 from __future__ import annotations
 

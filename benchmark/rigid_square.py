@@ -68,8 +68,7 @@ def _hit(z: np.ndarray, block: np.ndarray, impact: Impact, e: float, mu: float) 
 
 
 def two_at_once(tossed: np.ndarray, rows: np.ndarray, block: np.ndarray, within: float) -> np.ndarray:
-    """Return a mask of the motions, rows every 0.25 ms, in which two corners are in contact within a time `within` [s].
-    """
+    """Return a mask of the motions, rows every 0.25 ms, in which two corners touch within a time `within` [s]."""
     found = np.zeros(len(tossed), bool)
     width = math.ceil(within * 16.0 * RATE_HZ)
     for index, motion in enumerate(tossed):

@@ -1,6 +1,6 @@
 """CPU time of the operator's screen in a twin at 1 kHz and in its server, by the number of open pages.
 
-    python benchmark/screen_load.py [SECONDS]
+python benchmark/screen_load.py [SECONDS]
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Bags of other programs for the tests, with the paper's load and with poses from a biased, late and noisy sensor."""
+"""Bags in the format of other programs, with the paper's load and poses of a sensor with bias, delay and noise."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ head_pose: {topic: /pose}
 
 @cache
 def motion() -> Motion:
-    """Return times (n,), loads (n, 3) and poses (n, 3) of 8 s of the paper's head."""
+    """Return times (n,), loads (n, 3) and poses (n, 3) of the paper's head during 8 s."""
     twin = Twin(load_scene(PAPER), excitation="sampled")
     times = np.arange(COUNT) * 1e-3
     wrench = np.array([paper_sample(index).wrench for index in range(COUNT)])
@@ -40,7 +40,7 @@ def motion() -> Motion:
 
 
 def measured(motion: Motion) -> Iterable[tuple[float, np.ndarray]]:
-    """Yield time and pose at 100 Hz, late, biased and noisy."""
+    """Yield times and poses at 100 Hz, with delay, bias and noise."""
     times, _, q = motion
     rng = np.random.default_rng(4)
     for t in np.arange(0.1, times[-1], 0.01):

@@ -1,4 +1,4 @@
-"""A headless Chromium or Firefox that opens a page, takes its picture and reads its console."""
+"""A headless Chromium or Firefox that opens a page, takes a picture of it and reads its console."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from websockets.sync.client import ClientConnection, connect
 
 #: Path of Chromium, or None if it is not installed.
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-#: Options that let Chromium draw WebGL without a graphics card.
+#: Options with which Chromium draws WebGL without a graphics card.
 _OPTIONS = (
     "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--remote-debugging-port=0",
@@ -27,7 +27,7 @@ _OPTIONS = (
 
 
 class Page:
-    """An open page; `requests` are the addresses that it requests, `errors` its error messages."""
+    """An open page. `requests` are the addresses that it requests, and `errors` are its error messages."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self._socket = socket
@@ -38,7 +38,7 @@ class Page:
             self.call(f"{domain}.enable")
 
     def call(self, method: str, **params: Any) -> dict[str, Any]:
-        """Call the browser and return its answer; events that arrive meanwhile are kept."""
+        """Call a method of the browser and return its answer. Events that arrive before the answer are stored."""
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": params}))
         while True:
@@ -50,7 +50,7 @@ class Page:
             self._note(message)
 
     def open(self, url: str) -> None:
-        """Go to an address and wait until it has been loaded."""
+        """Open an address and wait until the page has been loaded."""
         self.call("Page.navigate", url=url)
         while True:
             message = json.loads(self._socket.recv(timeout=60.0))
@@ -65,7 +65,7 @@ class Page:
             self.errors.append(str(message["params"]["exceptionDetails"]))
         elif message.get("method") == "Log.entryAdded":
             entry = message["params"]["entry"]
-            if entry["level"] == "error" and entry["source"] != "network":  # `requests` has the network errors
+            if entry["level"] == "error" and entry["source"] != "network":  # network errors are recorded in `requests`
                 self.errors.append(str(entry))
 
     def evaluate(self, expression: str) -> Any:
@@ -75,13 +75,13 @@ class Page:
         return found["result"].get("value")
 
     def picture(self) -> bytes:
-        """Return the page as a PNG."""
+        """Return a picture of the page as PNG."""
         return base64.b64decode(self.call("Page.captureScreenshot")["data"])
 
 
 @contextmanager
 def page(folder: Path, url: str) -> Iterator[Page]:
-    """Open a page in a separate browser, whose files lie in `folder`."""
+    """Open a page in a separate browser with its files in `folder`."""
     assert CHROMIUM is not None
     command = [CHROMIUM, *_OPTIONS, f"--user-data-dir={folder}", "about:blank"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -107,7 +107,7 @@ FIREFOX = shutil.which("firefox-esr") or shutil.which("firefox")
 
 
 class FirefoxPage:
-    """An open page of a headless Firefox, driven by WebDriver BiDi; `errors` are the exceptions of its scripts."""
+    """An open page of a headless Firefox, controlled by WebDriver BiDi. `errors` are the exceptions of its scripts."""
 
     def __init__(self, socket: ClientConnection) -> None:
         self._socket = socket
@@ -130,7 +130,7 @@ class FirefoxPage:
                 self.errors.append(str(message["params"]["text"]))
 
     def open(self, url: str) -> None:
-        """Go to an address and wait until it has been loaded."""
+        """Open an address and wait until the page has been loaded."""
         self._call("browsingContext.navigate", context=self._context, url=url, wait="complete")
 
     def evaluate(self, expression: str) -> Any:
@@ -141,13 +141,13 @@ class FirefoxPage:
         return found["result"].get("value")
 
     def picture(self) -> bytes:
-        """Return the page as a PNG."""
+        """Return a picture of the page as PNG."""
         return base64.b64decode(self._call("browsingContext.captureScreenshot", context=self._context)["data"])
 
 
 @contextmanager
 def firefox_page(folder: Path, url: str) -> Iterator[FirefoxPage]:
-    """Open a page in a separate Firefox, whose files lie in `folder`."""
+    """Open a page in a separate Firefox with its files in `folder`."""
     assert FIREFOX is not None
     folder.mkdir(exist_ok=True)
     options = ["--headless", "--no-remote", "--profile", str(folder), "--remote-debugging-port", "0"]

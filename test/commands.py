@@ -1,4 +1,4 @@
-"""The command line as a user runs it, in its own process, and, faster, in this process."""
+"""The command line in a separate process, as a user runs it, and in this process, which is faster."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from plow_twin.cli.app import run
 
 
 def plow_twin(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Run a command as a program."""
     command = [sys.executable, "-m", "plow_twin", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=110, stdin=subprocess.DEVNULL)
 
 
 @contextmanager
 def started(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[str]]:
-    """Run a program beside the test, and kill it at the end if it still runs; `Popen` alone would wait for ever."""
+    """Start a program, and kill it at the end of the context; a `Popen` context would wait for the program without
+    limit.
+    """
     with subprocess.Popen(command, text=True, **options) as process:
         try:
             yield process
@@ -31,7 +32,7 @@ def started(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen
 
 
 def plow_twin_here(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Run a command in this process, with the same output and exit code, because starting a process takes a second."""
+    """Run a command in this process, which saves the second that the start of a process takes."""
     given, out, err = [*map(str, arguments)], StringIO(), StringIO()
     with chdir(cwd or Path.cwd()), redirect_stdout(out), redirect_stderr(err):
         code = run(given)

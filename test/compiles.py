@@ -1,6 +1,6 @@
-"""Plugin of `pytest --compiles`: the kernels that tests compile, with their processor time and their first test.
+"""Plugin for `pytest --compiles`: it lists the kernels that tests compile, with processor time and first test.
 
-A kernel that several tests share is compiled by the first of them. Processes that a test starts are not included.
+A kernel that several tests use is compiled by the first of them. Kernels of child processes are not listed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ PROPERTY = "compiled"
 
 
 class Compiles(event.Listener):
-    """Note each kernel that Python calls in the report of the test that compiles it."""
+    """Record each kernel that Python calls in the report of the test that compiles it."""
 
     def __init__(self) -> None:
         self._test: list[tuple[str, object]] = []
@@ -29,7 +29,7 @@ class Compiles(event.Listener):
 
     def on_end(self, event: Any) -> None:
         took = time.thread_time() - self._begun.pop()
-        if not self._begun:  # a kernel compiled during the compilation of another is part of the other's time
+        if not self._begun:  # the time of a kernel includes the kernels that are compiled for it
             function = event.data["dispatcher"].py_func
             self._test.append((PROPERTY, (took, f"{function.__module__}.{function.__qualname__}")))
 
@@ -38,7 +38,7 @@ class Compiles(event.Listener):
         self._test = item.user_properties
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        if report.when == "teardown":  # only this report, the test's last, holds all kernels of the test
+        if report.when == "teardown":  # only the last report of a test contains all its kernels
             for name, value in report.user_properties:
                 if name == PROPERTY:
                     self._found.append((*value, report.nodeid))  # type: ignore[misc]

@@ -1,4 +1,4 @@
-"""Set-up of every test process: ROS stays on this machine, and skips are accounted for."""
+"""Set-up of each test process: ROS is restricted to this machine, and skipped tests are checked."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from hypothesis import Phase, settings
 ROOT = Path(__file__).resolve().parent.parent
 SKIPS = ROOT / "test" / "skips.txt"
 FIRST = ROOT / "test" / "first.txt"
-#: Name of the environment variable that names the folder in which `_compile_once` has its locks.
+#: Name of the environment variable with the folder of the locks of `_compile_once`.
 LOCKS = "PLOW_TWIN_COMPILING"
 
 
@@ -27,26 +27,25 @@ def _prepare_environment() -> None:
     """Set the environment that child processes inherit, before rclpy and numpy are imported."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ.pop("ROS_LOCALHOST_ONLY", None)
-    # ROS domains 1 to 101 use no ephemeral ports; each process of each run has its own domain
+    # ROS domains 1 to 101 use no ephemeral ports; each process of each run gets its own domain
     worker = os.environ.get("PYTEST_XDIST_WORKER", "")
     number = 8 * (os.getppid() if worker else os.getpid()) + int(worker.removeprefix("gw") or 0)
     os.environ["ROS_DOMAIN_ID"] = str(1 + number % 101)
-    # the processes of a suite use all cores already; further threads of linear algebra would only wait for each other,
-    # and load the cores meanwhile
+    # the processes of a suite already use all cores, so more threads of linear algebra would only wait for each other
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     logs = tempfile.mkdtemp(prefix="plow_twin-ros-log-")
     atexit.register(shutil.rmtree, logs, ignore_errors=True)
     os.environ["ROS_LOG_DIR"] = logs
-    # if a shell has started the suite in the background, SIGINT is ignored; the tests that send SIGINT need Python's
-    # handler
+    # in a suite started in the background by a shell, SIGINT is ignored; tests that send SIGINT need the handler of
+    # Python
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _compile_once() -> None:
-    """Let the processes of a suite wait for each other's kernels instead of compiling the same kernels in parallel.
+    """Prevent the processes of a suite from compiling the same kernels in parallel.
 
-    Each signature of a kernel has a file, which the compiling process locks. Locks are taken in the order of calls and
-    by only one thread of a process, so that no two processes wait for each other.
+    Each signature of a kernel has a lock file, which the compiling process locks. To avoid a deadlock, locks are taken
+    in the order of calls, and by one thread of a process only.
     """
     if "PYTEST_XDIST_WORKER" not in os.environ:
         os.environ[LOCKS] = tempfile.mkdtemp(prefix="plow_twin-compiling-")
@@ -70,7 +69,7 @@ def _compile_once() -> None:
 _prepare_environment()
 _compile_once()
 settings.register_profile("plow_twin", deadline=None, derandomize=True, database=None)
-# the profile of `make stress`, which prints the seed, draws new examples each time and shrinks failures
+# profile of `make stress`: it prints the seed, draws new examples in each run, and shrinks failing examples
 FRESH = (Phase.explicit, Phase.generate, Phase.shrink)
 settings.register_profile("stress", deadline=None, derandomize=False, database=None, print_blob=True, phases=FRESH)
 settings.load_profile("plow_twin")
@@ -120,6 +119,6 @@ def _skipped(reporter: pytest.TerminalReporter) -> list[tuple[str, str]]:
 
 
 def _listed(file: Path) -> list[str]:
-    """Return the text before the first bar of each line, without comments."""
+    """Return the text before the first bar in each line that is not a comment."""
     lines = (line.partition("#")[0].strip() for line in file.read_text(encoding="utf-8").splitlines())
     return [line.partition("|")[0].strip() for line in lines if line]

@@ -1,4 +1,4 @@
-"""Simulated machines for the tests of the estimate; two of them are estimated once for all test files."""
+"""Simulated machines for the tests of the estimate. Two of them are estimated once for all tests of a process."""
 
 from __future__ import annotations
 
@@ -21,6 +21,6 @@ __all__ = ["GROUPS", "KINDS", "Truth", "draw", "known", "mismatched"]
 
 @cache
 def known() -> tuple[tuple[Truth, Estimate], ...]:
-    """Return two simulated machines of the paper's scene, over five load periods each, with their estimates."""
+    """Return two simulated machines with the paper's scene over five load periods, with their estimates."""
     truths = [draw(replace(GROUPS["plain"], periods=5.0), seed) for seed in (2, 3)]
     return tuple((truth, estimate(truth.nominal, truth.load, truth.poses)) for truth in truths)

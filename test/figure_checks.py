@@ -1,4 +1,4 @@
-"""Checks of a figure for legends over data, texts over each other or outside the figure, and axes without labels."""
+"""Checks of figures: legends beside the data, no overlapping or cut-off texts, and labels on all axes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from matplotlib.text import Text
 
 
 def kept_figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """Return a list that receives the figures drawn from now on."""
+    """Return a list to which each figure drawn from now on is appended."""
     figures: list[Figure] = []
 
     class Kept(backend_agg.FigureCanvasAgg):
@@ -25,7 +25,7 @@ def kept_figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 
 
 def check_figure(figure: Figure) -> None:
-    """Raise an AssertionError if a legend covers its axes, tick labels collide, or a visible axis has no label."""
+    """Raise an AssertionError if a legend covers its axes, tick labels overlap, or a visible axis has no label."""
     backend_agg.FigureCanvasAgg(figure).draw()
     assert figure.get_suptitle()
     for axis in figure.axes:
@@ -41,7 +41,7 @@ def check_figure(figure: Figure) -> None:
 
 
 def _check_words(figure: Figure) -> None:
-    """Raise an AssertionError if titles and labels of axes overlap each other or leave the figure."""
+    """Raise an AssertionError if titles and labels of axes overlap or extend beyond the figure."""
     words = [word for axis in figure.axes for word in (axis.title, axis.xaxis.label, axis.yaxis.label)]
     words += [text for text in figure.texts if text.get_text()]
     boxes = [(word.get_text(), word.get_window_extent()) for word in words if word.get_text() and word.get_visible()]

@@ -1,7 +1,8 @@
-"""Programs of the package as forks of one process that has imported them, because the imports take over a second.
+"""Programs of the package as forks of a process that has already imported them; the imports take over a second.
 
-A fork has the arguments, the environment and the signal handlers of a program that is started. Only variables that
-libraries read while they are imported have no effect on it, so a program with other variables must be started.
+A fork has the arguments, the environment and the signal handlers of a program that was started normally. Variables that
+libraries read during their import have no effect on a fork. A program with other values of such variables is therefore
+started normally.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from pathlib import Path
 from typing import IO
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Programs that are forked. Others are started, so that their imports are tested too.
+#: Programs that are forked. Other programs are started, which tests their imports too.
 _FORKED = ("plow_twin.ros.main", "plow_twin.demo.excitation_publisher")
-#: Variables that programs read after their imports.
+#: Variables that are read only after the imports.
 _LATE = {"PYTEST_CURRENT_TEST", "ROS_DOMAIN_ID", "ROS_LOG_DIR"}
 
 _PROGRAM = """
@@ -83,13 +84,13 @@ def _environment() -> dict[str, str]:
     return environment | {"AMENT_PREFIX_PATH": environment.get("AMENT_PREFIX_PATH") or sys.prefix}
 
 
-#: Environment of the imports, before any test has changed a variable.
+#: Environment at the time of the imports, before tests change variables.
 _KNOWN = _environment()
 
 
 @cache
 def _orders() -> socket.socket:
-    """Start this process's forge and return the socket for its orders."""
+    """Start the forking process of this test process. Return the socket for its commands."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     process = subprocess.Popen(
         [sys.executable, "-c", _PROGRAM], env=_KNOWN | {"FORGE_ORDERS": str(theirs.fileno())},
@@ -106,7 +107,7 @@ def _orders() -> socket.socket:
 
 
 class Fork:
-    """A program in a fork, with the methods of `subprocess.Popen`."""
+    """A program in a fork, with the interface of `subprocess.Popen`."""
 
     def __init__(self, module: str, arguments: Sequence[str], output: IO[bytes]) -> None:
         orders = _orders()
@@ -128,13 +129,13 @@ class Fork:
 
     def _ended(self, timeout: float | None) -> int | None:
         if self.returncode is None and select.select([self._end], [], [], timeout)[0]:
-            self.returncode = int(os.read(self._end, 64) or b"-9")  # a forge that was killed writes nothing
+            self.returncode = int(os.read(self._end, 64) or b"-9")  # a killed forking process writes no exit code
             os.close(self._end)
         return self.returncode
 
     def send_signal(self, number: int) -> None:
         if self.poll() is None:
-            with suppress(ProcessLookupError):  # the process has ended, and the forge has not yet written its exit code
+            with suppress(ProcessLookupError):  # the program has ended, but its exit code has not been written yet
                 os.kill(self.pid, number)
 
     def terminate(self) -> None:
@@ -145,7 +146,7 @@ class Fork:
 
 
 def start(module: str, arguments: Sequence[str], output: IO[bytes]) -> Fork | subprocess.Popen[bytes]:
-    """Start a program, in a fork if it is one of `_FORKED` and no variable was changed that imports may read."""
+    """Start a program. Fork it if it is one of `_FORKED` and all variables that imports may read are unchanged."""
     environment = _environment()
     if module in _FORKED and {name for name, _ in environment.items() ^ _KNOWN.items()} <= _LATE:
         return Fork(module, arguments, output)

@@ -1,8 +1,8 @@
-"""Motions whose bits are pinned by hashes of their results, not of the solver's state.
+"""Motions whose results are pinned by hashes, bit for bit.
 
     python test/golden.py
 
-computes all motions and prints the figures as JSON.
+computes all motions and prints their figures as JSON.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from plow_twin.model.loads import compile_loads
 
 Figures = dict[str, Any]
 
-#: Damping for the laws that have this parameter, with the head of a bench scene.
+#: Damping of the laws that have this parameter, for the head of a bench scene.
 _DAMPING = {"kelvin_voigt": 6e4, "ramped_damping": 6e4}
 
 
 def build_name() -> str:
-    """Return a name of the compiler and the mathematical libraries, on which bits depend beside the sources.
+    """Return a name of the compiler and the mathematical libraries, on which the bits of a result depend.
 
-    The digests are the same on AMD's Zen 3 and Zen 4 and on an Intel Xeon with AVX-512.
+    The hashes are equal on AMD Zen 3, AMD Zen 4 and an Intel Xeon with AVX-512.
     """
     libc = "".join(platform.libc_ver())
     return f"numba{version('numba')}-numpy{version('numpy')}-{libc}"

@@ -1,4 +1,4 @@
-"""Makers of absurd recordings."""
+"""Malicious and damaged recordings."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _pairs(pairs: dict[str, str]) -> bytes:
 
 
 def record(opcode: int, body: bytes) -> bytes:
-    """Return a record of MCAP."""
+    """Return an MCAP record."""
     return struct.pack("<BQ", opcode, len(body)) + body
 
 
@@ -51,7 +51,7 @@ def message(number: int, sequence: int, data: bytes) -> bytes:
 
 
 def chunk(content: bytes, size: int | None = None, compression: str = "zstd", data: bytes | None = None) -> bytes:
-    """Return a chunk that claims to hold `size` bytes."""
+    """Return an MCAP chunk whose header states an unpacked size of `size` bytes."""
     data = zstandard.compress(content) if data is None else data
     head = struct.pack("<QQQI", 0, 0, len(content) if size is None else size, 0)
     return record(6, head + _text(compression) + struct.pack("<Q", len(data)) + data)
@@ -67,7 +67,9 @@ def _header() -> dict[str, str]:
 
 
 def run(*entries: str, more: bytes = b"", **changed: str) -> bytes:
-    """Return a run of plow_twin with 20 samples, given journal entries, further records and changed header keys."""
+    """Return a run of plow_twin with 20 samples, the given journal entries, more records, and changed keys of the
+    header.
+    """
     samples = [WrenchStamped(_T0 + n * 1_000_000, "slide_frame", (1e3 * n, 0.0, 0.0), (0.0,) * 3) for n in range(20)]
     body = b"".join(message(1, n, encode(sample)) for n, sample in enumerate(samples))
     body += b"".join(message(2, 20 + n, encode(Text(entry))) for n, entry in enumerate(entries))
@@ -78,7 +80,7 @@ def run(*entries: str, more: bytes = b"", **changed: str) -> bytes:
 
 
 def foreign(text: str, channels: int = 1) -> bytes:
-    """Return a recording of another program: a topic /load of a type that `text` defines, and further topics."""
+    """Return a recording of another program: a topic /load whose type `text` defines, and more topics."""
     declared = schema(1, "a/msg/A", text) + b"".join(
         channel(n % 65536, 1, f"/load{n - 1 if n > 1 else ''}") for n in range(1, channels + 1)
     )
@@ -87,7 +89,7 @@ def foreign(text: str, channels: int = 1) -> bytes:
 
 
 def bag(path: Path, *statements: str) -> None:
-    """Write a sqlite3 file of rosbag2 with a topic /load, whose messages the statements insert."""
+    """Write a rosbag2 sqlite3 file with a topic /load. The SQL statements insert its messages."""
     with sqlite3.connect(path) as base:
         base.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT)")
         base.execute("INSERT INTO topics VALUES(1, '/load', 'geometry_msgs/msg/WrenchStamped')")
@@ -97,7 +99,7 @@ def bag(path: Path, *statements: str) -> None:
 
 
 def archive(path: Path, size: Sequence[int], kind: str, data: bytes) -> None:
-    """Write an npz file whose arrays `t` and `q` claim to have a shape and a type."""
+    """Write an npz file whose headers state a shape and a type for the arrays `t` and `q`."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as found:
         for name in ("t", "q"):
             head = io.BytesIO()
@@ -147,8 +149,7 @@ MADE: dict[str, Callable[[Path], object]] = {
     "channels.mcap": lambda path: path.write_bytes(
         run(more=b"".join(channel(n % 65536, 1, f"/t{n}") for n in range(100_000)))
     ),
-    # two files of 170 kB that unpack to 5 GB: in the first each chunk is too large; in the second only the sum of the
-    # chunks is too large
+    # two files of 170 kB unpack to 5 GB: the first has too large chunks, the second has too many chunks
     "large_chunks.mcap": lambda path: path.write_bytes(run(more=20 * chunk(bytes(250 * 2**20)))),
     "many_chunks.mcap": lambda path: path.write_bytes(run(more=100 * chunk(bytes(50 * 2**20)))),
     "lying_zstd.mcap": lambda path: path.write_bytes(

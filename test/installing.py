@@ -1,4 +1,4 @@
-"""Environments and clean sources for the tests that install the package."""
+"""Environments and clean sources for tests that install the package."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SOURCES = (
 
 
 def copy_sources(target: Path) -> Path:
-    """Copy the inputs of a build, without remains of an earlier build or run."""
+    """Copy the inputs of a build, without results of an earlier build or run."""
     target.mkdir(parents=True)
     for name in SOURCES:
         if (ROOT / name).is_dir():
@@ -42,15 +42,15 @@ def copy_sources(target: Path) -> Path:
 
 
 def clean_environment(**extra: str) -> dict[str, str]:
-    """Return this process's environment without the variables that lead to another installation."""
+    """Return the environment without the variables that refer to another installation."""
     hidden = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "AMENT_PREFIX_PATH", "COLCON_PREFIX_PATH")
-    # the ROS wheels restart Python with these variables, which a child in another environment must not inherit
+    # the ROS wheels restart Python with these variables; a child in another environment must not inherit them
     hidden += ("LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE", "NUMBA_CACHE_DIR")
     return {key: value for key, value in os.environ.items() if key not in hidden} | extra
 
 
 def run(*command: str | Path, cwd: Path, env: dict[str, str] | None = None, code: int = 0) -> str:
-    """Run a command that must end with `code`. Return its standard output, or standard error if `code` is not 0."""
+    """Run a command and check its exit code. Return its output, or its error output if `code` is not 0."""
     done = subprocess.run(
         [str(part) for part in command],
         cwd=cwd,
@@ -65,7 +65,8 @@ def run(*command: str | Path, cwd: Path, env: dict[str, str] | None = None, code
 
 
 def make_environment(folder: Path, *requirements: str) -> Path:
-    """Make a virtual environment with these requirements, at the locked versions, and return its Python."""
+    """Create a virtual environment with the given requirements at the locked versions. Return the path of its Python.
+    """
     run(sys.executable, "-m", "venv", folder, cwd=folder.parent)
     python = folder / "bin" / "python"
     install(python, *requirements)
@@ -73,15 +74,15 @@ def make_environment(folder: Path, *requirements: str) -> Path:
 
 
 def install(python: Path, *requirements: str) -> None:
-    """Install into an environment at the locked versions."""
+    """Install requirements at the locked versions into an environment."""
     pip = ("-m", "pip", "install", "--quiet", "--no-compile", "-c", ROOT / "requirements" / "constraints.txt")
     run(python, *pip, *requirements, cwd=python.parent)
 
 
 def lend_kernels(python: Path) -> None:
-    """Copy the kernels that this source tree has compiled to the sources installed in an environment.
+    """Copy the kernels that this source tree has compiled into the package that is installed in an environment.
 
-    They are used if sources and versions are the same, and compiled anew otherwise.
+    If sources or versions differ, the copies are ignored and the kernels are compiled again.
     """
     (package,) = python.parent.parent.glob("lib/python*/site-packages/plow_twin")
     for kernel in (to_bernstein, power_term, integrate, expand):
@@ -91,7 +92,7 @@ def lend_kernels(python: Path) -> None:
 
 
 def build_wheel(folder: Path) -> Path:
-    """Build the package's wheel from clean sources with this environment's setuptools."""
+    """Build the wheel of the package from clean sources with the setuptools of this environment."""
     source = copy_sources(folder / "source")
     wheels = folder / "wheels"
     pip = (sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation")

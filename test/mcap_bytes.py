@@ -1,4 +1,4 @@
-"""The first bytes of a recording, written by hand, which make a file a recording."""
+"""The first bytes of a recording, built by hand. A file that begins with them is recognised as a recording."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def _record(opcode: int, body: bytes) -> bytes:
 
 
 def beginning() -> bytes:
-    """Return magic, header and the metadata record of a run."""
+    """Return magic, header and metadata record of a run."""
     pairs = _text("layout_version") + _text("4")
     metadata = _text("plow_twin") + struct.pack("<I", len(pairs)) + pairs
     return b"\x89MCAP0\r\n" + _record(0x01, _text("ros2") + _text("plow_twin")) + _record(0x0C, metadata)

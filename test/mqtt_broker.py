@@ -1,4 +1,4 @@
-"""A real MQTT broker in a process of its own: `python mqtt_broker.py CONFIG.yaml`."""
+"""A real MQTT broker for a separate process: `python mqtt_broker.py CONFIG.yaml`."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""A real OPC UA server, `opcua_server.py PORT [CERTIFICATE KEY [USER]]`, which reads commands from its input.
+"""A real OPC UA server: `opcua_server.py PORT [CERTIFICATE KEY [USER]]`. It reads commands from standard input.
 
-With `MORE_NAMESPACES` in the environment, the nodes have another namespace number.
+If the environment contains `MORE_NAMESPACES`, the namespace of the nodes has another number.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class OneUser(UserManager):
-    """Only the user `plough`, or the user of a certificate, may connect."""
+    """Admit only the user `plough`, or the user of a certificate."""
 
     def __init__(self, certificate: Path | None) -> None:
         read = None if certificate is None else x509.load_pem_x509_certificate(certificate.read_bytes())
         self._known = None if read is None else read.public_bytes(Encoding.DER)
 
     def get_user(self, iserver: Any, username: Any = None, password: Any = None, certificate: Any = None) -> Any:
-        # without a user token, the certificate is that of the client program
+        # without a user token, the certificate is the certificate of the client program
         known = (username, password) == ("plough", "s3cret") or (username is None and certificate == self._known)
         return User(UserRole.User) if known else None
 
@@ -60,12 +60,12 @@ class Plant:
             await asyncio.sleep(pause_s)
 
     async def number(self, more: int) -> None:
-        """Let each subscription skip sequence numbers, as if messages had been lost, or repeat a number."""
+        """Let all subscriptions skip sequence numbers, as if messages were lost, or repeat a number."""
         for found in self._server.iserver.subscription_service.subscriptions.values():
             found._notification_seq += more
 
     async def lie(self, kind: str) -> None:
-        """Return a history from the far future, or a history without end."""
+        """Answer requests of the history with data from the far future, or with endless data."""
 
         def answer(*asked: Any) -> Any:
             years = {"future": (2090, 9999), "endless": (2026,), "nothing": ()}[kind]
@@ -79,7 +79,7 @@ class Plant:
         self._server.iserver.history_manager.storage.read_node_history = read
 
     async def refuse(self, refused: bool) -> None:
-        """Refuse subscriptions, or admit them again."""
+        """Refuse subscriptions, or accept them again."""
         service = self._server.iserver.subscription_service
         if refused:
 

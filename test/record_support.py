@@ -1,4 +1,4 @@
-"""Recordings for the tests, made by a real twin, session and recorder in this process, and rewritten files."""
+"""Recordings for the tests, made by a twin, a session and a recorder in this process, and modified copies of files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from plow_twin.stream.session import Session
 
 BASE_NS = 1_800_000_000_000_000_000
 STEP_NS = 1_000_000
-#: amplitudes of the paper's loads in N, N, N m
+#: Amplitudes of the paper's loads [N, N, N m].
 PAPER_AMPLITUDE = (32_000.0, -11_000.0, -45_495.0)
 
 
@@ -40,7 +40,7 @@ def paper_sample(index: int, first_ns: int = BASE_NS) -> Sample:
 
 
 def paper_entries(count: int) -> list[Entry]:
-    """Return samples with an entry of every other kind in between, and a reset half way."""
+    """Return samples, with one entry of every other kind in between and a reset in the middle."""
     half = count // 2
     entries: list[Entry] = [Parameter("hold", "hold"), *map(paper_sample, range(half))]
     entries.insert(half // 2, Travel(BASE_NS, 2.5))
@@ -51,7 +51,7 @@ def paper_entries(count: int) -> list[Entry]:
 
 @dataclass
 class Run:
-    """A recording, with all entries and messages that were written."""
+    """A recording, and all entries and messages that were written to it."""
 
     folder: Path
     file: Path
@@ -71,7 +71,7 @@ def record_run(
     parameters: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Run:
-    """Drive a twin of the paper's head by entries and record it as the node does."""
+    """Pass entries to a twin of the paper's head, and record the twin as the node does."""
     scene = replace(load_scene(scene_path("paper")), wear=wear)
     header = RunHeader(dump_scene(scene), parameters={"hold": "hold", **(parameters or {})})
     recorder = Recorder(folder, header, **options)
@@ -93,7 +93,7 @@ def record_run(
         if recorder.snapshot_wanted:
             journal(session.snapshot())
         if pause_every and index % pause_every == 0:
-            time.sleep(0.02)  # the pause gives the recorder's thread time to empty the queue
+            time.sleep(0.02)  # in the pause, the recorder's thread can empty its queue
     session.close()
     run.loss = recorder.close()
     return run
@@ -107,7 +107,7 @@ def rewrite(
     *,
     metadata_last: bool = False,
 ) -> Path:
-    """Copy an MCAP file with other tools than the package's; `change` may return other bytes for a message."""
+    """Copy an MCAP file with third-party tools; `change` may replace the bytes of a message."""
     with source.open("rb") as stream, target.open("wb") as out:
         writer = Writer(out, chunk_size=64 * 1024)
         writer.start(profile="ros2", library="test")
@@ -138,7 +138,7 @@ def rewrite(
 
 
 def chunk_spans(file: Path, *, journal: bool | None = None) -> list[tuple[int, int]]:
-    """Return offset and length of the data of each chunk in a file, for the journal's chunks or for all others."""
+    """Return offset and length of the data of each chunk of a file: of the journal, of all other chunks, or of both."""
     spans, topics = [], {}
     with file.open("rb") as stream:
         for record in StreamReader(stream, emit_chunks=True).records:

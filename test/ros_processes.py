@@ -1,4 +1,4 @@
-"""Real processes, and a real node that observes them, for the tests of the ROS side."""
+"""Processes of the package, and a ROS node that observes them, for the tests of the ROS side."""
 
 from __future__ import annotations
 
@@ -25,23 +25,21 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from plow_twin.ros.messages import set_stamp
 
 with warnings.catch_warnings():
-    # in the ROS wheels, the parser of message definitions uses a deprecated module, so importing it gives a warning
+    # the message parser of the ROS wheels imports a deprecated module
     warnings.simplefilter("ignore", DeprecationWarning)
     import rosidl_generator_py  # noqa: F401
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Time [s] that is long enough for the solver's first compilation on a slow machine.
+#: Time limit [s] that is sufficient for the first compilation of the solver on a slow machine.
 START_S = 200.0
-#: Time [s] that is long enough for discovery on a machine that does other work.
+#: Time limit [s] that is sufficient for discovery on a busy machine.
 WAIT_S = 60.0
-#: Time within which a process must stop [s]. It is twice the longest time measured while three processes shared two
-#: cores.
+#: Time limit [s] for the end of a process: twice the longest time measured with three processes on two cores.
 STOP_S = 10.0
 _numbers = itertools.count()
 
 
 class Process:
-    """A program of the package in a process of its own."""
 
     def __init__(self, module: str, arguments: Sequence[str], log: Path) -> None:
         self._log = log
@@ -62,19 +60,20 @@ class Process:
         return self._process.wait(timeout_s)
 
     def stop(self, number: signal.Signals = signal.SIGINT) -> int:
-        """Request a stop; it fails if it takes longer than `STOP_S`."""
+        """Send a signal and return the exit code. Fail if the process does not end within `STOP_S`."""
         self._process.send_signal(number)
         return self._process.wait(STOP_S)
 
     def stop_again_and_again(self, number: signal.Signals) -> int:
-        """Request a stop again and again until the process has ended."""
+        """Send a signal repeatedly until the process has ended. Return its exit code."""
         while self.running:
             self._process.send_signal(number)
             time.sleep(0.002)
         return self._process.wait()
 
     def close(self) -> None:
-        """End the process without killing it, because a killed process leaves its shared memory behind."""
+        """End the process by a signal that it handles, because a killed process would leave its shared memory behind.
+        """
         if self.running:
             self._process.terminate()
             try:
@@ -86,14 +85,14 @@ class Process:
 
 @cache
 def _context() -> Context:
-    """Return the only ROS participant of this process, because only 32 are discovered on localhost."""
+    """Return the only ROS participant of this process: on localhost, at most 32 participants are discovered."""
     context = Context()
     context.init(args=[])
     return context
 
 
 class Probe:
-    """A node of the test process that publishes, listens, calls services and waits."""
+    """A ROS node of the test process that publishes, subscribes, calls services and waits."""
 
     def __init__(self, namespace: str) -> None:
         self.context = _context()
@@ -103,7 +102,7 @@ class Probe:
         self._clients: dict[str, Any] = {}
         self.status: list[DiagnosticStatus] = []
         self.reports: list[dict[str, DiagnosticStatus]] = []
-        # this queue is deeper than the twin's, so that no quick change is missed
+        # this queue is longer than that of the twin, so that no short change is missed
         latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(DiagnosticStatus, "status", self.status.append, latched)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._report, 100)
@@ -112,7 +111,7 @@ class Probe:
         self.reports.append({status.name: status for status in message.status})
 
     def listen(self, kind: type, topic: str) -> list[Any]:
-        """Return a list to which all messages from now on are added."""
+        """Return a list to which all further messages are appended."""
         heard: list[Any] = []
         subscription = self.node.create_subscription(kind, topic, heard.append, QoSProfile(depth=20000))
         self.until(lambda: subscription.get_publisher_count() > 0, f"a publisher of {topic}")
@@ -130,14 +129,14 @@ class Probe:
         self.until(lambda: self.status and value(self.status[-1], "lifecycle") == state, state, timeout_s)
 
     def figures(self, part: str) -> dict[str, str]:
-        """Return the figures of a report that was sent after this call."""
+        """Return the values of a part of the diagnostics that was sent after this call."""
         count = len(self.reports)
         name = f"{self.node.get_namespace()}/plow_twin: {part}"
         self.until(lambda: any(name in report for report in self.reports[count:]), f"diagnostics {part}")
         return {item.key: item.value for item in self.reports[-1][name].values}
 
     def until_figure(self, part: str, key: str, *expected: str, timeout_s: float = WAIT_S) -> None:
-        """Wait until a figure of the diagnostics has one of the values."""
+        """Wait until a value of the diagnostics equals one of the expected values."""
         name = f"{self.node.get_namespace()}/plow_twin: {part}"
         try:
             self.until(
@@ -149,7 +148,7 @@ class Probe:
             raise AssertionError(f"{error}; last {part} {self.figures(part)}") from None
 
     def publisher(self, kind: type, topic: str, profile: QoSProfile | int = 1000) -> Any:
-        """Return a publisher, as soon as the twin reports its connection to it."""
+        """Return a publisher as soon as the twin reports that it is connected to it."""
         key = f"publishers_{topic}"
         before = value(self.status[-1], key)
         publisher = self.node.create_publisher(kind, topic, profile)
@@ -158,7 +157,7 @@ class Probe:
         return publisher
 
     def excitation(self, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> Callable[..., None]:
-        """Return a function that publishes a sample, as soon as the twin reads the topic."""
+        """Return a function that publishes a sample, as soon as the twin subscribes to the topic."""
         publisher = self.publisher(WrenchStamped, "excitation", QoSProfile(depth=5000, reliability=reliability))
 
         def send(stamp_ns: int, wrench: Sequence[float], **components: float) -> None:
@@ -173,19 +172,21 @@ class Probe:
         return send
 
     def pace(self, index: int) -> None:
-        """Pause after each 50 samples, because best-effort readers drop messages that come faster than they read."""
+        """Pause after every 50 samples, because best-effort subscribers drop messages that arrive faster than they
+        read.
+        """
         if index % 50 == 49:
             self.pause(0.04)
 
     def pause(self, seconds: float) -> None:
-        """Wait for discovery on the other side."""
+        """Wait for discovery by the other process."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             self._executor.spin_once(timeout_sec=0.02)
 
     def call(self, kind: type, service: str, request: Any) -> Any:
-        # the answer to a client that the server has not yet discovered is lost, so each service has one client, which
-        # makes all calls
+        # a server loses the answer to a client that it has not discovered yet, so each service has one client for all
+        # calls
         if service not in self._clients:
             self._clients[service] = self.node.create_client(kind, service)
         client = self._clients[service]
@@ -200,11 +201,11 @@ class Probe:
 
 
 class Bench:
-    """A twin in a process of its own, in a namespace of its own, and a probe beside it."""
+    """A twin in a separate process and namespace, with a probe in this process."""
 
     def __init__(self, folder: Path, parameters: dict[str, Any], arguments: Sequence[str] = ()) -> None:
         self.namespace = f"/t{os.getpid()}_{next(_numbers)}"
-        # {ns} in the name of a parameter is replaced by the namespace
+        # in names of parameters, {ns} is replaced by the namespace
         named = {name.replace("{ns}", self.namespace): given for name, given in parameters.items()}
         self.folder = folder
         self._publishers: list[Process] = []
@@ -214,13 +215,11 @@ class Bench:
         self.twin = Process("plow_twin.ros.main", given, folder / "twin.log")
 
     def publisher(self, *arguments: str) -> Process:
-        """Start the excitation publisher."""
         given = [*arguments, "--ros-args", "-r", f"__ns:={self.namespace}"]
         self._publishers.append(Process("plow_twin.demo.excitation_publisher", given, self.folder / "publisher.log"))
         return self._publishers[-1]
 
     def close(self) -> None:
-        """End the processes that still run."""
         self.probe.close()
         for process in (self.twin, *self._publishers):
             process.close()
@@ -228,7 +227,7 @@ class Bench:
 
 @contextmanager
 def bench(folder: Path, lifecycle: str = "active", arguments: Sequence[str] = (), **parameters: Any) -> Iterator[Bench]:
-    """Start a twin and wait until it is in the given state."""
+    """Start a twin and wait until it is in the given lifecycle state."""
     running = Bench(folder, parameters, arguments)
     try:
         running.probe.until_lifecycle(lifecycle, START_S)
@@ -238,5 +237,5 @@ def bench(folder: Path, lifecycle: str = "active", arguments: Sequence[str] = ()
 
 
 def value(status: DiagnosticStatus, key: str) -> str:
-    """Return the value of a key of a status."""
+    """Return the value of a key in a status."""
     return {item.key: item.value for item in status.values}[key]

@@ -1,4 +1,4 @@
-"""Scenes that several tests use, built from dataclasses."""
+"""Scenes that several tests use."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def reference(name: str) -> dict[str, np.ndarray]:
 
 
 def pose_error(scene: Scene, q: np.ndarray, reference_q: np.ndarray) -> float:
-    """Return the largest error relative to the clearance, with angles multiplied by the half diagonal."""
+    """Return the largest pose error relative to the clearance. Angles are multiplied by half the diagonal."""
     gx, gy = scene.clearance.horizontal_m, scene.clearance.vertical_m
     radius = 0.5 * np.hypot(scene.frame.width_m, scene.frame.height_m)
     return float((np.abs(q - reference_q) / np.array([gx, gy, gx / radius])).max())
 
 
 def gaps_at(scene: Scene, q: np.ndarray) -> np.ndarray:
-    """Return the true gaps of the pairs in m at poses (n, 3), shape (n, 8)."""
+    """Return the exact gaps [m] of the pairs at poses (n, 3), shape (n, 8)."""
     c, s = np.cos(q[:, 2]), np.sin(q[:, 2])
     body = [c, s, c * q[:, 0] + s * q[:, 1], -s * q[:, 0] + c * q[:, 1], np.ones(len(q))]
     gaps: np.ndarray = -np.stack(body, axis=1) @ penetration_rows(scene)
@@ -48,7 +48,7 @@ def wall_and_point(
     gap: float = 0.01,
     pairs: tuple[str, ...] = ("top_left_top",),
 ) -> Scene:
-    """Return a mass that can only move vertically and starts `gap / 2` above the corner on which it falls."""
+    """Return a mass that can move only vertically, and starts `gap / 2` above the corner on which it falls."""
     return Scene(
         head=Head(mass, 1.0),
         frame=Frame(0.2, 0.2),
@@ -61,14 +61,14 @@ def wall_and_point(
     )
 
 
-#: An inertia that no moment of the tests turns, and a harmonic moment for it.
+#: An inertia so large that no moment of the tests turns the head, and a harmonic moment.
 FIRM, TURNING_NOTHING = 1e18, Harmonic("turning nothing", (0.0, 0.0), 2.0, moment_n_m=1e3)
 
 
 def with_presets_terms(scene: Scene) -> Scene:
-    """Return a scene of the same motion with the terms of the presets, whose kernels are compiled already.
+    """Return a scene with the same motion and the terms of the presets, whose kernels are already compiled.
 
-    The head does not turn because of its inertia, not because its angle is locked. Under the harmonic moment, the
-    solver does not look for rest. Nothing may push the head sideways if x was locked.
+    A large inertia prevents rotation instead of a locked angle, so the head must not be pushed sideways. Under the
+    harmonic moment, the solver does not search for rest.
     """
     return replace(scene, head=replace(scene.head, inertia_kg_m2=FIRM), loads=(TURNING_NOTHING,), locked=())

@@ -1,4 +1,4 @@
-"""The benchmark runs, names the peers that it cannot run, and keeps its errors within the tolerances."""
+"""The benchmark runs, names peers that it cannot run, and has errors within the tolerances."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ OURS = "plow_twin events"
 
 
 def run(code: str, *arguments: str) -> str:
-    """Run Python with the benchmark's folder on its path."""
     command = [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(BENCHMARK)!r}); {code}", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
@@ -64,7 +63,7 @@ def test_the_ensemble_ends_at_the_tolerance_that_every_pair_needs(rows: list[dic
     pairs = [row for row in rows if row["section"] == "ensemble" and not row["wall_ms"]]
     assert float(timed[-1]["error"]) <= 1e-4 and float(timed[-1]["value"]) == 0.0
     assert len(pairs) == 6 and all(float(row["amplification"]) > 0.1 for row in pairs)
-    # the expected errors come from running every pair by itself and computing its error in another way
+    # the expected errors are computed here in another way, with a separate run for each pair
     code = (
         "import numpy as np, ensemble_rows as e; from plow_twin import simulate, simulate_many\n"
         "for scene in e.clearance_pairs(3, 2):\n"
@@ -81,7 +80,7 @@ def test_the_ensemble_ends_at_the_tolerance_that_every_pair_needs(rows: list[dic
 
 
 def test_work_grows_with_contact_events_not_with_time(rows: list[dict[str, str]]) -> None:
-    """With 80 to 1089 events in the same 20 s, there are a few steps for each event and few between events."""
+    """In 20 s with 80 to 1089 events, the solver needs a few steps per event, and few steps between events."""
     driven = [row for row in rows if row["section"] == "contact_events"]
     steps, events = ([int(row[name]) for row in driven] for name in ("steps", "events"))
     assert events == sorted(events) and events[-1] > 10 * events[0] > 0
@@ -116,8 +115,8 @@ def test_a_target_is_reached_when_the_peer_takes_so_many_times_as_long() -> None
         "print(sorted(levels.contenders([row(w.OURS_BARE, 'tol', 1.0, 1e-7), *ladder])))\n"
     )
     within, beyond, without, contenders = run(f"exec({code!r})").strip().splitlines()
-    # at 1e-6 the target is 0.667 ms, a thirtieth of the peer's time; at 1e-9 the peer has no row, so the target counts
-    # as reached
+    # at 1e-6, the target is 0.667 ms, a thirtieth of the peer's time; at 1e-9, there is no row of the peer, so the
+    # target is reached
     assert within == "[True, True]" and beyond == "[False, True]"
     assert without == "[]" and contenders == "[0, 1, 2]"
 
@@ -135,7 +134,7 @@ def test_a_peer_that_is_missing_is_named() -> None:
 
 
 def test_the_independent_reference_agrees_with_the_shipped_one(tmp_path: Path) -> None:
-    """The results of `reference.c` for both bench scenes agree with trajectories of another program."""
+    """For both bench scenes, `reference.c` agrees with trajectories that another program has computed."""
     code = (
         "import numpy as np, random_scenes as r, bench_scenes as b\n"
         "from native import NotInstalled\n"
@@ -157,7 +156,7 @@ def test_the_independent_reference_agrees_with_the_shipped_one(tmp_path: Path) -
 
 
 def test_saved_references_belong_to_the_saved_scenes() -> None:
-    """The rows start at the initial pose, and every calm scene has a reference."""
+    """The first row of each reference is the initial pose, and every calm scene has a reference."""
     with np.load(BENCHMARK / "data" / "random_scenes.npz") as saved:
         q, lines = saved["q"], saved["lines"]
         assert q.shape == (200, 51, 3) and len(lines) == 200

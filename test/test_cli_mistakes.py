@@ -1,4 +1,4 @@
-"""A new user's mistakes with verbs other than `live`: each ends with one clear message and an exit code."""
+"""Mistakes of a new user with all verbs except `live`: each gives one clear message and an exit code."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _write(
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a new user's files."""
+    """Return a folder with the files of a new user."""
     folder = tmp_path_factory.mktemp("desk")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -129,7 +129,7 @@ def test_a_stranger_s_mistake_is_named_in_a_message(
     assert cli(arguments) == code
     shown = capsys.readouterr().err
     assert said in " ".join(shown.split()), shown
-    # one line names the mistake without the file's contents, and no file is left behind
+    # the message names the mistake in one line without the contents of the file, and no output file remains
     assert len([line for line in shown.splitlines() if not line.startswith("Usage")]) <= 3 and len(shown) < 500
     assert sorted(desk.rglob("*")) == before
 
@@ -138,8 +138,7 @@ def test_a_load_that_looks_like_kilonewtons_is_named_before_it_is_estimated(
     desk: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(desk)
-    # an estimate fits the gains of the load, so a load in kN only causes a warning; but no clearance is found from it
-    # here
+    # the estimate fits the gains of the load, so a load in kN causes only a warning, but here no clearance is found
     assert cli(["estimate", "kN", "--json"]) == 0
     shown = capsys.readouterr()
     assert "fx, fy: got 30, expected some 3.2e+04 N as in the scene; they look like kN: convert the file" in shown.err

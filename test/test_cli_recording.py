@@ -1,4 +1,4 @@
-"""`replay`, `view` and `info` on recordings: their output and exit codes."""
+"""Output and exit codes of `replay`, `view` and `info` for recordings."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def answers(port: int) -> bool:
 def test_view_refuses_recordings_that_cannot_be_drawn(run: Run, tmp_path: Path) -> None:
     refused = plow_twin_here("view", run.folder, "--out", tmp_path / "x.rrd", "--exaggerate", "1e+308")
     assert refused.returncode == 2 and "1e+308" in refused.stderr and "Traceback" not in refused.stderr
-    # a run under its scene's own loads has no samples in its journal
+    # the journal of a run under the loads of its scene contains no samples
     own = rewrite(run.file, tmp_path / "own.mcap", metadata=lambda record: {**record, "excitation_source": "scene"})
     refused = plow_twin_here("view", own, "--out", tmp_path / "x.rrd", "--with", "paper")
     assert refused.returncode == 1 and "excitation_source" in refused.stderr
@@ -200,7 +200,7 @@ def test_view_names_a_port_that_is_taken(run: Run, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def served(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Yield the address that `view --web` names, while it is serving."""
+    """Yield the address that `view --web` prints, as long as it serves."""
     out = tmp_path_factory.mktemp("served") / "run.rrd"
     command = [sys.executable, "-m", "plow_twin", "view", str(run.folder), "--out", str(out), "--web", "--quiet"]
     process = subprocess.Popen(
@@ -233,18 +233,18 @@ def test_view_serves_a_page_on_the_loopback_address_alone(served: str) -> None:
 def test_a_browser_shows_the_run_at_the_address_that_view_names(served: str, tmp_path: Path) -> None:
     with browser.page(tmp_path, served) as page:
         deadline = time.monotonic() + 90
-        # the cross-sections have a dark background, unlike the viewer's own pages
+        # the cross-sections have a dark background; other pages of the viewer have not
         while _dark(page.picture()) < 0.15:
             assert time.monotonic() < deadline, f"no picture: {page.errors}, {page.requests}"
             time.sleep(0.5)
         assert not page.errors
-        # the page has the dark theme whatever the browser's theme, so hardly any pixel is white
+        # the page requests the dark theme, so almost no pixel is white, whatever the theme of the browser
         dots = np.asarray(Image.open(BytesIO(page.picture())).convert("L"))
         assert (dots > 230).mean() < 0.05
         assert any("ReadMessages" in request for request in page.requests)
 
 
 def _dark(png: bytes) -> float:
-    """Return the share of a picture's pixels with the background colour of the cross-sections."""
+    """Return the share of pixels that have the background colour of the cross-sections."""
     dots = np.asarray(Image.open(BytesIO(png)).convert("RGB")).astype(int)
     return float((np.abs(dots - (24, 26, 30)).max(axis=2) <= 3).mean())

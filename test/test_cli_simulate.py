@@ -1,4 +1,4 @@
-"""The command line: files, JSON and exit codes. It runs as a program where that matters, otherwise in this process."""
+"""The command line: files, JSON and exit codes. It is run in this process unless the process matters."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_csv_and_json_keep_the_contract(tmp_path: Path) -> None:
         header, *rows = csv.reader(file)
     assert header == ["t", "x", "y", "theta", "vx", "vy", "omega", *(f"force_{name}" for name in PAIR_NAMES)]
     expected = np.column_stack([result.t, result.q, result.v, result.force])
-    np.testing.assert_array_equal(np.array(rows, dtype=float), expected)  # 17 digits represent a number exactly
+    np.testing.assert_array_equal(np.array(rows, dtype=float), expected)  # 17 digits represent each number exactly
 
     answer = json.loads(done.stdout)
     assert answer.keys() == {"scene", "t_end", "pairs", "contact_sets", "solver", "wall_s", "compile_s"}
@@ -216,7 +216,7 @@ main(["simulate", "no such scene"])
 def test_a_missing_extra_is_named_with_its_pip_command(tmp_path: Path) -> None:
     (tmp_path / "mcap.py").write_text("raise ModuleNotFoundError(\"No module named 'mcap'\", name='mcap')")
     (tmp_path / "run.mcap").write_bytes(mcap_bytes.beginning())
-    # `python -m` puts the working directory, and with it this mcap.py, first on the path
+    # `python -m` puts the working directory, which contains this mcap.py, first on the path
     done = plow_twin("replay", "run.mcap", cwd=tmp_path)
     assert done.returncode == 1
     assert "pip install 'plow_twin[record]'" in done.stderr
@@ -246,7 +246,8 @@ def test_info_lists_marks_and_versions() -> None:
 
 
 def test_the_energy_balance_closes() -> None:
-    call = ["simulate", "bench_kv", *RUN[2:], "--energy-balance"]  # this scene uses the kernels of the pinned motions
+    # this scene uses the same kernels as the pinned motions
+    call = ["simulate", "bench_kv", *RUN[2:], "--energy-balance"]
     done = plow_twin_here(*call, "--json")
     assert done.returncode == 0, done.stderr
     balance = json.loads(done.stdout)["energy_balance"]

@@ -1,4 +1,4 @@
-"""The output of verbs fits a terminal of 80 columns: no cell is cut, and no Python is shown."""
+"""The output of commands fits a terminal of 80 columns: no cell is cut off, and no Python names are shown."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_a_scene_s_numbers_stand_in_one_line_each(printed: Callable[..., list[st
     assert any(
         re.fullmatch(r"│ +stiffness +│ +9\.6975e\+06 │ N/m\^exponent │ +reconstructed +\d+ │", line) for line in lines
     )
-    # a row never continues on a second line: each line has a value or is a heading
+    # no row continues on a second line: each line is a heading or contains a value
     numbers, _ = "\n".join(lines).split("what follows")
     rows = [line for line in numbers.splitlines() if line.startswith("│")]
     assert all(re.match(r"│ (\w+(\[\d\])? +│ +│|  \w+(\[\d\])? +│ +\S)", line) for line in rows)
@@ -75,7 +75,7 @@ def test_a_recording_and_its_replay_are_shown_as_words(printed: Callable[..., li
     for line in ("messages", "build", "messages_compared", "  contact_forces         50", "lost                     -"):
         assert line in lines
     long = [line for line in lines if len(line) > WIDTH]
-    assert all(str(tmp_path) in line for line in long)  # a value that users copy stays in one piece
+    assert all(str(tmp_path) in line for line in long)  # a path that users may copy is not broken
 
 
 def test_numbers_that_are_estimated_or_compared_have_their_units_and_are_whole(
@@ -119,7 +119,7 @@ def test_ctrl_c_is_not_lost_in_a_destructor() -> None:
     with pytest.raises(KeyboardInterrupt), progress("replaying", quiet=True) as on_progress:
         on_progress(0.1)
         left = Ends()
-        del left  # here Python drops the exception that `__del__` raises
+        del left  # Python ignores the exception that `__del__` raises
         on_progress(0.2)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 

@@ -1,4 +1,4 @@
-"""The operator's screen shows the twin's numbers, and its readers do not affect the twin."""
+"""The operator's screen shows the results of the twin, and its pages do not affect the twin."""
 
 from __future__ import annotations
 
@@ -67,8 +67,7 @@ def test_a_feed_without_a_reader_does_not_wait_and_keeps_the_peaks() -> None:
             updates.append(update)
         feed.turn()
         updates.append(far.receive() or {})
-        # the first update contains the facts; the first update after a refusal contains the largest force of the
-        # refused updates
+        # the first update contains the facts; the update after a refused update contains the largest force of both
         assert updates[0]["facts"]["can_ask"] is False and len(updates) == feed.taken
         assert max(update["motion"]["peak"][0] for update in updates) == 7e5
         assert updates[-1]["not_taken"] == feed.not_taken and updates[-1]["motion"]["t"] == pytest.approx(2.999)
@@ -81,7 +80,7 @@ def test_each_second_of_a_file_has_its_update_on_the_screen_and_a_way_out_keeps_
     for by_second, expected in ((True, [float(second) for second in range(1, 30)]), (False, [])):
         link, theirs = pair()
         feed = Feed(link, FACTS, by_second=by_second)
-        for index in range(580):  # the stamps have a rate of 20 Hz, but the publications are sent as fast as possible
+        for index in range(580):  # the stamps have a rate of 20 Hz, but publications are sent as fast as possible
             feed.publication(_published(1.0 + 0.05 * index, 1.0 + index // 20))
         with theirs:
             far, peaks = Link(theirs), []
@@ -139,7 +138,8 @@ def test_the_clearances_of_an_estimate_after_the_last_publication_are_shown_with
             clearance = (far.receive() or {})["motion"]["clearance"]
             return clearance["horizontal/p05"], clearance["vertical/p05"]
 
-        publish(1.0, 0.0057)  # this publication comes before the estimate, and is summed up with later publications
+        # this publication precedes the estimate; it is summed up later, together with later publications
+        publish(1.0, 0.0057)
         feed.part("estimate", (0, "", numbers))
         feed.part("status", (0, "", {"horizontal": "estimated", "vertical": "not_observable"}))
         feed.part("estimate", (0, "estimating", {"estimates": "1"}))
@@ -252,7 +252,7 @@ def test_a_frozen_page_costs_no_memory_delays_no_page_and_gets_the_newest_when_i
         with _data(screen.url, sock=raw, ping_interval=None, max_queue=1) as frozen, _data(screen.url) as page:
             assert "version" in json.loads(page.recv())
             before, text = _memory_kb(screen.process.pid), "x" * 2700
-            for index in range(200):  # messages of 6 MB in total
+            for index in range(200):  # 6 MB of messages in total
                 screen.feed.publication(_published(1.0 + index, float(index)))
                 screen.feed.part("state", (0, str(index), {str(number): text for number in range(10)}))
                 while not screen.feed.send():
@@ -275,14 +275,14 @@ def _row(index: int) -> str:
 
 
 COUNT = 6000
-#: Options with an alarm threshold that the forces exceed, and with a timeout so long that no silence is held,
-#: because the samples have their own stamps.
+#: Options with an alarm threshold that the forces exceed. The timeout is so long that the load is never held, because
+#: the stamps differ from the wall clock.
 OPTIONS = ("--scene", "paper", "--set", "excitation_timeout=3600", "--set", "alarm_force=[1.5e5,1e9]", "--json")
 
 
 @contextmanager
 def _twin(*options: str | Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Start a twin with a screen, which reads standard input."""
+    """Start a twin with a screen. The twin reads standard input."""
     command = [sys.executable, "-m", "plow_twin", "live", "-", *OPTIONS, "--dashboard", "--listen", "127.0.0.1:0"]
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
     with started([*command, *map(str, options)], **pipes) as process:
@@ -293,7 +293,7 @@ def _twin(*options: str | Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 
 def _said(process: subprocess.Popen[str], begin: str) -> str:
-    """Return the line on standard error that begins with a text."""
+    """Return the line on standard error that begins with the text `begin`."""
     assert process.stderr is not None
     while line := process.stderr.readline():
         if line.startswith(begin):
@@ -302,7 +302,7 @@ def _said(process: subprocess.Popen[str], begin: str) -> str:
 
 
 def _feed(process: subprocess.Popen[str], begin: int = 0, end: int = COUNT) -> None:
-    """Send samples at three times their rate."""
+    """Send samples at three times their real-time rate."""
     assert process.stdin is not None
     for first in range(begin, end, 60):
         process.stdin.write("".join(map(_row, range(first, min(first + 60, end)))))
@@ -311,7 +311,7 @@ def _feed(process: subprocess.Popen[str], begin: int = 0, end: int = COUNT) -> N
 
 
 def _stopped(process: subprocess.Popen[str]) -> dict[str, Any]:
-    """End the input and the twin; return the twin's diagnostics, and its output meanwhile."""
+    """End the input and wait for the twin. Return its diagnostics and its output since the start."""
     assert process.stdin is not None
     process.stdin.close()
     process.stdin = None
@@ -366,7 +366,7 @@ def test_an_operator_acknowledges_and_marks_and_the_journal_has_both(tmp_path: P
         see(lambda: told.get("motion", {}).get("t", 0) >= 0.999e-3 * COUNT)
         assert told["alarms"]["force_latched"] == "warn" and told["motion"]["clearance"]["horizontal"] > 0.02
         page.send("no JSON")
-        page.send(json.dumps({"do": "reset"}))  # the page itself never sends this request
+        page.send(json.dumps({"do": "reset"}))  # the page itself never sends such a request
         page.send(json.dumps({"do": "mark", "text": "x" * 1000}))
         page.send(json.dumps({"do": "mark", "text": "<b>shift</b> " + "x" * 180}))
         page.send(json.dumps({"do": "acknowledge"}))
@@ -395,7 +395,7 @@ def test_a_killed_server_is_reported_once_and_the_twin_continues(tmp_path: Path)
         assert process.stdin is not None
         process.stdin.close()
         process.stdin = None
-        out, err = process.communicate(timeout=60)  # the killed server does not hold up the end
+        out, err = process.communicate(timeout=60)  # the killed server does not delay the end
     assert process.returncode == 0 and json.loads(out)["input"]["samples_used"] == str(COUNT)
     assert "server of the screen" not in err
 
@@ -445,7 +445,7 @@ def test_a_recording_s_inputs_are_counted_by_name(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
-#: Script that returns texts of the page.
+#: Script that returns texts of the page as JSON.
 _SEEN = """JSON.stringify({pads: document.querySelectorAll('#pads tbody tr').length,
     colors: [...document.querySelectorAll('#section rect.pad')].map((pad) => pad.getAttribute('fill')),
     alarms: document.getElementById('alarms').innerText, clearance: document.getElementById('clearance').innerText,
@@ -455,7 +455,7 @@ _SEEN = """JSON.stringify({pads: document.querySelectorAll('#pads tbody tr').len
     seconds: screenState.seconds.length, fooled: Boolean(window.fooled)})"""
 
 
-#: Script that returns the smallest contrast of a text with its background (WCAG 2); disabled controls are left out.
+#: Script that returns the smallest contrast between a text and its background (WCAG 2), without disabled controls.
 _CONTRAST = """(() => {
     const parts = (color) => color.match(/[\\d.]+/g).map(Number);
     const light = (color) => parts(color).slice(0, 3).map((part) => part / 255)
@@ -478,7 +478,7 @@ _CONTRAST = """(() => {
 
 
 def _check_readable(page: browser.Page) -> None:
-    """Check the contrast in both themes, and that the page needs no sideways scrolling on a phone."""
+    """Check the contrast in both themes, and that a phone need not scroll the page sideways."""
     for theme in ("dark", "light"):
         page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": theme}])
         assert page.evaluate(_CONTRAST) >= 4.5, theme
@@ -494,7 +494,7 @@ def test_a_browser_shows_the_twin_takes_names_as_text_and_fetches_nothing_from_e
     scene = tmp_path / f"{name.replace('/', '')}.yaml"
     scene.write_text(dump_scene(load_scene("paper")))
     given = ("--scene", scene, "--set", f"hardware_id={name}", "--token-file", tmp_path / "token")
-    given += ("--record", tmp_path / "run")  # without a recording a mark is refused
+    given += ("--record", tmp_path / "run")  # without a recording, marks are refused
     (tmp_path / "token").write_text(TOKEN + "\n")
     with _twin(*given) as (process, said), ExitStack() as opened:
         url = said.partition("#")[0]

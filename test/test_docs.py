@@ -1,4 +1,4 @@
-"""The documents are correct: links and named files exist, examples run, and laws, verbs and exports are complete."""
+"""The documents are correct: links and file names exist, examples run, and laws, commands and exports are complete."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_links_and_named_files_exist(page: Path) -> None:
 
 
 def shown_calls() -> list[tuple[str, str]]:
-    """Return each call of `plow-twin` in a block of a page, with the page's name."""
+    """Return each call of `plow-twin` in a code block, and the name of its page."""
     pages = [*PAGES, *sorted((ROOT / "examples").rglob("*.md"))]
     return [
         (page.name, call.partition("#")[0])
@@ -60,7 +60,7 @@ def test_every_call_that_a_page_shows_has_a_verb_and_options_that_exist() -> Non
     unknown = []
     for page, call in calls:
         command, words = commands, re.split(r"\s+", re.split(r"[|&<>]", call)[0].strip())
-        words = words[2:] if words[0] == "--laws" else words  # every verb takes the option `--laws`
+        words = words[2:] if words[0] == "--laws" else words  # all verbs accept the option `--laws`
         while isinstance(command, click.Group) and words and words[0] in command.commands:
             command = command.commands[words.pop(0)]
         known = {option for one in command.params for option in (*one.opts, *one.secondary_opts)} | {"--help"}
@@ -88,7 +88,7 @@ def test_the_mappings_and_credentials_of_the_how_to_are_read(tmp_path: Path) -> 
 
 
 def public_names() -> set[str]:
-    """Return the names that `plow_twin/__init__.py` imports `as` themselves, also lazily."""
+    """Return the names that `plow_twin/__init__.py` exports by `import x as x`, directly or lazily."""
     nodes = ast.walk(ast.parse((ROOT / "plow_twin" / "__init__.py").read_text()))
     aliases = [alias for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names]
     return {alias.name for alias in aliases if alias.asname == alias.name}
@@ -102,7 +102,7 @@ def test_every_public_name_is_on_the_reference_page_and_there_is_no_other() -> N
 
 
 def test_no_heading_begins_with_a_digit() -> None:
-    """The site's contents select headings by name, and a selector may not begin with a digit."""
+    """The table of contents selects headings by CSS selectors, which must not begin with a digit."""
     pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "examples").glob("**/README.md")]
     found = [line for page in pages for line in re.findall(r"^#+ \d.*", page.read_text(), re.MULTILINE)]
     assert found == []
@@ -117,7 +117,7 @@ def test_every_page_is_in_the_site_s_contents() -> None:
 
 
 def test_every_table_of_the_pages_is_that_of_the_results_and_the_code() -> None:
-    """`tools/pages.py` would change nothing, and each of its tables is on a page."""
+    """The tables of the pages are up to date, and each table of `tools/pages.py` is on a page."""
     code = (
         "import pages, re\n"
         "texts = {page.name: page.read_text() for page in pages.PAGES}\n"
@@ -166,7 +166,7 @@ def test_the_page_s_example_runs(page: str) -> None:
 
 def test_the_law_of_the_how_to_runs() -> None:
     (example,) = blocks(ROOT / "docs" / "how_to_own_law.md", "python")
-    # the example runs in its own process, because an added law stays in the process
+    # a separate process, because an added law cannot be removed
     code = f"{example}\nfrom plow_twin.model.contact_laws import LAWS\nprint(LAWS[contact.law].damping_number(0.4))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=280, check=False)
     assert (done.stdout.strip(), done.stderr) == (str(1.2 * (1.0 - 0.4) / 0.4), "")

@@ -1,4 +1,4 @@
-"""The reference is complete: every parameter, field and result of a public name is described, with an array's shape."""
+"""The API reference is complete: it describes every parameter, field and result, with the shapes of arrays."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import griffe
 import pytest
 from scenes import ROOT
 
-#: Pattern of a field's declaration that gives the unit and the meaning of the field; the site shows both.
+#: Pattern of the declaration of a field that contains its unit and its meaning, which the site shows.
 DECLARED = re.compile(r"_(quantity|choice)\(")
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 ARRAYS = re.compile(r"NDArray|ArrayLike|\bArray\b")
@@ -23,7 +23,7 @@ def package() -> griffe.Module:
 
 
 def public(package: griffe.Module) -> Iterator[tuple[str, Any]]:
-    """Yield public functions and classes, and the public methods and properties of the classes."""
+    """Yield all public functions and classes, and the public methods and properties of these classes."""
     for name in re.findall(r"^::: plow_twin\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE):
         found = package[name]
         found = found.final_target if found.is_alias else found
@@ -35,7 +35,7 @@ def public(package: griffe.Module) -> Iterator[tuple[str, Any]]:
 
 
 def described(item: Any) -> dict[str, str]:
-    """Return a docstring's type, shape and text of each parameter and attribute."""
+    """Return the type, shape and text of each parameter and attribute in a docstring."""
     said = {}
     for section in item.docstring.parsed:
         if section.kind.value in ("parameters", "attributes"):
@@ -91,14 +91,16 @@ def test_errors_that_a_function_raises_are_documented(package: griffe.Module) ->
         if function.is_function:
             raised = {*re.findall(r"^ +raise (\w+)\(", function.source, re.MULTILINE)}
             said = function.docstring.value
-            # a docstring that names ValueError covers ArgumentError, which is a ValueError
+            # ArgumentError is a ValueError, so a docstring that names ValueError covers it
             said += "ArgumentError" if "ValueError" in said else ""
             lacking += [f"{name}: {error}" for error in raised if error not in said]
     assert lacking == []
 
 
 def test_no_docstring_begins_with_a_word_that_names_nothing() -> None:
-    """A docstring begins with a verb or with the name of its subject; `Return whether` replaces `Tell whether`."""
+    """The first word of a docstring is a verb or the name of its subject, for example `Return whether`, not `Tell
+    whether`.
+    """
     found = []
     for folder in ("plow_twin", "test", "benchmark", "tools", "studies", "examples", "launch"):
         for path in (ROOT / folder).rglob("*.py"):

@@ -19,8 +19,8 @@ from plow_twin.study.measured.drops import Drops
 
 DATA = Path(__file__).resolve().parent.parent / "benchmark" / "data" / "measured" / "square_drops.npz"
 SQUARE = load_scene("measured_square")
-#: Standard deviation of the clearance's prior in m. The table's height is half of the clearance, so the prior knows the
-#: height to 5 mm.
+#: Standard deviation [m] of the clearance's prior. The height of the table is half the clearance, so its deviation is 5
+#: mm.
 DEVIATION = 0.01
 
 
@@ -30,7 +30,7 @@ def drops() -> Drops:
 
 
 def unknown_table(off: float) -> Scene:
-    """Return the square's scene with the table `off` metres lower."""
+    """Return the square's scene with the table `off` [m] lower."""
     marks = dict(SQUARE.marks)
     marks["clearance.vertical_m"] = replace(marks["clearance.vertical_m"], deviation=DEVIATION)
     clearance = Clearance(SQUARE.clearance.horizontal_m, SQUARE.clearance.vertical_m + 2.0 * off)
@@ -49,12 +49,12 @@ def test_height_of_the_table_follows_from_measured_drops(drops) -> None:
     known = [one for one in found if one.vertical_state.known]
     assert len(known) > 0.9 * len(found)
     true = SQUARE.clearance.vertical_m
-    # the error of the table's height is half the error of the clearance
+    # an error of the clearance causes half the error in the height of the table
     off = 0.5 * np.array([one.vertical.mean - true for one in known])
     assert np.median(np.abs(off)) < 5e-4
     inside = np.mean([one.vertical.p05 < true < one.vertical.p95 for one in known])
     assert 0.8 < inside < 0.99
-    # a height that the data do not determine to half a millimetre is marked as rough
+    # heights that the data do not determine to half a millimetre are marked as rough
     rough = np.array([one.vertical_state is State.ROUGH for one in known])
     assert (rough | (np.abs(off) < 5e-4)).mean() > 0.85
     for one, flagged in zip(known, rough, strict=True):
@@ -70,18 +70,18 @@ def test_walls_that_are_never_met_are_not_observable(drops) -> None:
         "clearance.horizontal_m": replace(width, deviation=2e-3),
     }
     found = of_drop(drops, 0, scene=replace(scene, marks={**scene.marks, **stated}))
-    # with impacts on one wall only, a bias cannot be distinguished from a clearance
+    # with impacts on a single wall, a bias has the same effect as another clearance
     assert found.bias_x is None and found.bias_y is None and found.bias_theta is not None
     assert found.horizontal_state is State.NOT_OBSERVABLE
     assert found.horizontal.mean == SQUARE.clearance.horizontal_m
-    # the deviation is the one that the scene states
+    # the scene states this deviation
     assert found.horizontal.deviation == pytest.approx(2e-3)
     assert found.stiffness is not None and found.stiffness.deviation == pytest.approx(1e6, rel=0.05)
     assert any("0 impacts on the right wall" in reason for reason in found.reasons)
 
 
 def test_impact_on_something_else_is_left_out_and_named(drops) -> None:
-    # in this drop the block hits an obstacle 0.7 m from the origin
+    # in this drop, the block hits an obstacle 0.7 m from the origin
     found = of_drop(drops, 10)
     assert found.horizontal_state is State.NOT_OBSERVABLE
     assert any(reason.startswith("left wall: 1 impacts left out, got one at 0.69") for reason in found.reasons)
@@ -133,7 +133,7 @@ def test_poses_that_cannot_do_are_named(drops, change, word) -> None:
     assert word in found.reasons[0]
 
 
-# the twins that follow compile kernels of their own
+# the following twins need other kernels, which must be compiled
 @pytest.mark.parametrize("follows", [False, pytest.param(True, marks=pytest.mark.stress)])
 def test_command_estimates_a_drop(follows: bool, drops, tmp_path) -> None:
     pose = drops.pose[8] - [0.0, 1.0, 0.0]
@@ -160,7 +160,7 @@ def test_command_estimates_a_drop(follows: bool, drops, tmp_path) -> None:
 
 @pytest.fixture(scope="module")
 def elastic() -> dict[float, tuple[np.ndarray, np.ndarray]]:
-    """Return by stiffness the times and poses, every 4 ms, of a block in a guide with clearances of 30 mm and 22 mm."""
+    """Return by stiffness the times and poses of a block in a guide with clearances of 30 mm and 22 mm, every 4 ms."""
     found = {}
     for stiffness in (1e4, 1e8):
         motion = simulate(guide(stiffness), t_end=12.0, output_dt=0.004, tol=1e-6)
@@ -174,7 +174,7 @@ def guide(stiffness: float) -> Scene:
         Head(5.0, 5.0 * 0.2**2 / 6.0, carries="corners"),
         Frame(0.2, 0.2),
         Clearance(0.030, 0.022),
-        # nearly elastic; without any damping, kernels of its own would be compiled
+        # nearly elastic; a contact without damping would need other compiled kernels
         Contact("exact_restitution", stiffness=stiffness, restitution=0.999),
         loads=(Harmonic("x", (60.0, 0.0), omega_rad_s=7.0), Harmonic("y", (0.0, 55.0), omega_rad_s=11.0)),
         initial=Initial(v=(0.3, 0.2, 0.1)),
@@ -196,7 +196,7 @@ def test_a_stiffness_that_is_not_known_widens_the_interval(elastic) -> None:
 
 @pytest.mark.parametrize(("stiffness", "every"), [(1e4, 1), (1e8, 5)])
 def test_contacts_that_are_no_impacts_between_two_poses_determine_nothing(elastic, stiffness, every) -> None:
-    """A soft contact lasts for many rows, and at 50 Hz two impacts look like one."""
+    """A soft contact lasts for many rows. At 50 Hz, two impacts look like one impact."""
     t, q = elastic[stiffness]
     found = of_guide(t[::every], q[::every], stiffness)
     assert found.horizontal_state is State.NOT_OBSERVABLE
@@ -205,7 +205,7 @@ def test_contacts_that_are_no_impacts_between_two_poses_determine_nothing(elasti
 
 @pytest.mark.parametrize("too_stiff", [300.0, 30.0])
 def test_a_contact_far_softer_than_believed_leaves_the_clearance_in_its_interval(too_stiff) -> None:
-    """The impacts scatter more than rigid impacts, and the interval is accordingly wide."""
+    """The impacts scatter more than rigid impacts, and the interval is correspondingly wide."""
     motion = simulate(guide(1e7), t_end=12.0, output_dt=0.004, tol=1e-6)
     noise = np.random.default_rng(1).normal(0.0, [3e-5, 3e-5, 2e-4], motion.q.shape)
     found = of_guide(motion.t, motion.q + noise, 1e7 * too_stiff)
@@ -214,7 +214,7 @@ def test_a_contact_far_softer_than_believed_leaves_the_clearance_in_its_interval
         assert value.p05 < true < value.p95
 
 
-@pytest.mark.stress  # this test compiles kernels of its own
+@pytest.mark.stress  # this test compiles additional kernels
 def test_rounded_block_between_four_walls_is_estimated() -> None:
     rounded = replace(guide(1e8), frame=Frame(0.2, 0.2, corner_radius_m=0.03))
     motion = simulate(rounded, t_end=12.0, output_dt=0.004, tol=1e-6)

@@ -1,4 +1,4 @@
-"""The estimate of a hard contact, by comparison with drawn motions."""
+"""The estimate of a hard contact, by comparison with simulated motions for random parameters."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_a_hard_contact_is_estimated_by_its_bounces() -> None:
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert "distance" in result.figures, "the bounces were compared"
     assert (result.model, result.sensor) == ("ok", "ok"), result.reasons
-    # the other law is so unlikely that half of the draws planned for it are enough
+    # the other law is so unlikely that half of its planned simulations are sufficient
     assert result.figures["law_odds"] < tuning.CLEAR_ODDS[0]
     assert result.figures["work"] < tuning.MOST_WORK[1] + 0.5 * tuning.MOST_WORK[2]
     for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):
@@ -47,9 +47,9 @@ def test_a_hard_contact_is_estimated_by_its_bounces() -> None:
 
 
 def test_the_deviate_of_a_path_is_normal_for_a_right_model_and_large_for_a_wrong_one() -> None:
-    """Paths scatter widely along a few common directions, so a correct path may be far off along these.
+    """Correct paths scatter widely along a few common directions, so a correct path may be far from the mean.
 
-    A wrong path deviates in another direction. It is found, although its mean square over the phases is smaller.
+    A wrong path deviates in another direction, and is detected although its mean square over the phases is smaller.
     """
     rng = np.random.default_rng(5)
     modes, slopes = rng.standard_normal((3, 60)), rng.standard_normal((14, 60))
@@ -81,7 +81,7 @@ def test_a_method_that_disagrees_widens_the_interval() -> None:
     both = with_bounced(fitted, bounced, 0)
     assert both.horizontal.deviation == pytest.approx(2.4e-5)
     assert both.horizontal.mean == pytest.approx(0.0300108)
-    # the two vertical results are 8 deviations apart, so the interval is widened to contain both
+    # the two vertical results differ by 8 deviations, so the interval is widened to contain both
     assert both.vertical.p05 < 0.0201 and both.vertical.p95 > 0.0202
     assert both.vertical.deviation == pytest.approx(8.0 * 2.4e-5)
     unlike = with_bounced(fitted, replace(bounced, distance=2.0 * tuning.MOST_DISTANCE), 0)
@@ -90,7 +90,7 @@ def test_a_method_that_disagrees_widens_the_interval() -> None:
 
 @pytest.mark.parametrize("turn", [0.0, -0.1])
 def test_the_bias_of_a_sensor_behind_a_hard_contact_is_found(turn: float) -> None:
-    """Half a degree that is missed would withdraw the estimate; 9 mm along y would make a clearance 1 mm too large."""
+    """An undetected angle of half a degree would withdraw the estimate. 9 mm along y would cause an error of 1 mm."""
     truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
     bias = np.array([1e-3, -9e-3, turn])
     found = bias_of_hard(Unknowns(truth.nominal), truth.poses.moved(bias))
@@ -98,7 +98,7 @@ def test_the_bias_of_a_sensor_behind_a_hard_contact_is_found(turn: float) -> Non
 
 
 def test_a_bias_changes_the_other_features_of_a_hard_motion_hardly_at_all() -> None:
-    """A remaining turn of 3e-4 rad would move the measured motion away from the drawn motions, which are not turned."""
+    """A remaining angle of 3e-4 rad would separate the measured motion from the simulated motions."""
     truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
     eye = MotionFeatures(Unknowns(truth.nominal), truth.poses, truth.load.period())
     bias = np.array([1e-4, -1e-4, 6e-4])
@@ -123,7 +123,7 @@ def test_the_delay_is_the_lag_at_which_the_measured_path_is_nearest_to_drawn_pat
 
 
 def test_a_classifier_of_drawn_motions_finds_another_law() -> None:
-    """The classes differ along one direction of little scatter, and no single feature separates them."""
+    """The classes differ in one direction, in which they scatter little. No single feature separates them."""
     rng = np.random.default_rng(5)
     across = np.array([1.0, -1.0, 0.0, 0.0, 0.0, 0.0]) / np.sqrt(2.0)
 
@@ -142,7 +142,7 @@ def test_a_classifier_of_drawn_motions_finds_another_law() -> None:
 
 
 def test_log_odds_find_another_law_among_motions_whose_drawn_numbers_matter_more() -> None:
-    """The drawn parameters move the features along a curve, about ten times as far as law and noise do."""
+    """The parameters move the features along a curve. This effect is ten times as large as that of law and noise."""
     rng = np.random.default_rng(5)
     slope, curve, apart = rng.standard_normal((3, 40))
 
@@ -169,7 +169,7 @@ def test_a_hard_contact_is_estimated_from_a_sensor_with_bias_delay_and_gaps() ->
 
 
 def test_a_contact_of_any_hardness_gives_finite_numbers() -> None:
-    """A regression that extrapolates can give a softness of e^800 m, which JSON cannot represent."""
+    """The extrapolation of a regression can give a softness of e^800 m, for which JSON has no number."""
     unknowns = Unknowns(preset("paper"))
     poses, _ = Poses.of(np.arange(100) * 0.01, np.zeros((100, 3)))
     two = np.full(2, 1e-2)
@@ -193,7 +193,7 @@ def test_a_motion_like_those_of_another_law_is_suspect_unless_that_law_is_unlike
 
 
 def test_what_a_hard_motion_hides_widens_the_clearances_and_not_the_twins() -> None:
-    """Corners rounded by 5 mm make clearances 0.7 mm too large, which is ten of their deviations."""
+    """Corners rounded by 5 mm make the estimated clearances 0.7 mm too large, which is ten standard deviations."""
     truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
     unknowns, period = Unknowns(truth.nominal), truth.load.period()
     eye = MotionFeatures(unknowns, truth.poses, period)
@@ -210,7 +210,7 @@ def test_what_a_hard_motion_hides_widens_the_clearances_and_not_the_twins() -> N
     assert back.apparent == result.apparent
     scenes, _ = draw_scenes(truth.nominal, back, 50, np.random.default_rng(0))
     assert np.std([scene.clearance.horizontal_m for scene in scenes]) < 7e-5
-    # the scene states a deviation of the sides; this also covers the corners, so nothing is added for round corners
+    # the stated deviation of the sides covers the corners too, so that rounded corners add no variance
     exact = Provenance(Mark.MEASURED, deviation=0.0)
     marks = {**truth.nominal.marks, "frame.width_m": exact, "frame.height_m": exact}
     stated = replace(unknowns, scene=replace(truth.nominal, marks=marks))
@@ -239,7 +239,7 @@ def test_a_clearance_at_its_bound_is_not_observable() -> None:
 
 
 def test_the_likeliest_clearances_are_found_from_paths_with_more_parts_than_drawn_motions() -> None:
-    """The clearances of each drawn motion are found as for a new motion, for any drawn parameters and any delay."""
+    """The clearances of each simulated motion are found like those of a new motion, for all parameters and delays."""
     rng = np.random.default_rng(5)
     slopes, curve, common, late = (rng.standard_normal((rows, 150)) for rows in (7, 1, 3, 1))
     scale, middle = np.array([3e-4, 3e-4, 0.3, 0.3, 0.06, 0.06, 0.06]), np.array([0.02, 0.03, -7.0, 0.0, 1.0, 1.0, 1.0])
@@ -268,6 +268,6 @@ def test_the_regression_gives_the_value_at_the_measured_features() -> None:
     found = regress_near(features, targets, np.array([0.5, 0.2, 0.0]))
     assert found.value[0] == pytest.approx(2.3, abs=0.1)
     assert 0.05 < found.deviation[0] < 0.2
-    # the relation is partly nonlinear, and the deviation includes what a line leaves over
+    # the relation is partly nonlinear, and the deviation includes the nonlinear part
     assert found.deviation[1] > 0.2
     assert found.distance < 1.5 < regress_near(features, targets, np.full(3, 6.0)).distance

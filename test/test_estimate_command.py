@@ -1,4 +1,4 @@
-"""`plow-twin estimate`: its contract, mapped bags, and the part of a recording that it uses."""
+"""`plow-twin estimate`: interface, mapped bags, and the part of a recording that it uses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from plow_twin.stream.journal import Entry, Pose, SetWear
 def test_the_command_keeps_the_contract(tmp_path: Path) -> None:
     truth = draw(replace(GROUPS["sensor"], periods=6.0), 1)
     truth.write(tmp_path)
-    # a row with a value that is no number is counted, and not replaced by a guess
+    # a row with a text instead of a number is counted and not used
     with (tmp_path / "pose.csv").open("a") as file:
         file.write("99,what,0,0\n")
     command = [sys.executable, "-m", "plow_twin", "estimate", str(tmp_path), "--json", "--out", str(tmp_path / "out")]

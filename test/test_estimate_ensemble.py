@@ -1,4 +1,4 @@
-"""Forces with intervals, from an ensemble of twins drawn from an estimate."""
+"""Forces with intervals from an ensemble of twins that is drawn from an estimate."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ def test_a_thinned_load_gives_the_same_forces(noise: float) -> None:
     load = Load(t, wrench)
     few = followed(load, truth.load.period())
     assert len(few.t) < 0.3 * len(t)
-    # one load has fewer samples than the other, but with both the forces begin 3.1 s after the first sample
+    # one load has fewer samples than the other, but with both loads the forces begin 3.1 s after the first sample
     each = [forces_of(truth.nominal, result, one, 60, 3.1, over_time=False) for one in (load, few)]
     assert each[0].start == each[1].start == pytest.approx(3.1)
     for one, other in ((each[0].peak, each[1].peak), (each[0].impulse, each[1].impulse)):
-        # single members of sixty take another path, which moves the 5 % and 95 % points
+        # a few of the sixty members move differently, which changes the 5 % and 95 % points
         for value, its, most in zip(one, other, (0.15, 0.03, 0.15), strict=True):
             assert its == pytest.approx(value, rel=most, abs=1e-3 * float(one.max()))
 
@@ -66,9 +66,9 @@ def test_members_are_drawn_with_the_estimate_s_correlation() -> None:
     scenes, gains = draw_scenes(truth.nominal, drawn, 2000, np.random.default_rng(1))
     clearance = np.array([scene.clearance.horizontal_m for scene in scenes])
     stiffness = np.log([scene.contact.stiffness for scene in scenes])
-    # clearance and stiffness are correlated: a member with a smaller clearance has a softer contact
+    # clearance and stiffness are correlated: members with a smaller clearance have softer contacts
     assert np.corrcoef(clearance, stiffness)[0, 1] == pytest.approx(0.8, abs=0.04)
-    assert drawn.apparent is not None  # members have exactly the scene's frame
+    assert drawn.apparent is not None  # all members have the frame of the scene
     ends = drawn.apparent[0].p05, drawn.apparent[0].p95
     assert np.quantile(clearance, [0.05, 0.95]) == pytest.approx(ends, abs=0.05 * (ends[1] - ends[0]))
     assert gains.shape == (2000, 3)

@@ -1,4 +1,4 @@
-"""The algebra of the fit: links between swings, normal equations, intervals."""
+"""Algebra of the fit: links between swings, normal equations and intervals."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_a_clearance_at_its_bound_is_not_observable() -> None:
 
 
 def test_a_change_without_effect_on_the_motion_has_no_derivative() -> None:
-    """Mass, inertia, stiffness and load larger by the same share change nothing; steps of a fit leave a quarter."""
+    """If mass, inertia, stiffness and load grow by the same factor, the motion is unchanged."""
     truth = draw(replace(GROUPS["plain"], periods=3.0), 2)
     unknowns, share = Unknowns(truth.nominal), 1e-5
     forward = Forward(truth.nominal, truth.load)
@@ -117,7 +117,7 @@ def test_a_change_without_effect_on_the_motion_has_no_derivative() -> None:
 def test_starts_that_meet_end_the_search(
     group: str, least: int, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:  # fmt: skip
-    """Two starts that lead to the same optimum need no third; noise keeps the starts apart, so all six are fitted."""
+    """If two starts lead to the same optimum, no third start is fitted. With noise, all six starts are fitted."""
     truth = draw(replace(GROUPS[group], periods=3.0), 2)
     fitted = Mock(side_effect=fit)
     monkeypatch.setattr(search, "fit", fitted)
@@ -125,8 +125,7 @@ def test_starts_that_meet_end_the_search(
     problem, found = search.candidate(forward, unknowns, truth.poses, truth.load.period()) or (None, None)
     assert problem is not None and found is not None
     assert least <= fitted.call_count <= most
-    # one call gives the derivatives with respect to all six components of the starting states, and each other unknown
-    # takes one call
+    # one call gives the derivatives with respect to all six initial values, and one call those of each other unknown
     run = Mock(side_effect=forward.run)
     monkeypatch.setattr(forward, "run", run)
     problem.linearise(found.point)

@@ -1,4 +1,4 @@
-"""The twin that follows its machine: forces and clearances at each time from earlier measurements."""
+"""The twin that follows its machine: its forces and clearances depend only on earlier measurements."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ from estimate_truths import GROUPS, PERIOD, Truth, draw
 
 Array = NDArray[np.float64]
 MEMBERS = 48
-#: Seed of a machine with a soft contact, a horizontal clearance 8 mm larger than believed, and load gains up to 10 %
-#: off.
+#: Seed of a machine with a soft contact. Its horizontal clearance is 8 mm larger than assumed, and load gains have
+#: errors up to 10 %.
 SEED = 71003
 
 
@@ -55,7 +55,7 @@ def followed(truth: Truth) -> Stretch:
 
 
 def _known(truth: Truth, state: State = State.ESTIMATED) -> Estimate:
-    """Return an estimate with the accuracy of ten load periods."""
+    """Return an estimate with the accuracy of an estimate from ten load periods."""
     clearance, contact = truth.scene.clearance, truth.scene.contact
     assert contact.damping is not None
     fx, fy, m = (Interval.normal(gain, 0.003) for gain in truth.gain)
@@ -68,7 +68,7 @@ def _known(truth: Truth, state: State = State.ESTIMATED) -> Estimate:
 
 
 def _run(follower: Follower, truth: Truth, end: float, begin: float = -1.0, late: float = 0.0) -> Array:
-    """Continue to a time with load and poses, where poses are `late` s late; return the forces of the median twin."""
+    """Pass load and poses up to a time, with poses late by `late` [s]. Return the forces of the median twin."""
     load, poses = truth.load, truth.poses
     there = np.flatnonzero((load.t > begin) & (load.t <= end))
     rows, place = np.zeros(len(there), ROW), int(np.searchsorted(poses.t + late, begin, side="right"))
@@ -81,7 +81,8 @@ def _run(follower: Follower, truth: Truth, end: float, begin: float = -1.0, late
 
 
 def _take(follower: Follower, found: Estimate) -> bool:
-    """Add an estimate now; return whether it is followed, or the prior again."""
+    """Add an estimate at the present time. Return whether the twins follow it; otherwise, they follow the prior again.
+    """
     before = follower.drawn
     follower.add_estimate(json.dumps(found.as_dict()), follower.time)
     return follower.drawn != before
@@ -107,9 +108,9 @@ def test_intervals_hold_from_the_first_row_on_and_narrow(truth: Truth, followed:
     for axis, true in enumerate(truth.clearance):
         value, low, high = clearance[:, axis].T
         assert ((low <= true) & (true <= high)).mean() > 0.85
-        assert 0.02 < high[0] - low[0] < 0.04  # at the start the interval is as wide as the prior's
+        assert 0.02 < high[0] - low[0] < 0.04  # at the start, the interval is that of the prior
         assert (low <= value).all() and (value <= high).all()
-        assert high[-1] - low[-1] < 2e-3  # errors of the frame and of the sensor's scales are part of it
+        assert high[-1] - low[-1] < 2e-3  # the interval includes errors of the frame and of the scales of the sensor
 
 
 def test_a_row_uses_measurements_up_to_its_time_only(truth: Truth, followed: Stretch) -> None:
@@ -223,7 +224,7 @@ def test_late_poses_correct_too_and_later_poses_have_no_effect(truth: Truth, for
 
 
 def test_the_load_error_of_a_rough_estimate_lets_the_intervals_hold(truth: Truth, forces: Array) -> None:
-    """The believed load lacks a constant force of 4 kN, an eighth of the load's amplitude."""
+    """The assumed load lacks a constant force of 4 kN, an eighth of the load's amplitude."""
     figures = {f"load_error_{name}": 0.01 for name in ("fx", "fy", "m")}
     rough = replace(_known(truth, State.ROUGH), figures=figures)
     wrench = truth.load.wrench + np.array([4e3, 0.0, 0.0])
@@ -261,7 +262,7 @@ def test_a_machine_without_gravity_is_steered_too(truth: Truth, monkeypatch: pyt
     monkeypatch.setattr(TwinBatch, "move", counted)
     nominal = replace(truth.nominal, gravity=replace(truth.nominal.gravity, acceleration_m_s2=0.0))
     _run(Follower(nominal, MEMBERS), truth, 1.0)
-    # hardly any member would be moved if a wall's force were limited to a share of the weight, which is zero here
+    # here the weight is zero; if a share of the weight limited the force of a wall, hardly any member would move
     assert np.mean(moved) > MEMBERS / 3
 
 
@@ -292,9 +293,9 @@ def test_stiffness_and_gains_of_a_hard_contact_are_learned_from_the_poses() -> N
     follower.span()
     _run(follower, truth, 5.0, 4.0)
     peak = simulate(truth.scene, 5.0, 1e-4, 1e-6).force[40_000:].max()
-    # twins with the estimate's stiffness would have a peak less than half as large
+    # twins with the stiffness of the estimate would have less than half of this peak
     assert follower.span().peak[0].max() == pytest.approx(peak, rel=0.25)
-    # a twin that follows by its parameters alone keeps the learned parameters
+    # a twin that follows by parameters alone retains the parameters learned before
     follower.follow_parameters()
     _run(follower, truth, 5.02, 5.0)
     alone = Follower(truth.nominal, 1)
@@ -369,7 +370,7 @@ def test_early_windows_grow_until_there_are_whole_ones_and_each_has_new_motion()
         window = windows.add_load(stamp, (float(index % 7), 0.0, 0.0))
         if window is not None:
             ends.append(window.end_ns * 1e-9)
-    # the early window that would end at 10.8 s is left out
+    # the window that would end at 10.8 s is skipped, because it is too early
     assert np.allclose(ends, [3.2, 4.8, 7.2, 10.0, 20.0, 30.0, 40.0])
 
 

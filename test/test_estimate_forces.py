@@ -1,4 +1,4 @@
-"""Measured contact forces beside the poses: the information in them, and the evidence against them."""
+"""Contact forces measured in addition to the poses: they narrow the intervals, and can contradict the estimate."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def fitted(truth: Truth) -> tuple[Estimate, Problem, Fit]:
 
 
 def _exact(result: Estimate) -> dict[str, Interval]:
-    """Return the values of a machine that has exactly the scene's frame."""
+    """Return the values of a machine with exactly the frame of the scene."""
     assert result.apparent is not None
     return result.values() | dict(zip(("horizontal", "vertical"), result.apparent, strict=True))
 
@@ -94,7 +94,7 @@ def test_forces_of_another_law_make_the_model_suspect(truth: Truth, fitted: tupl
     assert truth.forces is not None
     result, problem, fit = fitted
     t, measured = truth.forces.t, truth.forces.force
-    # the motion follows the believed law, so poses alone show no fault
+    # the motion obeys the assumed contact law, so the poses alone show no contradiction
     own = fit.shared.copy()
     own[[*range(SIZE)[BIAS], DELAY]] = 0.0
     window = Window(Poses(t, np.zeros((len(t), 3))), problem.window.starts, problem.window.states)
@@ -126,10 +126,11 @@ def test_a_folder_without_forces_runs_no_code_of_forces(
 ) -> None:
     short = replace(truth, load=truth.load.between(0.0, 4.0), poses=truth.poses.between(0.0, 4.0), forces=None)
     short.write(tmp_path)
-    # `--out` writes a file of this name with computed forces, so this file is not read as a measurement
+    # `--out` writes a file of this name with computed forces, which must not be read as a measurement
     (tmp_path / "forces.csv").write_text("t,force_top_left_top/p05\n0,1\n")
     for name in ("contact_forces", "force_fit"):
-        monkeypatch.setitem(sys.modules, f"plow_twin.estimate.{name}", None)  # an import of this module now fails
+        # an import of this module now raises an error
+        monkeypatch.setitem(sys.modules, f"plow_twin.estimate.{name}", None)
     result, _ = _given(tmp_path, None, None, True).run()
     assert result.forces_measured is None
     (tmp_path / "contact_forces.csv").write_text("t,top_left_top\n0,1\n")

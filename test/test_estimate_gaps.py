@@ -1,4 +1,4 @@
-"""Gap sensors beside the poses, or instead of them."""
+"""Gap sensors in addition to poses, or instead of them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SENSOR_ERROR = 1e-4
 
 @pytest.fixture(scope="module")
 def gapped() -> tuple[Truth, np.ndarray]:
-    """Return a simulated machine and the gaps measured at all pairs, with constant errors, noise and missing times."""
+    """Return a simulated machine and measured gaps of all pairs, with constant errors, noise and missing times."""
     truth = known()[0][0]
     still = draw(replace(truth.group, noise_m=0.0), 2).poses.q
     rng = np.random.default_rng(6)
@@ -55,7 +55,7 @@ def test_gaps_that_do_not_determine_the_clearances_are_not_used_and_the_reason_n
 ) -> None:
     truth, gap = gapped
     gap = gap.copy()
-    gap[:, [3, 5]] = np.nan  # the right wall has no gap sensor
+    gap[:, [3, 5]] = np.nan  # there is no gap sensor at the right wall
     gaps, _ = Gaps.of(truth.poses.t, gap)
     names = ", ".join(PAIR_NAMES[pair] for pair in (0, 1, 2, 4, 6, 7))
     why = f"gaps: got sensors at {names}, expected five pairs that determine theta, or one pair at each wall"
@@ -73,7 +73,7 @@ def test_gaps_that_do_not_determine_the_clearances_are_not_used_and_the_reason_n
 def test_gaps_with_theta_alone_give_the_clearances_and_the_reason_names_the_missing_components(
     gapped: tuple[Truth, np.ndarray],
 ) -> None:
-    """With four sensors theta comes from the poses, so the gaps give no pose in place of the measured one."""
+    """With four sensors, theta is taken from the poses, so the gaps alone give no pose."""
     truth, gap = gapped
     four, q = np.full_like(gap, np.nan), truth.poses.q.copy()
     four[:, [0, 1, 3, 6]], q[:, :2] = gap[:, [0, 1, 3, 6]], np.nan

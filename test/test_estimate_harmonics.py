@@ -1,4 +1,4 @@
-"""Harmonics that the measured load lacks."""
+"""Harmonics that are missing in the measured load."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from plow_twin.stream.journal import Estimated, Pose, Sample
 from plow_twin.stream.session import Session
 
 OMEGA = 2.0
-#: Share of the third harmonic in the load's amplitude.
+#: Amplitude of the third harmonic, relative to the amplitude of the load.
 SHARE = 0.1
 
 
@@ -90,7 +90,7 @@ def test_a_load_that_explains_the_motion_is_fitted_without_harmonics(monkeypatch
 
 
 def test_harmonics_are_found_where_the_residuals_do_not_repeat_with_the_load() -> None:
-    """The head's motion differs from period to period, so the residuals without harmonics differ too."""
+    """The motion differs from period to period, so the residuals without the harmonics differ too."""
     truth = draw(replace(GROUPS["plain"], third_harmonic=SHARE), 78000)
     load, poses = truth.load, truth.poses.between(0.0, 10.0)
     found = estimate(truth.nominal, Load(load.t[:1001], load.wrench[:1001]), poses)
@@ -116,7 +116,7 @@ def _error(force: np.ndarray, true: np.ndarray) -> float:
 
 
 def test_twins_follow_with_the_harmonics_of_their_window(truth: Truth, found: Estimate) -> None:
-    """The window begins 1.5 s before the session's first sample; the session's state continues bit for bit."""
+    """The window begins 1.5 s before the first sample of the session, whose state is unchanged, bit for bit."""
     text, begin, end = json.dumps(found.as_dict()), 150, 700
     run = simulate(truth.scene, end * 0.01, 0.01, 1e-6)
     errors = {}

@@ -1,4 +1,4 @@
-"""Wear over a life: known answers, comparison with a direct run, and a forecast with correct quantiles."""
+"""Wear over a life: known solutions, comparison with a direct simulation, and quantiles of the forecast."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from plow_twin.scene_file import dump_scene
 from plow_twin.stream.journal import Estimated, SetModel, SetWear
 from plow_twin.stream.session import Session
 
-#: Wear so fast that a life fits into a simulation of a minute, about 1 mm in 20 s.
+#: Wear so fast that a life takes a minute, about 1 mm in 20 s.
 FAST = Wear(1e-8, 1.0, 0.2)
 
 
@@ -42,7 +42,7 @@ def test_the_jump_agrees_with_the_direct_run() -> None:
 
 
 def test_the_jump_agrees_with_the_direct_run_with_sliding_in_the_plane_and_running_in() -> None:
-    """Travel is a hundredth of the usual, so sliding in the plane outweighs it; new pads wear three times as fast."""
+    """With a hundredth of the usual travel, most wear is by sliding in the plane. New pads wear three times as fast."""
     slow = replace(FAST, travel_speed_m_s=0.02, coefficient_m2_n=3e-9, sliding="total")
     scene = replace(preset("paper"), wear=replace(slow, running_in_ratio=3.0, running_in_depth_m=2e-4))
     assert scene.wear is not None
@@ -53,18 +53,18 @@ def test_the_jump_agrees_with_the_direct_run_with_sliding_in_the_plane_and_runni
     assert path.depth[-1] == pytest.approx(direct, rel=0.03, abs=1e-5)
     travel_only = wear_path(replace(preset("paper"), wear=replace(slow, sliding="travel")), (1.0, 1.0), exposure)
     assert direct.max() > 1.5 * travel_only.depth[-1].max() > 1e-4
-    # with a quarter of the coefficient running-in is not yet complete, but the same path is valid
+    # with a quarter of the coefficient, running-in is incomplete, but the path is still valid
     quarter = simulate(replace(scene, wear=replace(scene.wear, coefficient_m2_n=7.5e-10)), span, span, 1e-6).wear_depth
     early = [np.interp(0.25 * exposure, path.exposure, pad) for pad in path.depth.T]
     assert early == pytest.approx(quarter, rel=0.05, abs=1e-5)
-    # if a head's clearances have grown, its pads have worn and therefore run in
+    # larger clearances mean that the pads have worn, so that their running-in is complete
     grown = with_clearances(scene, scene.clearance.horizontal_m + 2e-3, scene.clearance.vertical_m)
     assert grown.wear is not None and grown.clearance == scene.clearance
     assert grown.wear.initial_depth_m == pytest.approx(1e-3 * np.abs(NORMAL_X))
 
 
 def test_constant_force_wears_as_archard_says() -> None:
-    """If wear does not change the force F, the depth is h = F E, where E is the exposure."""
+    """For a constant force F, the depth is h = F E, where E is the exposure."""
     scene = replace(preset("paper"), wear=FAST)
     force, deviation = mean_forces(scene, np.zeros(8))
     path = wear_path(scene, (1.0, 1.0), 1e-10)
@@ -79,7 +79,7 @@ def test_quantiles_scale_with_the_coefficient_and_the_horizon_cuts(tmp_path: Pat
     life = forecast(scene, plan)
     p10, p50, p90 = (life.quantile(share) for share in (0.1, 0.5, 0.9))
     assert p10 is not None and p50 is not None and p90 is not None and p10 < p50 < p90
-    # the prior of k_s is log-normal, which determines the ratio of the 10 % and 90 % points of 1/k_s
+    # k_s has a log-normal prior, which determines the ratio of the 10 % and 90 % points of 1/k_s
     assert np.log(p90 / p10) == pytest.approx(np.log(4.0) * 1.2816 / 1.6449, rel=0.1)
     doubled = replace(scene, wear=replace(slow, prior_m2_n=(1e-14, 4e-14)))
     assert forecast(doubled, plan).quantile(0.5) == pytest.approx(0.5 * p50, rel=0.02)
@@ -101,7 +101,7 @@ def test_quantiles_scale_with_the_coefficient_and_the_horizon_cuts(tmp_path: Pat
     assert other["p50"]["hours"] < 0.55 * facts["p50"]["hours"]
     assert other["probability_before_stop"] >= facts["probability_before_stop"]
     assert picture.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    # just before the median time at which a limit is reached, one clearance has nearly reached its limit
+    # just before the median time to the limit, one clearance has nearly reached its limit
     now = life.clearances(np.zeros(1))[1, 0]
     assert now == pytest.approx([0.025, 0.030], abs=1e-9)
     late = life.clearances(np.array([0.99 * p50]))[1, 0]
@@ -116,7 +116,7 @@ def test_scenarios_are_forecasts_of_their_own_from_the_same_draws() -> None:
     alone = forecast(scene, replace(plan, scenarios=()))
     assert np.array_equal(found.hours, alone.hours)
     assert found.scenarios["dry"].hours == pytest.approx(2.0 * found.hours, rel=1e-2)
-    # a heavier load makes larger forces and a shorter life; how much shorter depends on the contact
+    # a heavier load causes larger forces and a shorter life; the ratio depends on the contact
     middle, sooner = found.quantile(0.5), found.scenarios["heavy"].quantile(0.5)
     assert middle is not None and sooner is not None and 0.6 * middle < sooner < 0.95 * middle
     for text in ("no numbers:load", "a:speed=2", "b:load=0", ":load=2", "c:load=nan"):
@@ -127,7 +127,7 @@ def test_scenarios_are_forecasts_of_their_own_from_the_same_draws() -> None:
 
 
 def test_a_table_of_enough_periods_is_a_load_to_forecast_under() -> None:
-    """A sampled harmonic load, as in a recording, gives the same mean forces."""
+    """A sampled harmonic load, as in a recording, gives the same mean forces as the harmonic load."""
     scene = preset("paper")
     t = np.arange(0.0, 20.0, 0.01)
     sampled = replace(scene, loads=(Table("recorded", t, compile_loads(scene.loads).at(t)),))
@@ -139,7 +139,7 @@ def test_a_table_of_enough_periods_is_a_load_to_forecast_under() -> None:
 
 
 def test_an_estimated_clearance_holds_the_wear_that_there_is() -> None:
-    """The estimated clearance includes 2 mm of wear of the pads; the forecast must not add this wear again."""
+    """The estimated clearance already includes 2 mm of wear of the pads, which the forecast must not add again."""
     worn = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, initial_depth_m=(2e-3,) * 8))
     facts = {
         name: {"mean_m": mean, "p05_m": mean - 1e-4, "p95_m": mean + 1e-4, "state": "estimated"}
@@ -164,8 +164,8 @@ def test_of_a_run_the_pads_as_it_left_them_count_and_no_estimate_of_others(tmp_p
     scene, newest = left_by(RunReader(tmp_path / "set"))
     assert newest is None and scene.clearance.vertical_m == 0.031
     assert scene.wear is not None and scene.wear.initial_depth_m == pytest.approx(depth, abs=1e-12)
-    # the first snapshot of a run contains the wear at the run's start, which may come from wear_state_path instead of
-    # the scene
+    # the first snapshot of a run contains the wear at the start of the run, which may come from wear_state_path and not
+    # from the scene
     session = Session(Twin(scene, excitation="sampled"), wear_depth=depth)
     record_run(tmp_path / "kept", [session.snapshot(), paper_sample(0), of_old_pads], wear=Wear(1e-14, 0.015, 2.0))
     scene, newest = left_by(RunReader(tmp_path / "kept"))
@@ -187,7 +187,7 @@ def test_a_scene_without_wear_or_period_is_refused() -> None:
 
 
 def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The true history is a direct run without jumps, with a coefficient away from the middle of the prior."""
+    """The true history is a direct simulation without jumps. Its coefficient is not in the middle of the prior."""
     true_k = 1.8e-9
     scene = replace(preset("paper"), wear=replace(FAST, coefficient_m2_n=1e-9, prior_m2_n=(2.5e-10, 4e-9)))
     worn = replace(scene, wear=replace(FAST, coefficient_m2_n=true_k))
@@ -201,11 +201,12 @@ def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, caps
     known = coefficient(scene, history)
     found = known.interval()
     assert found.p05 < true_k < found.p95 and found.p95 / found.p05 < 1.3**2
-    # clearances without noise would leave a single value, but the path itself is uncertain, so the interval stays wide
+    # without noise, the clearances would determine the coefficient exactly, but the interval includes the error of the
+    # path
     sure = replace(known, weight=np.eye(len(known.value))[len(known.value) // 2]).interval()
     assert sure.p95 / sure.p05 > math.exp(3.2 * tuning.PATH_DEVIATION)
     assert np.abs(known.clearance - [0.025, 0.030] - grown[-1]).max() < 4.0 * noise
-    # the forecast continues along the path with the present depths of the pads, which have worn unequally
+    # the forecast begins with the present depths of the pads, which have worn unequally
     assert known.depth == pytest.approx(depth[-1], rel=0.1, abs=5e-5)
     ahead = with_clearances(scene, *map(float, known.clearance), known.depth)
     assert ahead.wear is not None and ahead.wear.initial_depth_m == pytest.approx(known.depth)
@@ -213,7 +214,7 @@ def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, caps
         [known.depth @ np.abs(NORMAL_X), known.depth @ np.abs(NORMAL_Y)]
     )
     assert total == pytest.approx(known.clearance)
-    # more knowledge narrows the forecast
+    # a narrower posterior gives a narrower forecast
     plan = Plan(0.030, 0.035, 1.0, load_deviation=0.0)
     prior, posterior = (forecast(scene, plan, known=knowledge) for knowledge in (None, known))
     ratios = [life.quantile(0.9) / life.quantile(0.1) for life in (prior, posterior)]  # type: ignore[operator]
@@ -231,7 +232,7 @@ def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, caps
 
 
 def test_a_forecast_wears_the_pads_by_the_contact_that_was_estimated() -> None:
-    """Another contact loads other pads, so the forecast must not use the believed contact."""
+    """The forces on the pads depend on the contact, so the forecast must use the estimated contact."""
     wear = Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14))
     believed = replace(preset("paper"), wear=wear)
     hard = replace(believed, contact=replace(believed.contact, stiffness=2.4 * believed.contact.stiffness))
@@ -250,7 +251,7 @@ def test_a_forecast_wears_the_pads_by_the_contact_that_was_estimated() -> None:
 
 
 def test_a_path_that_does_not_come_to_its_end_is_no_limit_never_reached() -> None:
-    """From a clearance of a micrometre, 400 steps make no progress; this must not be reported as `not reached`."""
+    """From a clearance of a micrometre, 400 steps make no progress. The result must not be `not reached`."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     tight = replace(scene, clearance=Clearance(1e-6, 0.030))
     found = forecast(tight, Plan(0.002, 0.034, 1e3, draws=50))
@@ -261,7 +262,8 @@ def test_a_path_that_does_not_come_to_its_end_is_no_limit_never_reached() -> Non
 
 
 def test_a_clearance_hardly_known_is_not_below_zero() -> None:
-    """A clearance drawn from its prior can be -70 mm, from which the path to the limit leaves the model's range."""
+    """A clearance drawn from its prior can be -70 mm, from which the path to the limit leaves the range of the model.
+    """
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     found = forecast(scene, Plan(0.026, 0.031, 1e3, draws=50), (0.03, 0.03))
     assert found.now.min() > 0.0
@@ -276,7 +278,7 @@ def test_a_clearance_hardly_known_is_not_below_zero() -> None:
 
 
 def test_a_history_that_the_prior_does_not_allow_is_refused() -> None:
-    """The whole posterior would be at the end of the grid, with an interval of no width that excludes the truth."""
+    """The posterior would be at the end of the grid. Its interval would have no width and would exclude the truth."""
     scene = replace(preset("paper"), wear=replace(FAST, coefficient_m2_n=1e-9, prior_m2_n=(2.5e-10, 4e-9)))
     travel = np.arange(5) * 10.0
     still = np.tile([0.025, 0.030], (5, 1))
@@ -287,7 +289,7 @@ def test_a_history_that_the_prior_does_not_allow_is_refused() -> None:
 
 
 def test_a_history_that_shrinks_is_refused() -> None:
-    """A clearance that shrinks by 20 of its deviations must not give a coefficient near 0 with a narrow interval."""
+    """A clearance that decreases by 20 deviations must not give a coefficient near 0 with a narrow interval."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0))
     travel, shrunk = np.array([0.0, 1e4]), np.array([[0.025, 0.030], [0.0245, 0.0295]])
     with pytest.raises(LifeError, match=r"no wear of this scene explains.*row 2 is -0\.2\d+ mm off"):
@@ -298,11 +300,11 @@ def test_a_history_that_shrinks_is_refused() -> None:
 def test_unusable_input_of_a_forecast_is_refused_and_not_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A stop beyond the horizon, an empty estimate and a missing contact give no forecast."""
+    """There is no forecast for a stop beyond the horizon, an empty estimate or a missing contact."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     file, found, history = (tmp_path / name for name in ("scene.yaml", "estimate.json", "history.csv"))
     file.write_text(dump_scene(scene))
-    # a spreadsheet program may write the history with a byte order mark, semicolons and decimal commas
+    # a spreadsheet may write the history with a byte order mark, semicolons and decimal commas
     sheet = "\ufeffkm;horizontal_mm;horizontal_sd_mm;vertical_mm;vertical_sd_mm\n0,0;25;1;30;1\n9;25;1;30;1\n"
     history.write_text(sheet)
     limits = ["--limit-horizontal", "28", "--limit-vertical", "34"]

@@ -1,4 +1,4 @@
-"""The estimate beside the live node, with real processes and late data, and the same estimate from the journal."""
+"""The estimate beside the live node, with real processes and late data. The journal gives the same estimate."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ from estimate_truths import GROUPS, Truth, draw
 #: Stamp of the first sample [ns].
 START_NS = 1_700_000_000_000_000_000
 WINDOW_S, INTERVAL_S, WAIT_S = 10.0, 4.0, 2.0
-#: Settings with which a busy machine loses no sample and no pose. If rows were missing, a window would differ.
+#: Settings with which no sample and no pose is lost on a busy machine. Lost rows would change a window.
 RELIABLE = {
     f"qos_overrides.{{ns}}/{topic}.subscription.reliability": "reliable"
     for topic in ("excitation", "head_pose", "gaps")
@@ -56,7 +56,7 @@ RELIABLE = {
 
 
 def _windows(loads: list[tuple[int, tuple[float, ...]]], poses: list[tuple[int, tuple[float, ...]]]) -> list[Window]:
-    """Feed a collector with samples and poses, each pose before the sample with the same index."""
+    """Pass samples and poses to a collector of windows; each pose precedes the sample with the same index."""
     windows, found = Windows(4.0, 1.0, 0.5), []
     for index, load in enumerate(loads):
         if index < len(poses):
@@ -73,7 +73,7 @@ def test_windows_do_not_depend_on_the_order_of_arrival() -> None:
     stamps = START_NS + np.arange(0, 800) * 10_000_000
     loads = [(int(stamp), tuple(rng.standard_normal(3).tolist())) for stamp in stamps]
     poses = [(int(stamp) + 3, tuple(rng.standard_normal(3).tolist())) for stamp in stamps]
-    # each row is late by up to 0.4 s, less than the waiting time
+    # each row is late by up to 0.4 s, which is less than the waiting time
     late = [sorted(rows, key=lambda row: row[0] + int(rng.integers(0, 400_000_000))) for rows in (loads, poses)]
     ordered, mixed = _windows(loads, poses), _windows(*late)
     assert [window.end_ns for window in ordered] == [window.end_ns for window in mixed]
@@ -91,7 +91,7 @@ def test_windows_do_not_depend_on_the_order_of_arrival() -> None:
 
 
 def test_measurements_without_a_load_do_not_pile_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The load may have stopped, or the poses may have a clock that is hours ahead."""
+    """If the load has stopped, or the clock of the poses is hours ahead, the queue must not grow without limit."""
     monkeypatch.setattr("plow_twin.estimate.window.MOST_KEPT", 100)
     windows = Windows(4.0, 1.0, 0.5)
     for index in range(300):
@@ -115,7 +115,7 @@ def test_a_window_begins_behind_a_silence_of_the_load() -> None:
 
 
 def _play(running: Bench, truth: Truth, late: bool) -> None:
-    """Send load and poses of a simulated machine faster than their stamps; with `late`, some poses come 1 s late."""
+    """Send load and poses of a simulated machine faster than in real time. With `late`, some poses are late by 1 s."""
     probe = running.probe
     send = probe.excitation()
     pose, gap = probe.publisher(PoseStamped, "head_pose"), probe.publisher(JointState, "gaps")
@@ -154,7 +154,7 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
         "forecast_limits": "[0.04, 0.05]",
         "forecast_horizon": 3.6e7,
         "hold_limit": 3600.0,  # an estimate may take long on a busy machine, so holding must not end
-        "estimate_window": WINDOW_S,
+        "estimate_window": WINDOW_S,  # an estimate may take long on a busy machine, and the hold must not end before
         "estimate_interval": INTERVAL_S,
         "rollback_span": WAIT_S,
     }
@@ -168,13 +168,13 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
         assert value(probe.status[-1], "horizontal") == "prior"
         probe.until_figure("estimate", "ready", "1", timeout_s=100.0)  # before the first sample
         _play(running, truth, late=True)
-        # windows end every 4 s; a slow machine may leave out a window, but not the last one
+        # windows end every 4 s; on a slow machine a window may be skipped, but not the last window
         last_s = (START_NS + round((truth.load.t[-1] - WAIT_S) * 1e9)) // round(INTERVAL_S * 1e9) * round(INTERVAL_S)
         probe.until(lambda: heard and heard[-1].header.stamp.sec == last_s, "the last window's estimate", 100.0)
         probe.until_figure("estimate", "estimates", *map(str, range(1, 9)))
         probe.until(lambda: value(probe.status[-1], "horizontal") == "estimated", "the flag")
         found = dict(zip(heard[-1].name, heard[-1].position, strict=True))
-        # the hold policy applies the estimate at the next slow publication
+        # the hold policy applies the estimate in the next slow publication
         probe.until(lambda: abs(clearances[-1].position[0] - found["horizontal"]) < 1e-9, "the clearance")
         last = dict(zip(clearances[-1].name, clearances[-1].position, strict=True))
         status: DiagnosticStatus = probe.status[-1]
@@ -195,10 +195,10 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
     facts = json.loads(done.stdout)
     assert facts["live"]["repeated"] is True and facts["live"]["estimates"] >= 1
     assert facts["horizontal"]["mean_m"] == found["horizontal"]
-    # gaps were measured too, so there are also clearances of the groups of pads
+    # gaps were measured, so clearances of the groups of pads are estimated too
     group = facts["groups"]["horizontal_top"]
     assert group["mean_m"] == pytest.approx(truth.clearance[0], abs=3e-4) and group["p95_m"] - group["p05_m"] > 4e-4
-    # forecast and forces are computed from the estimate, so they are the same too
+    # forecast and forces are computed from the same estimate
     assert facts["forecast"] == json.loads(answer.message)
     told = dict(zip(forecasts[-1].name, forecasts[-1].position, strict=True))
     assert told["seconds/p50"] == pytest.approx(3600.0 * facts["forecast"]["p50"]["hours"])
@@ -236,12 +236,12 @@ def test_an_estimate_stays_until_it_is_withdrawn_or_the_pads_are_changed() -> No
     assert [now[f"horizontal{point}"] for point in ("", "/p05", "/p95")] == pytest.approx(
         [0.02, 0.019, 0.021], abs=1e-6
     )
-    # a late sample takes the model back to a time before the estimate, but the estimate stays in force
+    # a late sample takes the model back to a time before the estimate, but the estimate remains valid
     clearance(0.6)
     session.apply(Sample(START_NS + 100_000_000, (4e4, -1e4, 0.0)))
     later = clearance(1.8)
     assert later["vertical"] == pytest.approx(0.03, abs=1e-6)
-    # the interval of the horizontal clearance widens by the prior of the wear
+    # the prior of the wear widens the interval of the horizontal clearance
     assert later["horizontal/p95"] - later["horizontal/p05"] > now["horizontal/p95"] - now["horizontal/p05"]
     second = entry_of(_found(State.NOT_OBSERVABLE, State.WITHDRAWN), session, first)
     assert second.shift == (*first.shift[:3], 0.0, 0.0, 0.0)
@@ -251,7 +251,7 @@ def test_an_estimate_stays_until_it_is_withdrawn_or_the_pads_are_changed() -> No
 
 
 class _Finished:
-    """A worker without a process, to which the test gives the results."""
+    """A worker without a process. The test sets its results."""
 
     def __init__(self, *_: Any) -> None:
         self.found: list[Found] = []
@@ -283,17 +283,17 @@ def test_other_pads_and_other_model_numbers_discard_earlier_estimates(
         return estimation.poll(session)
 
     assert told()["forecast"].name == ("seconds/p50",)
-    # while the model is changed, an estimate of the previous machine is still being computed
+    # when the model is changed, an estimate of the previous machine is still being computed
     estimation.worker.found.append(_found(State.ESTIMATED, State.ESTIMATED))
     session.apply(SetModel(START_NS, json.dumps({"clearance.horizontal_m": 0.026})))
-    # the clearance is that of the model again, because an estimate is not kept if the other clearance is not observable
+    # the clearance is that of the model again: no estimate remains if the other clearance is not observable
     assert estimation.entry is None and set(estimation.states.values()) == {State.PRIOR}
     assert estimation.forecast is not None and estimation.poll(session) == {}
     told()
     session.apply(SetWear(START_NS + 1, (0.0,) * 8, "new pads"))
     assert (estimation.forecast, estimation.reasons, estimation.end_ns) == (None, (), None)
     assert estimation.forecast_error and set(estimation.trust.values()) == {""}
-    # empty messages replace the latched estimate and the latched forecast
+    # empty messages replace the latched messages of estimate and forecast
     messages = estimation.poll(session)
     assert {topic: (message.stamp_ns, message.name) for topic, message in messages.items()} == dict.fromkeys(
         ("estimate", "forecast"), (START_NS + 1, ())
@@ -325,7 +325,7 @@ def test_a_frozen_worker_is_reported_and_costs_no_further_memory(monkeypatch: py
         for _ in range(1000):
             worker.add_load(START_NS, (0.0, 0.0, 0.0))
         assert worker.poll() is None
-        # the pause is that of a source that waits for a slow worker
+        # a source pauses in the same way while it waits for a slow worker
         time.sleep(0.1)
     assert worker.error == "the estimator did not read for 20000 samples"
     assert not worker.ready
@@ -339,7 +339,7 @@ def test_the_death_of_a_worker_is_reported_and_stops_nothing() -> None:
     worker = Worker(preset("paper"), Windows(10.0, 4.0, 1.0))
     os.kill(worker._process.pid, signal.SIGSTOP)
     worker._connection.close()
-    # the worker has not ended yet, and `poll` does not wait for its end
+    # the worker has not ended yet, and `poll` does not wait for it
     assert worker.poll() is None and not worker.error
     worker._process.kill()
     give_up = time.monotonic() + 20.0
@@ -374,7 +374,7 @@ context.try_shutdown()
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.timeout(600)  # at first, twin and worker each compile for 65 s of processor time
+@pytest.mark.timeout(600)  # at first, the twin and the worker each compile for 65 s of processor time
 @pytest.mark.parametrize(("rows", "code"), [(None, 0), (100, 3)])
 def test_of_a_file_that_ends_the_last_window_is_estimated_or_too_few_data_are_named(
     rows: int | None, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -402,7 +402,7 @@ def test_of_a_file_that_ends_the_last_window_is_estimated_or_too_few_data_are_na
         )
         assert found == []
         return
-    last_s = truth.load.t[-1] + 1.0  # stamps that begin at 0 are moved by a second, so the data end a second later
+    last_s = truth.load.t[-1] + 1.0  # stamps that begin at 0 are shifted by a second
     window = found[-1].window
     assert window is not None and window.end_ns == pytest.approx(last_s * 1e9 + 1, abs=1.0)
     assert "Estimate of the window" in shown.out and "horizontal clearance" in shown.out.lower()

@@ -1,4 +1,4 @@
-"""Poses and loads as they are read: rows that are left out and counted, stated deviations, and thinning."""
+"""Poses and loads on input: rows that are rejected and counted, stated deviations, and thinning."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_arrays_of_the_wrong_shape_are_named() -> None:
 
 
 def test_implausible_poses_and_loads_are_left_out_and_counted() -> None:
-    """A single pose of 1e300 m would end the estimate with an overflow."""
+    """A single pose of 1e300 m would make the estimate fail with an overflow."""
     poses, lost = Poses.of([0.0, 1.0, 2.0], [[0.0, 0.0, 0.0], [1e300, 0.0, 0.0], [np.inf, 0.0, 0.0]])
     assert (poses.t.tolist(), lost) == ([0.0, 2.0], 1)
     load, lost = Load.of([0.0, 1.0, 2.0], [[0.0, 0.0, 0.0], [1e5, 0.0, 1e300], [0.0, 0.0, 0.0]])
@@ -26,7 +26,7 @@ def test_implausible_poses_and_loads_are_left_out_and_counted() -> None:
 
 
 def test_the_covariance_of_a_pose_is_believed() -> None:
-    """A covariance of 1e6, which means `not measured`, must not make all other poses useless."""
+    """A covariance of 1e6, which means `not measured`, must not make the other poses useless."""
     q, own = np.ones((40, 3)), np.full((40, 3), 1e-3)
     own[7], own[8, 0], own[9] = 1e3, 0.02, np.nan
     kept, deviation = believed((0.0, 0.0, 4e-3), q, own)
@@ -51,7 +51,7 @@ def test_spikes_and_repetitions_of_a_sensor_are_left_out() -> None:
     )
     q[::4] += 5.0
     assert Poses(poses.t, q).without_spikes(level)[1] == 0, "a bad sensor is not made a good one"
-    # a sensor of 20 Hz whose values are sent at 100 Hz repeats each value in five rows
+    # a sensor with a rate of 20 Hz, read at 100 Hz, repeats each value in five rows
     slow = Poses(poses.t, poses.q[np.arange(len(poses.t)) // 5 * 5])
     assert np.array_equal(slow.fresh().q, poses.q[::5]) and np.array_equal(slow.fresh().t, poses.t[::5])
     slow.q[700:] = slow.q[700]
@@ -76,7 +76,7 @@ def test_an_averaged_load_keeps_its_mean_and_bridges_gaps() -> None:
     fine = np.linspace(0.0, t[-1], 200_001)
     for column, whole in zip(few.wrench.T, load.wrench.T, strict=True):
         left_over = np.interp(fine, few.t, column) - np.interp(fine, t, whole)
-        # the impulse of the difference, summed from the beginning, does not drift
+        # the integral of the difference does not drift
         assert np.abs(np.cumsum(left_over) * (fine[1] - fine[0])).max() < 0.02
         assert np.abs(np.interp(4.4, few.t, column) - np.interp(4.4, t, whole)) < 0.1
 
@@ -107,6 +107,6 @@ def test_samples_too_rare_for_a_rough_load_leave_its_oscillation_and_the_density
     assert ((share > 0.4) & (share < 1.3)).all(), "samples hardly tell how short the correlation is"
     known = load.believable()
     left = np.stack([np.interp(known.t, fine, column) for column in slow.T], axis=1) - known.wrench
-    # the samples have errors with standard deviations of 1, 2 and 3; the errors that are left are smaller
+    # the samples have errors with standard deviations of 1, 2 and 3; the remaining errors are smaller
     assert (left.std(axis=0) < [0.4, 0.8, 1.2]).all()
     assert (np.array(known.unknown) < (impulse**2).mean(axis=0)).all()

@@ -1,4 +1,5 @@
-"""The estimate from measured motion: intervals that contain a simulated machine's values, or a stated reason."""
+"""The estimate from a measured motion: its intervals contain the values of a simulated machine, or it states why not.
+"""
 
 from __future__ import annotations
 
@@ -91,7 +92,7 @@ def test_effects_outside_the_model_are_flagged_and_rough_at_best(name: str) -> N
 def test_a_sensor_beside_the_centre_or_behind_a_low_pass_is_found_and_the_interval_holds(
     name: str, seed: int, names: tuple[str, ...], size: float
 ) -> None:
-    """Without these unknowns the fit does not converge, or clearances are 0.4 mm and 1.9 mm off, up to 8 deviations."""
+    """Without these unknowns, the fit does not converge, or clearances have errors of 0.4 mm and 1.9 mm."""
     truth = mismatched(replace(KINDS[name], periods=6.0), seed)
     result = estimate(truth.nominal, truth.load, truth.poses)
     for value, state, true in zip(
@@ -120,7 +121,7 @@ def test_the_vertical_clearance_of_a_head_that_never_moves_sideways_is_estimated
 def test_a_difference_that_explains_the_residuals_is_found_and_the_interval_holds(
     name: str, quantity: str, size: float
 ) -> None:
-    """With derivatives from coarse steps other quantities explain them, and clearances are up to 0.2 mm off."""
+    """With derivatives from coarse steps, other quantities would explain the residuals, with errors up to 0.2 mm."""
     truth = mismatched(KINDS[name], 84001)
     result = estimate(truth.nominal, truth.load, truth.poses)
     share, by, _ = result.differs[quantity]
@@ -141,7 +142,9 @@ def test_the_intervals_of_a_machine_that_does_not_differ_stay_narrow() -> None:
 @pytest.mark.stress
 @pytest.mark.parametrize("seed", [43202, 43210])
 def test_intervals_hold_between_soft_and_hard_contacts(seed: int) -> None:
-    """The first machine is treated as if its contact were hard: errors of the frame, here zero, widen its intervals."""
+    """The first machine is treated as if its contact were hard. Errors of the frame, which are zero here, widen its
+    intervals.
+    """
     truth = draw(GROUPS["middle"], seed)
     result = estimate(truth.nominal, truth.load, truth.poses)
     values = result.horizontal, result.vertical
@@ -175,7 +178,7 @@ def test_the_fit_finds_the_bias_of_a_sensor_behind_a_soft_contact() -> None:
 
 
 def test_a_wall_never_touched_is_not_observable() -> None:
-    """A head that is always pressed to the right never meets the left wall, so gx keeps its prior."""
+    """A head that is always pressed to the right never touches the left wall, so gx has its prior value."""
     nominal = preset("paper")
     t = np.arange(0.0, 20.0, 0.01)
     wrench = np.stack([5e4 + 2e4 * np.sin(2.0 * t), 0.0 * t, -1e3 * np.sin(2.0 * t)], axis=1)
@@ -198,14 +201,14 @@ def test_a_motion_that_can_hardly_be_predicted_is_no_evidence_of_a_clearance(mon
     assert (result.model, result.sensor) == ("ok", "ok") and before.horizontal_state is State.ESTIMATED
     assert all("is predicted, expected 110% or more" in reason for reason in result.reasons)
     assert [reason.split()[0] for reason in result.reasons] == ["horizontal", "vertical"]
-    # each group has the value of the whole clearance, because no group is known better
+    # no group is known better than the whole clearance, so each group has its value
     assert {value for value, _ in result.groups.values()} == {result.horizontal, result.vertical}
     assert result.horizontal.deviation > 10.0 * before.horizontal.deviation
 
 
 @pytest.mark.stress
 def test_a_clearance_without_evidence_is_not_estimated() -> None:
-    """With theta locked the head stays at the top walls.
+    """With theta locked, the head remains at the top walls.
 
     A fit would give 6.8 mm instead of 27.1 mm, with a deviation of 0.4 mm.
     """
@@ -229,7 +232,7 @@ def test_a_clearance_without_evidence_is_not_estimated() -> None:
 
 
 def test_stated_deviations_of_the_measurements_are_believed() -> None:
-    """The stated deviations are lower bounds; intervals and the prior of the load's gains follow from them."""
+    """The stated deviations are lower bounds. They determine the intervals and the prior of the load's gains."""
     scene = preset("paper")
     t = np.arange(0.0, 10.0, 0.01)
     wrench = compile_loads(scene.loads).at(t)
@@ -253,7 +256,7 @@ def test_without_measurements_the_prior_is_returned() -> None:
 
 
 def test_poses_too_sparse_for_a_fit_are_refused() -> None:
-    """At 5 Hz, or with 1.5 % or 10 % of the poses, swings would begin anywhere, and a wrong fit would look certain."""
+    """At 5 Hz, or with 1.5 % or 10 % of the poses, swings cannot be located, and a wrong fit would seem certain."""
     nominal = preset("paper")
     load, _ = Load.of([0.0, 20.0], np.ones((2, 3)))
     rng = np.random.default_rng(1)
@@ -290,7 +293,7 @@ def test_a_component_with_a_large_stated_deviation_is_not_used() -> None:
 
 
 def test_a_silence_of_the_load_is_not_bridged() -> None:
-    """If a straight line bridged a lost period of the load, the sensor would be suspect."""
+    """If a lost period of the load were interpolated linearly, the sensor would seem faulty."""
     truth, _ = known()[0]
     there = (truth.load.t < 11.0) | (truth.load.t > 14.0)
     load = Load(truth.load.t[there], truth.load.wrench[there])
@@ -323,12 +326,12 @@ def test_a_machine_at_rest_does_not_make_the_model_suspect() -> None:
         result = estimate(truth.nominal, Load.of(t, load)[0], Poses.of(t, rests)[0])
         assert result.horizontal_state is result.vertical_state is State.NOT_OBSERVABLE
         assert (result.model, result.sensor) == ("ok", "ok") and "the head rests" in result.reasons[0]
-    # if a head has just come to rest, its poses scatter as little as at a hard wall, but show no other sign of a hard
-    # wall
+    # just after a head has come to rest, its poses scatter as little as at a hard wall, but nothing else indicates a
+    # hard wall
     rests[:200] += np.linspace(1e-2, 0.0, 200)[:, None]
     result = estimate(truth.nominal, Load.of(t, idle)[0], Poses.of(t, rests)[0])
     assert (result.horizontal_state, result.model) == (State.NOT_OBSERVABLE, "ok")
-    # if a head that is pushed does not move, the head or its sensor is stuck
+    # if the head does not move although it is pushed, the head or its sensor is stuck
     pushed = Load.of(t, idle + np.outer(np.sin(2.0 * t), [3e4, 1e4, 4e4]))[0]
     result = estimate(truth.nominal, pushed, Poses.of(t, rests)[0])
     assert result.horizontal_state is State.WITHDRAWN
@@ -349,12 +352,12 @@ def test_a_rough_load_costs_little_accuracy() -> None:
     found = estimate(truth.nominal, truth.load, truth.poses)
     assert (found.model, found.sensor) == ("ok", "ok")
     for value, true in zip((found.horizontal, found.vertical), truth.clearance, strict=True):
-        # if the swings were not linked, the interval would be twice as wide, and the clearance 0.2 mm off
+        # without links between the swings, the interval would be twice as wide, and the error 0.2 mm
         assert value.p95 - value.p05 < 2.5e-4 and abs(value.mean - true) < 1.5e-4
 
 
 def test_ten_poses_a_second_are_fitted_to_the_end_and_the_sensor_is_not_suspect() -> None:
-    """The residual motion of a fit that has not converged must not be taken for a sensor that is noisier at times."""
+    """The residuals of a fit that has not converged must not be mistaken for a sensor with variable noise."""
     truth = draw(GROUPS["slow"], 33001)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert (result.sensor, result.horizontal_state) == ("ok", State.ESTIMATED), result.reasons
@@ -362,7 +365,9 @@ def test_ten_poses_a_second_are_fitted_to_the_end_and_the_sensor_is_not_suspect(
 
 
 def test_a_load_with_a_little_noise_is_followed_in_long_swings() -> None:
-    """With the short swings of a load that changes at each sample, this correct model would be withdrawn."""
+    """If each change of the load began a new swing, the short swings would make the estimate of this correct model
+    invalid.
+    """
     truth = draw(replace(GROUPS["plain"], load_step=1e-3, periods=8.0), 42004)
     noise = 0.01 * truth.load.wrench.std(axis=0) * np.random.default_rng(1).standard_normal(truth.load.wrench.shape)
     result = estimate(truth.nominal, Load(truth.load.t, truth.load.wrench + noise), truth.poses)

@@ -1,4 +1,4 @@
-"""Clearances by groups of pads, and pads worn askew."""
+"""Clearances of the groups of pads, and pads that are unevenly worn."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_the_motion_gives_the_clearance_of_each_group_of_pads() -> None:
     assert held >= 6, "of 8, whose errors go together"
 
 
-#: Wear of the pads in m near the end of a life under the paper's load.
+#: Wear of the pads [m] near the end of a life under the paper's load.
 UNEVEN = np.array([2.8, 3.3, 4.5, 2.3, 2.2, 2.2, 3.2, 1.3]) * 1e-3
 
 
@@ -48,7 +48,7 @@ def worn_askew(depth: np.ndarray, seed: int) -> tuple[Estimate, dict[str, float]
 
 
 def test_walls_worn_askew_are_estimated_and_the_model_is_not_suspect(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The pads are as uneven as near the end of a life, where a fit with even pads fails."""
+    """The wear is as uneven as near the end of a life. A fit with evenly worn pads fails."""
     fitted = Mock(side_effect=pads.fit)
     monkeypatch.setattr(pads, "fit", fitted)
     result, true = worn_askew(UNEVEN, 1)
@@ -58,13 +58,12 @@ def test_walls_worn_askew_are_estimated_and_the_model_is_not_suspect(monkeypatch
     assert result.vertical.mean == pytest.approx(0.5 * (true["vertical_left"] + true["vertical_right"]), abs=3e-4)
     for name, (value, state) in result.groups.items():
         assert state is State.ESTIMATED and abs(value.mean - true[name]) < 1.5 * (value.p95 - value.p05)
-    # the walls are askew, so the clearances at the top and at the bottom differ by 2 mm; the estimate distinguishes
-    # them
+    # the walls are inclined, so the horizontal clearance at the top exceeds that at the bottom by 2 mm
     assert result.groups["horizontal_top"][0].p05 > result.groups["horizontal_bottom"][0].p95
 
 
 def test_walls_worn_less_askew_do_not_make_the_clearance_too_small() -> None:
-    """A fit with even pads passes all checks here, but it is 0.26 mm too small, with a deviation of 0.29 mm."""
+    """A fit with evenly worn pads passes all checks here, but its error is 0.26 mm, with a deviation of 0.29 mm."""
     result, true = worn_askew(0.6 * UNEVEN, 2)
     off = result.vertical.mean - 0.5 * (true["vertical_left"] + true["vertical_right"])
     assert result.apparent is not None
@@ -72,7 +71,7 @@ def test_walls_worn_less_askew_do_not_make_the_clearance_too_small() -> None:
 
 
 def test_pads_that_are_not_touched_leave_a_clearance_between_askew_walls_open() -> None:
-    """The lower left pad is never touched, so neither the lower nor the mean horizontal clearance is determined."""
+    """The lower left pad is never touched, so the lower and the mean horizontal clearance are undetermined."""
     truth, _ = known()[0]
     depth = tuple(1e-3 * value for value in (3.0, 0.0, 0.0, 2.0, 0.0, 4.0, 1.0, 0.0))
     scene = replace(
@@ -86,7 +85,7 @@ def test_pads_that_are_not_touched_leave_a_clearance_between_askew_walls_open() 
     noise = np.random.default_rng(1).standard_normal(run.q.shape) * [5e-4, 5e-4, 2e-3]
     result = estimate(truth.nominal, truth.load, Poses.of(run.t, run.q + noise)[0])
     assert run.statistics["bottom_left_left"]["time_in_contact"] == 0.0
-    # an overconfident fit would be 1.1 mm off and state a deviation of 0.03 mm
+    # an overconfident fit would have an error of 1.1 mm and a stated deviation of 0.03 mm
     assert abs(result.horizontal.mean - 0.0354) < 3.0 * result.horizontal.deviation
     assert abs(result.vertical.mean - 0.0205) < 3.0 * result.vertical.deviation < 9e-4
     assert result.groups["horizontal_bottom"][1] is State.NOT_OBSERVABLE
@@ -94,7 +93,7 @@ def test_pads_that_are_not_touched_leave_a_clearance_between_askew_walls_open() 
 
 
 def test_a_pad_that_a_pressed_head_never_touches_leaves_the_clearance_open() -> None:
-    """The fitted turn of the right wall ends where its lower pad would touch, 1.1 mm and six deviations off."""
+    """The rotation of the right wall is fitted up to the touch of its lower pad, with an error of six deviations."""
     truth = mismatched(KINDS["pressed"], 99001)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert result.horizontal_state.known and result.apparent is not None

@@ -1,4 +1,4 @@
-"""A machine of another size is estimated in units of the paper's size, with the same bits."""
+"""In units of its own size, a machine of another size gives bit-identical estimates."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_a_machine_of_another_size_is_estimated_as_one_of_the_paper_s_size() -> 
     scene = desk.scene(truth.nominal)
     found = estimate(scene, desk.load(truth.load), desk.poses(truth.poses))
     assert found.t_end == result.t_end / 4.0 and found.bias_x is not None and found.delay is not None
-    # a conversion to units that are powers of two keeps each number's bits
+    # the factors are powers of two, so the conversion changes no bit of a mantissa
     back = desk.in_si(found, truth.nominal)
     assert back == replace(result, lost=back.lost) and found.horizontal.mean == result.horizontal.mean / 8.0
     assert back.motion is not None and result.motion is not None
@@ -38,7 +38,7 @@ def test_a_machine_of_another_size_is_estimated_as_one_of_the_paper_s_size() -> 
 def test_a_scene_in_other_units_moves_alike(friction: Friction) -> None:
     thrown = Initial((1e-3, 0.0, 1e-3), (0.4, 0.3, 0.5))
     units, scene = Units(8.0, 1024.0, 4.0), replace(preset("bench_kv"), friction=friction, initial=thrown)
-    # the load moves nothing; load and energy balance are here only because the kernels of other tests have them
+    # load and energy balance have no effect on the motion, but with them the kernels of other tests are used
     nothing, balance = (Harmonic("nothing to speak of", (1e-9, 0.0), 2.0),), friction.stick_stiffness_n_m is not None
     run, other = (
         simulate(replace(one, loads=nothing), span, span / 40.0, 1e-9, energy_balance=balance)

@@ -67,7 +67,7 @@ def test_without_an_angle_the_range_of_the_head_gives_a_clearance_whose_deviatio
 
 
 def test_a_clearance_that_no_drawn_motion_has_is_not_a_result() -> None:
-    """With soft walls, pads that are askew look like a negative clearance."""
+    """With soft walls, unevenly worn pads have the effect of a negative clearance."""
     truth = mismatched(replace(KINDS["hard_askew"], periods=4.0), 99002)
     unknowns, period = Unknowns.stated(truth.nominal, truth.load, truth.poses), truth.load.period()
     found, work = compare_under_uncertain_load(thinned(truth.load, period)[0], unknowns, truth.poses, period)
@@ -75,7 +75,7 @@ def test_a_clearance_that_no_drawn_motion_has_is_not_a_result() -> None:
 
 
 def test_a_quick_load_is_no_reason_to_look_at_the_poses_in_its_own_time() -> None:
-    """In units in which a chatter of 8 Hz has the paper's period, poses at 100 Hz would be too sparse."""
+    """In units in which a load of 8 Hz has the paper's period, poses at 100 Hz would be too sparse."""
     truth = mismatched(replace(KINDS["chatter"], periods=6.0), 80001)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert result.horizontal_state is State.ROUGH and _holds(result, truth.clearance)

@@ -28,9 +28,9 @@ def test_the_prior_is_the_scene_s_or_that_of_the_mark() -> None:
         "contact.damping": Provenance(Mark.ASSUMED, "", 0.2 * (scene.contact.damping or 0.0)),
     }
     stated = Unknowns.stated(replace(scene, marks=marks), load, poses).deviations()
-    # 10 % more stiffness makes 10 % less penetration; a penetration of 0.1 mm is treated as zero
+    # 10 % more stiffness gives 10 % less penetration; a penetration of 0.1 mm is treated as zero
     np.testing.assert_allclose(stated[:4], [2e-3, 2e-3, 0.1, 0.2], rtol=0.02)
-    # in the units of a machine of another size, the deviations have other values but mean the same lengths and shares
+    # in the units of another machine, the deviations have other numbers but describe the same lengths and shares
     units = Units(0.5, 2.0, 0.25)
     other = units.scene(replace(scene, marks=marks))
     far = Unknowns.stated(other, units.load(load), units.poses(poses)).deviations()
@@ -44,7 +44,7 @@ def test_a_stated_deviation_of_a_zero_clearance_is_converted_to_other_units() ->
 
 
 def test_the_scene_of_a_vector_depends_only_on_the_quantities_that_are_declared_for_it() -> None:
-    """`Problem` keeps the scene while these quantities stay the same."""
+    """`Problem` does not build a new scene while these quantities are unchanged."""
     scene = preset("paper")
     t = np.arange(0.0, 10.0, 0.1)
     unknowns = Unknowns.stated(scene, Load(t, compile_loads(scene.loads).at(t)), Poses(t, np.zeros((len(t), 3))))

@@ -19,7 +19,7 @@ COMPONENTS = ("x", "y", "theta")
 def test_the_believed_load_gives_clearances_where_components_are_missing(
     missing: tuple[int, ...], kept: int, most: float
 ) -> None:
-    """A component with few values counts as missing."""
+    """A component with few values is treated as not measured."""
     truth, _ = known()[0]
     q = truth.poses.q.copy()
     q[kept:, missing] = np.nan

@@ -1,4 +1,4 @@
-"""Every example runs as its README says, in limited time, with the promised output."""
+"""Every example runs as its README describes, in limited time, with the promised output."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_every_example_is_listed_and_has_a_short_readme() -> None:
             assert (folder / target).exists(), target
 
 
-#: Examples that compile kernels of their own or take minutes.
+#: Examples that compile additional kernels or take minutes.
 LONG = ("a_year", "calibration", "measured_drop")
 
 

@@ -1,4 +1,4 @@
-"""Damaged files of each kind: readers refuse them only with errors of this package."""
+"""Damaged files of each kind: readers reject them with errors of this package only."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from plow_twin.scene_file import load_scene, loads_scene
 from plow_twin.scene_file.presets import scene_path
 
 pytestmark = [pytest.mark.stress, pytest.mark.timeout(3600)]
-#: Number of examples of each kind; all kinds together take about an hour, at 42 examples a second on a busy core.
+#: Number of examples of each kind. All kinds together take about an hour: 42 examples per second on a busy core.
 EXAMPLES = 20_000
 FUZZ = settings(
     max_examples=EXAMPLES, deadline=None, suppress_health_check=[*HealthCheck], print_blob=True, database=None

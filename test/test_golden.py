@@ -1,7 +1,7 @@
 """Pinned motions: their bits, and their numbers of steps, evaluations and events, change only on purpose.
 
-`pytest test/test_golden.py --golden-update` pins them again for the present build. A build without a file of its own
-must reach another build's counts, because rounding moves single events but not the work.
+`pytest test/test_golden.py --golden-update` pins them again for the present build. A build without pinned motions is
+compared with the counts of another build, because rounding may change single events but not the total work.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from golden import CASES, build_name
 
 FOLDER = Path(__file__).resolve().parent / "data" / "golden"
 PROGRAM = Path(__file__).resolve().parent / "golden.py"
-#: On another build, rounding may change a count by at most this share.
+#: Largest relative change of a count that rounding may cause on another build.
 OTHER_BUILD = 0.02
 
-# the limit is high, because compiling all kernels takes long
+# compiling all kernels takes long
 pytestmark = pytest.mark.timeout(600)
 
 
 @pytest.fixture(scope="module")
 def found() -> dict[str, Any]:
-    """Compute the figures; a process that compiles the kernels and a process that loads them must agree."""
+    """Compute the figures in a process that compiles the kernels and in a process that loads them. Both must agree."""
     runs: list[dict[str, Any]] = []
     for _ in range(2):
         done = subprocess.run([sys.executable, PROGRAM], capture_output=True, text=True, check=False)
@@ -38,7 +38,7 @@ def found() -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def pinned() -> dict[str, Any]:
-    """Return the figures of this build; if it has none, those of another build, without their digests."""
+    """Return the figures of this build. If there are none, return those of another build without their hashes."""
     own = FOLDER / f"{build_name()}.json"
     path = own if own.exists() else sorted(FOLDER.glob("*.json"))[0]
     figures: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))

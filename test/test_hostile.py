@@ -1,4 +1,4 @@
-"""Untrusted files: lines that expand to millions of values, endless nesting, and names with commands for a terminal."""
+"""Malicious files: lines that expand to millions of values, endless nesting, and names with terminal commands."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def nested(opening: str, levels: int) -> str:
-    """Return collections that are opened and never closed."""
+    """Return collections that are opened but never closed."""
     return opening * levels
 
 
 def laughs(levels: int, times: int = 9) -> str:
-    """Return nested lists of aliases that stand for `times` to the power of `levels` values."""
+    """Return nested lists of aliases that expand to `times` to the power of `levels` values."""
     lines = ["a0: &a0 [x]"]
     lines += [f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * times)}]" for level in range(1, levels + 1)]
     return "\n".join(lines)
@@ -76,9 +76,9 @@ FILES: dict[str, Callable[[], str]] = {
     "an alias to itself": lambda: "a: &a {b: *a}",
     "a scalar of 20 MB": lambda: "a: " + "x" * 20_000_000,
 }
-#: Files that can be read but lack the expected content.
+#: Files within the limits whose content is not as expected.
 WITHIN = {"unknown keys", "a scalar of 20 MB"}
-#: For each reader of YAML files that a user gives: the arguments of `plow-twin`.
+#: Arguments of `plow-twin` for each reader of a user's YAML files.
 READERS = {
     "scene": ["simulate", "FILE", "--t-end", "1"],
     "mapping": ["live", "load.csv", "--map", "FILE"],
@@ -86,13 +86,13 @@ READERS = {
 }
 
 
-#: Files for the readers other than the first; all readers have one parser.
+#: Files for all readers but the first, because all use the same parser.
 SOME_FILES = ("flow sequences", "aliases", "unknown keys")
 
 
 @pytest.mark.parametrize("reader", READERS)
 def test_files_that_stand_for_too_much_are_refused_in_a_line(reader: str, tmp_path: Path) -> None:
-    """Each command ends with exit code 2, one line and no signal; all of them take at most 60 s of processor time."""
+    """Each command ends with exit code 2 and one line, without a signal, after at most 60 s of processor time."""
     files = list(FILES if reader == "scene" else SOME_FILES)
     for name in files:
         (tmp_path / f"{name}.yaml").write_text(FILES[name]())
@@ -173,7 +173,7 @@ def test_thousands_of_unknown_keys_are_listed_up_to_a_number(tmp_path: Path) -> 
 
 
 MAP = "excitation: {topic: /load, fields: {fx: x, fy: x, m: x}, stamp: log}"
-#: Commands that read recordings, by the suffix of their files.
+#: Commands that read recordings, by kind of file.
 COMMANDS = {
     "run": [["info", "FILE"], ["replay", "FILE", "-q"], ["export", "FILE", "-q", "--to", "npz", "--out", "OUT.npz"]],
     "foreign": [["analyse", "FILE", "--scene", "paper", "--map", "map.yaml", "--json"]],
@@ -186,11 +186,11 @@ COMMANDS = {
 FOREIGN = {"array", "texts", "nothing", "itself", "tree", "chain", "empty_lines", "topics"}
 #: Files above a limit.
 ABOVE = {"channels", "many_chunks", "topics", "columns", "line", "row", "unpacked"}
-#: Files of which the usable part is used.
+#: Files whose valid part is used.
 WITH_LOSS = {"large_chunks", "lying_zstd", "lying_lz4", "lying_length"}
-#: Largest memory that a command may take [MB]. Compiled code and libraries take 200 MB of it.
+#: Largest memory of a command [MB], of which compiled code and libraries take 200 MB.
 MOST_MB = 700
-#: Program that runs each command in its own process, with at most 20 s of processor time and 6 GB of address space.
+#: Program that runs each command in a separate process, with at most 20 s of processor time and 6 GB of address space.
 RUNNER = """
 import json, os, resource, sys
 from plow_twin.cli.app import run
@@ -219,7 +219,7 @@ for name, words in json.load(sys.stdin):
 
 @pytest.mark.parametrize("kind", COMMANDS)
 def test_absurd_recordings_end_with_one_line(kind: str, tmp_path: Path) -> None:
-    """There is no signal, no traceback, at most one line for an error, and limited processor time and memory."""
+    """No command ends by a signal or prints a traceback. Errors have one line, and time and memory are limited."""
     asked = []
     for file, make in MADE.items():
         name, _, ending = file.partition(".")
@@ -242,7 +242,7 @@ def test_absurd_recordings_end_with_one_line(kind: str, tmp_path: Path) -> None:
                     ],
                 )
             )
-    if kind == "run":  # this run compiles the kernels, so that compiling does not count as processor time below
+    if kind == "run":  # this run compiles the kernels, so that the time of compiling is not counted below
         (tmp_path / "plain.mcap").write_bytes(recorded())
         subprocess.run(
             [sys.executable, "-m", "plow_twin", "replay", "plain.mcap", "-q"],
@@ -278,7 +278,7 @@ loads: [{name: "\\e[2J\\u202e[bold]<b>", constant: {force_n: [1, 2], moment_n_m:
 
 
 def _on_a_terminal(*commands: list[str], folder: Path) -> list[str]:
-    """Return all that each of the commands writes to a terminal."""
+    """Return everything that the commands write to a terminal."""
     ours, theirs = pty.openpty()
     code = f"from plow_twin.cli.app import run\nfor words in {commands!r}: run(words), print('\\0', flush=True)"
     process = subprocess.Popen(

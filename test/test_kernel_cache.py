@@ -17,14 +17,14 @@ from plow_twin.kernel.compiler import KERNEL_FOLDERS, kernel, share
 from plow_twin.model import contact
 
 ROOT = Path(__file__).resolve().parent.parent
-#: Program that prints how many machine-code functions the kernel `mode_inside` has. Only `settle_modes` calls this
-#: kernel.
+#: Program that prints the number of machine-code functions of the kernel `mode_inside`, which only `settle_modes`
+#: calls.
 LINKED = (
     "from plow_twin import load_scene; from plow_twin.solve import compiled_scene, modes; "
     "compiled_scene.compile_scene(load_scene('paper'), 1e-6).initial_state(); "
     "(overload,) = modes.mode_inside.overloads.values(); print(len(list(overload.library.get_defined_functions())))"
 )
-#: Continuation that prints whether a kernel called by Python contains its own copies of the kernels that it calls.
+#: Second part of the program. It prints whether a kernel called by Python contains copies of the kernels that it calls.
 ENTRY = (
     "; (overload,) = modes.settle_modes.overloads.values(); "
     "held = [function.linkage.name for function in overload.library.get_defined_functions()]; "
@@ -43,7 +43,7 @@ def run(cache: Path, program: str = MISSES) -> str:
 
 
 def test_an_index_of_other_sources_is_replaced_unread(tmp_path: Path) -> None:
-    """After an upgrade, an index may name removed types, which would raise an error when it is read."""
+    """After an upgrade, an index may name removed types. Reading it would raise an error."""
     assert run(tmp_path) == "1" and run(tmp_path) == "0"
     (index,) = tmp_path.rglob("contact.power_term*.nbi")
     index.write_bytes(pickle.dumps("another version") + b"cannot be read")
@@ -57,7 +57,7 @@ def cache_file(folder: Path, sources: str) -> Any:
 
 
 def test_processes_that_save_at_once_do_not_exchange_code(tmp_path: Path) -> None:
-    """The second process reads the index first, and saves between the two writes of the first process."""
+    """The second process reads the index first, and writes between the two writes of the first process."""
     first, second = (cache_file(tmp_path, "sources") for _ in range(2))
     write, opened = first._open_for_write, []
 
@@ -85,9 +85,10 @@ def test_code_of_other_sources_is_removed(tmp_path: Path) -> None:
 
 
 def test_a_kernel_that_only_kernels_call_stands_as_a_copy_in_each_entry_and_has_no_machine_code(tmp_path: Path) -> None:
-    """Compiling such a kernel by itself, in addition to its callers, would take a third of the time.
+    """Separate compilation of such a kernel, in addition to its callers, would take a third of the time.
 
-    Without copies, bits would depend on which entry a process loads first, and on whether it compiles or loads entries.
+    Without copies, bits would depend on the entry that a process loads first, and on whether it compiles or loads
+    entries.
     """
     assert run(tmp_path, LINKED + ENTRY).splitlines() == ["0", "True False"]
 
@@ -100,19 +101,16 @@ def test_a_call_from_python_of_a_kernel_without_machine_code_is_an_error() -> No
 
 @kernel(entry=True)
 def normal_force(*numbers: float) -> float:
-    """Call the kernel of this name."""
     return contact.normal_force(*numbers)
 
 
 @kernel()
 def twice(number: int) -> int:
-    """Return twice the number."""
     return 2 * number
 
 
 @kernel(entry=True)
 def twice_both(number: int) -> int:
-    """Pass a number and a constant to the same kernel."""
     return twice(number) + twice(3)
 
 
@@ -134,7 +132,9 @@ def test_a_disk_that_takes_no_cache_is_one_warning_and_the_run_goes_on(tmp_path:
 
 
 def test_no_kernel_assigns_an_array_to_a_slice() -> None:
-    """Numba would also compile how its error message is formatted, 2 s in each process; `copy_into` has no message."""
+    """Numba would also compile the formatting of its error message, which takes 2 s in each process. `copy_into` has
+    none.
+    """
     found = []
     for folder in KERNEL_FOLDERS:
         for source in sorted((ROOT / "plow_twin" / folder).rglob("*.py")):

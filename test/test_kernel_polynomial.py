@@ -1,4 +1,4 @@
-"""The maximum of a polynomial on an interval, by which peaks of forces are found."""
+"""The maximum of a polynomial on an interval, which is used to find the peaks of forces."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def _maximum(g: NDArray[np.float64], n: int, h: float, floor: float, work) -> fl
 
 
 def _expected(g: NDArray[np.float64], h: float, floor: float) -> float:
-    """Return the maximum from the roots of the derivative, as eigenvalues of its companion matrix."""
+    """Return the maximum from the roots of the derivative, which are eigenvalues of its companion matrix."""
     polynomial = Polynomial(g)
     roots = polynomial.deriv().roots() if len(g) > 2 else np.zeros(0)
     inside = [x.real for x in roots if abs(x.imag) < 1e-6 * h and 0.0 < x.real < h]

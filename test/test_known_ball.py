@@ -1,7 +1,7 @@
-"""A ball that bounces to rest on a rigid table, and a ball on a vibrating table, from period one to its doubling.
+"""A ball that bounces to rest on a rigid table, and a ball on a vibrating table up to its first period doubling.
 
-Both answers are for a rigid table with restitution e. The contact here is stiff, and the error decreases with its
-stiffness. It is linear, with the exact restitution; the floor of the impact speed is below every relevant bounce.
+The known solutions are for a rigid table with restitution e. The contact here is linear and stiff, with the exact
+restitution, and the error decreases with its stiffness. All relevant bounces are above the floor of the impact speed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 from plow_twin import Clearance, Contact, Frame, Gravity, Harmonic, Head, Initial, Result, Scene, simulate
 
 GRAVITY = 9.81
-#: Angular frequency of the table in rad/s, for a frequency of 10 Hz.
+#: Angular frequency of the table [rad/s], for 10 Hz.
 OMEGA = 2.0 * math.pi * 10.0
 PERIOD = 2.0 * math.pi / OMEGA
 
@@ -26,7 +26,7 @@ def rest_time_error(e: float, stiffness: float, h: float = 0.01) -> float:
     pairs = ("top_left_top", "top_right_top")
     scene = wall_and_point(contact, speed=0.0, mass=1.0, gravity=GRAVITY, gap=2 * h, pairs=pairs)
     result = simulate(with_presets_terms(scene), 1.5, output_dt=1.5, tol=1e-8)
-    # at rest, each of the two corners carries half of the weight
+    # at rest, each of the two corners carries half the weight
     assert result.force[-1, [0, 2]] == pytest.approx([GRAVITY / 2, GRAVITY / 2], rel=1e-5)
     assert abs(result.v[-1]).max() < 1e-6
     return float(result.events["time"][-1]) / (math.sqrt(2.0 * h / GRAVITY) * (1.0 + e) / (1.0 - e)) - 1.0
@@ -34,10 +34,10 @@ def rest_time_error(e: float, stiffness: float, h: float = 0.01) -> float:
 
 @pytest.mark.parametrize("e", [0.3, 0.5, 0.8])
 def test_bouncing_ball_comes_to_rest(e: float) -> None:
-    """Infinitely many bounces end at sqrt(2 h / g) (1 + e) / (1 - e); at K = 1e11 N/m the error is 5e-4."""
+    """Infinitely many bounces end at sqrt(2 h / g) (1 + e) / (1 - e). At K = 1e11 N/m, the error is 5e-4."""
     errors = [abs(rest_time_error(e, stiffness)) for stiffness in (1e7, 1e9, 1e11)]
     assert errors[0] > errors[1] > errors[2] and errors[2] < 5e-4
-    # at small speeds a nonlinear contact lasts longer, so the error falls only with K^-0.4
+    # a nonlinear contact lasts longer at small speeds, so the error is proportional to K^-0.4 only
     pairs = ("top_left_top", "top_right_top")
     limit = math.sqrt(0.02 / GRAVITY) * (1.0 + e) / (1.0 - e)
     for stiffness, bound in ((1e9, 0.05), (1e11, 0.015)):
@@ -49,10 +49,10 @@ def test_bouncing_ball_comes_to_rest(e: float) -> None:
 def on_the_table(
     gamma: float, r: float, stiffness: float, periods: int, shift: float = 0.0
 ) -> tuple[Result, np.ndarray]:
-    """Start `shift` rad off the period-one orbit; return the run, and the times of touches in periods of the table.
+    """Start `shift` rad from the period-one orbit. Return the run, and the times of touches in periods of the table.
 
-    In the table's frame, the table's motion A sin(wt) is a load m A w^2 sin(wt) on the ball. On the orbit, the ball
-    leaves the table at the phase with cos(phase) = pi (1 - r) / (1 + r) / gamma.
+    In the frame of the table, its motion A sin(wt) is a load m A w^2 sin(wt) on the ball. On the orbit, the ball leaves
+    the table at a phase with cos(phase) = pi (1 - r) / (1 + r) / gamma.
     """
     phase = math.acos(min(1.0, math.pi * (1.0 - r) / (1.0 + r) / gamma))
     amplitude = gamma * GRAVITY / OMEGA**2
@@ -70,7 +70,7 @@ def on_the_table(
 
 @pytest.mark.parametrize(("gamma", "period"), [(1.06, 1), (1.3, 1), (1.5, 1), (1.56, 2), (1.65, 2)])
 def test_a_ball_on_a_vibrating_table_has_its_period(gamma: float, period: int) -> None:
-    """With r = 0.5, one bounce a period exists from gamma = 1.0472 on, and its period doubles from 1.5268 on.
+    """With r = 0.5, an orbit with one bounce per period exists from gamma = 1.0472 on. Its period doubles at 1.5268.
 
     Reference: Holmes, J. Sound Vib. 84 (1982) 173.
     """
@@ -84,10 +84,10 @@ def test_a_ball_on_a_vibrating_table_has_its_period(gamma: float, period: int) -
 @pytest.mark.parametrize("gamma", [1.01, 1.03])
 def test_below_the_threshold_the_ball_sticks_each_period(gamma: float) -> None:
     result, touches = on_the_table(gamma, 0.5, 1e8, 60)
-    # there is no period-one orbit: in every period the ball bounces several times and then rides on the table
+    # without a period-one orbit, the ball bounces several times in each period and then stays on the table
     assert np.count_nonzero(touches > 40.0) > 2 * 19
     assert np.diff(touches)[touches[1:] > 40.0].max() < 0.999
-    # with one bounce a period, the ball would be in contact for only 0.3 % of the time
+    # with one bounce per period, the ball would be in contact for only 0.3 % of the time
     assert result.statistics["top_left_top"]["time_in_contact"] > 0.5 * 60 * PERIOD
 
 
@@ -97,7 +97,8 @@ def one_bounce_a_period(gamma: float, r: float, stiffness: float) -> bool:
 
 
 def existence_threshold(r: float, stiffness: float) -> float:
-    """Bracket the smallest gamma with one bounce a period to 1e-4, starting from the rigid table's value."""
+    """Return the smallest gamma with one bounce per period, to 1e-4. The search begins at the value of a rigid table.
+    """
     rigid = math.pi * (1.0 - r) / (1.0 + r)
     low, high = 0.97 * rigid, 1.02 * rigid
     assert one_bounce_a_period(high, r, stiffness) and not one_bounce_a_period(low, r, stiffness)
@@ -121,8 +122,8 @@ def doubling_threshold(r: float, stiffness: float) -> float:
 def test_both_thresholds_of_the_vibrating_table() -> None:
     """With r = 0.5, a = pi (1-r)/(1+r) is 1.0472, and (a^2 + 4 ((1+r^2)/(1+r)^2)^2)^0.5 is 1.5268.
 
-    The error decreases with K^-1/2, like the contact's duration. At K = 1e9 N/m it is 1e-3 and 4e-4; extrapolated in
-    K^-1/2 to a rigid table it is 1e-4.
+    The error is proportional to K^-1/2, like the duration of a contact. At K = 1e9 N/m, it is 1e-3 and 4e-4. The values
+    extrapolated to a rigid table have an error of 1e-4.
     """
     r = 0.5
     exists = math.pi * (1.0 - r) / (1.0 + r)

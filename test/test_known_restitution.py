@@ -1,6 +1,6 @@
-"""Restitution of the contact laws: the identity of the exact law, published tables, and the page made from the results.
+"""Restitution of the contact laws: the identity of the exact law, published tables, and the page of results.
 
-A free point hits a wall; cases 1 and 2 of docs/known_answers.md.
+A free point hits a wall. These are cases 1 and 2 of docs/known_answers.md.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from plow_twin.model.contact_laws import LAWS, exact_damping_number
 sys.path.insert(0, str(ROOT / "benchmark"))
 import restitution
 
-# `DELIVERED` has the restitutions that each law delivers for the nominal restitutions `ASKED`, by published tables
+# published restitutions `DELIVERED` of each law for the nominal restitutions `ASKED`
 ASKED = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 DELIVERED = {
     "lankarani_nikravesh": (0.6653, 0.6723, 0.6842, 0.7016, 0.7252, 0.7561, 0.7960, 0.8471, 0.9132, 0.9535),
@@ -28,11 +28,11 @@ DELIVERED = {
 }
 
 
-# integer exponents from 2 on compile kernels of their own
+# other integer exponents need kernels that must be compiled
 @pytest.mark.parametrize("n", [1.0, 1.5, 2.2, pytest.param(3.0, marks=pytest.mark.stress)])
 @pytest.mark.parametrize("e", [0.05, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99])
 def test_exact_restitution_is_returned_for_any_stiffness_exponent_and_mass(n: float, e: float) -> None:
-    """The identity D (1 + e) = ln((1 + D) / (1 - D e)) is valid for every exponent, stiffness, mass and speed."""
+    """The identity D (1 + e) = ln((1 + D) / (1 - D e)) is valid for all exponents, stiffnesses, masses and speeds."""
     for stiffness, mass, speed in ((1e7, 2.0, 1.0), (1e9, 300.0, 0.2)):
         stiff = stiffness * 1e3 ** (n - 1.0)
         contact = Contact("exact_restitution", stiff, n, restitution=e, impact_speed_floor_m_s=restitution.FLOOR)
@@ -44,10 +44,10 @@ def test_exact_restitution_is_returned_for_any_stiffness_exponent_and_mass(n: fl
 )
 @pytest.mark.parametrize("n", [1.0, 2.2])
 def test_a_constant_factor_of_the_published_d_returns_its_restitution(e: float, d: float, n: float) -> None:
-    """D = lambda v0 is given as plain damping, so that the law does not use the identity."""
+    """D = lambda v0 is given as a damping, so that the law does not use the identity."""
     speed = 0.4
     contact = Contact("hunt_crossley", 1e9, n, damping=d / speed)
-    # the table gives D with six decimals, and de/dD is at most 0.35 there, so rounding changes e by less than 3e-7
+    # the table contains D with six decimals, and de/dD is at most 0.35, so rounding changes e by less than 3e-7
     assert restitution.free_impact(contact, speed=speed) == pytest.approx(e, abs=3e-7)
 
 
@@ -86,13 +86,13 @@ def test_kelvin_voigt_is_the_closed_form() -> None:
 def test_ramped_damping_is_that_of_another_integrator(z: float, ramp: float) -> None:
     """SciPy integrates u'' = -max(0, u + 2 z s u') with the ramp s.
 
-    This is the law with depth in units of v sqrt(m/K) and time in units of sqrt(m/K).
+    This is the law for depths in units of v sqrt(m/K) and times in units of sqrt(m/K).
     """
 
     def rates(_t: float, state: list[float]) -> tuple[float, float]:
         u, rate = state
         share = min(max(u / ramp, 0.0), 1.0)
-        # a contact that is CLIPPED on the way out pushes again when the ramp has reduced the damping
+        # a contact that was CLIPPED on the way out pushes again when the ramp has reduced the damping
         return rate, -max(0.0, u + 2.0 * z * share * share * (3.0 - 2.0 * share) * rate)
 
     def parted(_t: float, state: list[float]) -> float:
@@ -117,8 +117,7 @@ def test_the_page_shows_the_results_of_the_solver() -> None:
     tables = (restitution.page_table, restitution.laws_table, restitution.ratio_table, restitution.ramp_table)
     for table in tables:
         assert f"\n{table(rows)}\n" in page
-    # the laws are damped as in the tests above; without damping each law delivers a restitution of 1 and needs other
-    # kernels
+    # a law without damping would need other compiled kernels
     for law in ("zhiying_qishao", "kelvin_voigt"):
         stored = {row.asked: row.delivered for row in rows if row.law == law}
         for again in restitution.measure(law, list(stored)[5:-1:10]):

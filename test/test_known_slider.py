@@ -1,8 +1,8 @@
 """The slider with clearance in its guide of Flores, Leine and Glocker, Multibody Syst. Dyn. 23 (2010) 165.
 
-It has the same topology, four corners in a guide. The paper's gap functions are compared with our penetrations. Its
-mechanism with rigid impacts, integrated here with located events, is compared with our solver. For Siconos' own data
-see docs/known_answers.md.
+The slider has four corners in a guide, like our head. The gap functions of the paper are compared with our
+penetrations. The mechanism with rigid impacts is integrated here with event detection, and compared with our solver.
+See docs/known_answers.md for a comparison with the data of Siconos.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import siconos
 
 
 def penetrations(y: float, theta: float) -> np.ndarray:
-    """Return our penetrations with the head as the guide, whose pose is the inverse of the slider's."""
+    """Return our penetrations. The head represents the guide, and its pose is the inverse of the slider's pose."""
     scene = replace(
         preset("paper"), frame=Frame(2.0 * siconos.HALF_LENGTH, 2.0 * siconos.HALF_HEIGHT),
         clearance=Clearance(1.0, 2.0 * siconos.GAP), initial=Initial((-np.sin(theta) * y, -np.cos(theta) * y, -theta)),
@@ -31,7 +31,7 @@ def penetrations(y: float, theta: float) -> np.ndarray:
 
 
 def test_gap_functions_are_our_penetrations() -> None:
-    """g1 and g2 are gaps of the upper left and right corners at the upper wall, g3 and g4 of the lower corners."""
+    """g1 and g2 are gaps of the upper corners (left, right) at the upper wall, g3 and g4 those of the lower corners."""
     random = np.random.default_rng(2010)
     for y, theta in zip(random.uniform(-2e-3, 2e-3, 200), random.uniform(-0.05, 0.05, 200), strict=True):
         depth = penetrations(y, theta)
@@ -39,7 +39,8 @@ def test_gap_functions_are_our_penetrations() -> None:
 
 
 def test_touches_are_those_of_the_rigid_mechanism() -> None:
-    """The first five touches, and the speeds after them, are late by the contact's duration, which falls as K^-1/2."""
+    """The first five touches, and the speeds after them, are late by the duration of a contact, proportional to K^-1/2.
+    """
     t, states, impacts = siconos.rigid_motion(0.009, 5)
     assert len(impacts) >= 5 and impacts[0] == pytest.approx(2.69e-3, abs=2e-5)
     late = []

@@ -1,4 +1,4 @@
-"""The live twin without ROS: files, standard input and MQTT supply the same session, counters and recording."""
+"""The live twin without ROS. With files, standard input and MQTT, session, counters and recording are the same."""
 
 from __future__ import annotations
 
@@ -75,12 +75,12 @@ def _csv(path: Path, count: int, more: str = "", times: float = 1.0) -> Path:
     return path
 
 
-#: Damaged sequence numbers, as texts.
+#: Invalid sequence numbers.
 STRAY = ("5000000", "1e30", "0", "-7", "nan")
 
 
 def _run(path: Path, mapping: Path | None = None, reports: list[Part] | None = None, **values: Any) -> dict[str, Part]:
-    """Feed a twin from a file and return its diagnostics; its reports meanwhile are added to `reports`."""
+    """Run a twin on a file and return its diagnostics. Diagnostics during the run are added to `reports`."""
     settings = parameters.settings(values)
     said: list[str] = []
 
@@ -112,7 +112,7 @@ def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(
     report = replay(tmp_path / "run")
     assert (report.samples, report.exit_code, report.first_divergence) == (1000, 0, None)
     assert report.compared["contact_forces"] == 1000
-    # the recording contains the unused messages, and its counts of them agree with the twin's counters
+    # the recording contains the unused messages, and their numbers agree with the counters of the twin
     told = {key.removeprefix("dropped_"): int(count) for key, count in dropped.items()}
     assert report.inputs == examine(tmp_path / "run").inputs == {"excitation": {"used": 1000, **told}}
     unused = {found["reason"]: found for found in unused_messages(tmp_path / "run")}
@@ -130,7 +130,7 @@ def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(
 def test_a_time_that_stands_alone_is_no_clock_and_no_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     date = "2026-01-01T00:00:{:06.3f}".format
     rows = [f"{date(index * 1e-3)},1,2,3\n" for index in range(300)]
-    rows[150:150] = ["2080-01-01,1,2,3\n"]  # this stamp does not continue the stamps before it
+    rows[150:150] = ["2080-01-01,1,2,3\n"]  # this stamp is not near the previous stamps
     rows[200:200] = ["9999-12-31,1,2,3\n", "9999-12-31,1,2,3\n"]
     path = tmp_path / "load.csv"
     path.write_text("time,fx,fy,m\n" + "".join(rows))
@@ -190,7 +190,7 @@ def test_bounded_work_is_reported_with_its_error_and_repeated_by_the_journal(tmp
     given = {"scene": "bench_kv", "max_evaluations": 16, "record_path": str(tmp_path / "run")}
     reports: list[Part] = []
     parts = _run(_csv(tmp_path / "load.csv", 1500), reports=reports, **given)
-    # each report covers only the time from the previous report on, so the largest error is sought in all reports
+    # a report covers the time since the previous report, so the largest error may be in any report
     largest = max(float(values["error_estimate_m"]) for _, _, values in (*reports, parts["state"]))
     assert int(parts["state"][2]["coarse_advances"]) > 0 and 0.0 < largest < 1e-3
     report = replay(tmp_path / "run")
@@ -221,7 +221,7 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
         return False
 
     assert front.run(acknowledge) == [] and acknowledged
-    # changes of a level are recorded; in addition, all alarms are reported once a second
+    # changes of a level are recorded, and all alarms are reported once per second
     alarms = [part[2] for name, part in said if name == "alarms"]
     assert any(values["residual_latched"] == "warn" for values in alarms)
     recorded = [
@@ -239,8 +239,7 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
     file = next((tmp_path / "run").glob("*.mcap"))
     report = replay(rewrite(file, tmp_path / "other.mcap", metadata=other_thresholds))
     assert report.exit_code == 1 and report.first_divergence is not None
-    # in the recording the residual's alarm was raised and then released; the replay raises none, so there are two
-    # divergences
+    # the alarm of the residual was raised and then released; the replay raises no alarm, so there are two divergences
     found = report.first_divergence
     assert (report.divergences, found.topic, found.recorded, found.computed) == (2, "alarms", "a message", "none")
 
@@ -251,7 +250,7 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
     assert report.first_divergence is not None
     found = report.first_divergence
     assert (found.topic, found.recorded, found.computed) == ("alarms", "none", "warn") and "_l" in found.field
-    # without recorded outputs, alarms cannot be compared
+    # alarms cannot be compared without recorded outputs
     few = given | {"record_path": str(tmp_path / "few"), "record_outputs": "none"}
     _run(path, mapping, **few)
     report = replay(tmp_path / "few")
@@ -271,13 +270,12 @@ def test_the_senders_own_numbers_show_loss_repetition_and_a_new_start(tmp_path: 
     lines = [
         json.dumps({"time": 1000 + index, "load": {"f": [index, 2, 3]}, "n": n}) for index, n in enumerate(numbers)
     ]
-    # messages of other senders come in between and have no sequence number; neither these nor the two damaged messages
-    # use up a number
+    # messages of other senders have no sequence number; they and the two damaged messages use no number
     lines[150], lines[151] = '{"n": 152, "load"', '{"n"'
     for place, other in ((60, '{"hello": 1}'), (40, "garbage"), (20, '{"n": "x", "status": 3}')):
         lines.insert(place, other)
     path = tmp_path / "plough.csv"
-    # an unreadable message before the first sequence number does not count as number 1
+    # an unreadable message before the first sequence number is not counted as number 1
     path.write_text("\n".join(["{}", "nothing", *lines, '{"n": 60, "load"']) + "\n", encoding="utf-8")
     mapping = tmp_path / "map.yaml"
     mapping.write_text(
@@ -294,8 +292,7 @@ def test_the_senders_own_numbers_show_loss_repetition_and_a_new_start(tmp_path: 
     ("numbers", "lost"),
     [
         *((["1", "2", *map(str, range(3, 150)), stray, *map(str, range(151, 301))], 0) for stray in STRAY),
-        # after each of these jumps the numbers continue: a jump back to a new count, a jump ahead, and a jump too large
-        # to be a loss
+        # jumps after which the numbers continue: back to a new count, ahead, and ahead by too much for a loss
         ([*map(str, range(2000, 2150)), *map(str, range(2, 150))], 1),
         ([*map(str, range(1, 150)), *map(str, range(5000, 5150))], 4850),
         ([*map(str, range(1, 150)), *map(str, range(10**15, 10**15 + 150))], 0),
@@ -331,10 +328,10 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_its_faults(tmp_path: Pat
     for wrong in (True, [1], {}, None, 10**400):
         assert read(pose + "stamp: at}", a=wrong, b={"c": 4}, turn=1, at=1) is None
     assert time_ns(1_767_323_045_123_456_789, "ns") == 1_767_323_045_123_456_789
-    # a time with an arbitrary start is moved by 1 s, because 0 stands for a missing stamp
+    # times with an arbitrary start are shifted by 1 s, because 0 means that a stamp is missing
     assert time_ns(0.5) == 1_500_000_000
     assert time_ns("yesterday") is None and time_ns(float("inf")) is None and time_ns(1e300) is None
-    # many databases write the first date for `empty`; no stamp can represent the other two dates
+    # many databases write the first date for `empty`; the other two dates cannot be stamps
     assert time_ns("9999-12-31") is None and time_ns("2300-01-01T00:00:00") is None and time_ns("0001-01-01") is None
     assert time_ns(10**400) is None and time_ns("20260102") == (20_260_102 + 1) * 10**9
     for text, said in (
@@ -359,7 +356,7 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_its_faults(tmp_path: Pat
         with pytest.raises(RecordingError, match="head_pose") as caught:
             read_map(path, None)
         assert said in str(caught.value)
-    # if a message lacks the time that was requested by name, the time of receipt is not used instead
+    # if the requested field with the time is missing, the time of receipt does not replace it
     assert read("head_pose: {topic: p, stamp: at}", x=1, y=2, theta=3) is None
     for key, name in (("stamp", "at"), ("sequence", "n")):
         path.write_text(f"head_pose: {{topic: p, {key}: {name}}}")
@@ -375,7 +372,7 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_its_faults(tmp_path: Pat
 
 
 def test_files_wait_for_a_recorder_that_is_slow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Input without a clock comes in batches, and each batch fills a quarter of this queue."""
+    """Input without a clock arrives in batches. Each batch fills a quarter of this queue."""
     monkeypatch.setattr("plow_twin.live.recording._QUEUE_SIZE", 2400)
     monkeypatch.setattr("plow_twin.record.recorder._POLL_S", 0.3)
     path = _csv(tmp_path / "load.csv", 2000)
@@ -387,7 +384,7 @@ def test_files_wait_for_a_recorder_that_is_slow(tmp_path: Path, monkeypatch: pyt
 def test_a_full_disk_under_the_log_does_not_end_the_twin(tmp_path: Path) -> None:
     _csv(tmp_path / "load.csv", 50)
     arguments = ["live", str(tmp_path / "load.csv"), "--record"]
-    full = Path("/dev/full").open("w")  # noqa: SIM115  # closing it fails
+    full = Path("/dev/full").open("w")  # noqa: SIM115  # closing this file raises an error
     with redirect_stderr(full):
         assert run_cli([*arguments, str(tmp_path / "log")]) == 0
     with redirect_stdout(full):
@@ -413,7 +410,7 @@ def test_a_reader_of_the_lines_that_hangs_stops_nothing_and_what_it_does_not_get
         outlet.put(str(number))
     assert lost_at == [1] and 99 <= outlet.lost <= 100
     hangs.set()
-    # after the line that was being written, the outlet writes the newest lines in their order
+    # after the line that was being written, the newest lines are written in order
     assert outlet.close() and len(taken) + outlet.lost == MOST_WAITING + 100
     assert taken[-MOST_WAITING:] == list(map(str, range(100, MOST_WAITING + 100)))
 
@@ -424,11 +421,11 @@ def test_a_live_twin_whose_standard_output_nobody_reads_goes_on_and_ends_when_it
     with _live(str(path), "--follow", "--scene", "paper", *more) as live:
         pipe = live.process.stdout
         assert pipe is not None
-        # the pipe holds fewer lines than come in a second, so it is soon full
+        # the pipe is soon full, because it holds less than the lines of one second
         fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, 4096)
         live.until_count("samples_used", 100)
         give_up = time.monotonic() + START_S
-        for count in range(1000, 4000, 1000):  # from here on nobody reads the pipe
+        for count in range(1000, 4000, 1000):  # from here on, nothing reads the pipe
             with path.open("a") as file:
                 file.writelines(",".join(map(repr, _row(index))) + "\n" for index in range(count - 900, count + 100))
             while _metric(port, "plow_twin_input_samples_used") < count + 100:
@@ -442,14 +439,14 @@ def test_a_live_twin_whose_standard_output_nobody_reads_goes_on_and_ends_when_it
 
 
 def _metric(port: int, name: str) -> float:
-    """Return a number from the page for Prometheus."""
+    """Return a value of the page for Prometheus."""
     with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as page:
         lines = [line.split() for line in page.read().decode().splitlines() if line.startswith(f"{name} ")]
     return float(lines[0][1]) if lines else 0.0
 
 
 class Live:
-    """`plow-twin live --lines` in a process of its own."""
+    """`plow-twin live --lines` in a separate process."""
 
     def __init__(self, *arguments: str, **options: Any) -> None:
         environment = os.environ | {"PYTHONPATH": str(ROOT), **options.pop("environment", {})}
@@ -461,7 +458,7 @@ class Live:
         self.alarms: list[dict[str, Any]] = []
 
     def until(self, reached: Callable[[dict[str, dict[str, Any]]], bool], what: str) -> dict[str, str]:
-        """Read the output until a condition is true; return the values of its part `input`."""
+        """Read the output until a condition is true. Return the values of its part `input`."""
         give_up = time.monotonic() + START_S
         assert self.process.stdout is not None
         while not ("input" in self.heard and reached(self.heard)):
@@ -496,12 +493,12 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
     path, run = tmp_path / "load.csv", tmp_path / "run"
     _csv(path, 100)
     arguments = (str(path), "--follow", "--record", str(run), "--set", "excitation_timeout=3600")
-    # a `nohup` around the tests would make the twin ignore SIGHUP, so it gets the default handler
+    # under `nohup`, the twin would ignore SIGHUP, so the default handler is restored
     with _live(*arguments, preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL)) as live:
         live.until_count("samples_used", 100)
         text = "".join(",".join(map(repr, _row(index))) + "\n" for index in range(100, 200))
         with path.open("a") as stream:
-            stream.write(text[:1234])  # this text ends in the middle of a number
+            stream.write(text[:1234])  # this text ends within a number
             stream.flush()
             live.until_count("samples_used", 105)
             stream.write(text[1234:])
@@ -510,7 +507,7 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
         path.write_text("t,fx,fy,m\n" + "".join(",".join(map(repr, _row(index))) + "\n" for index in range(200, 300)))
         values = live.until_count("samples_used", 300)
         assert values["samples_in"] == "300"
-        assert live.stop(signal.SIGHUP) == 0  # a terminal that is closed sends this signal
+        assert live.stop(signal.SIGHUP) == 0  # the signal of a terminal that is closed
     report = replay(run)
     assert (report.samples, report.exit_code) == (300, 0)
 
@@ -518,17 +515,18 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
 def test_an_alarm_is_reported_once_with_value_pad_threshold_and_time_and_acknowledged_without_ros(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # a socket needs a short path, and the folders of tests have long paths
+    # the path of a socket must be short, but the folders of tests have long paths
     path, control = _csv(tmp_path / "load.csv", 5000), Path(tempfile.mkdtemp(dir="/tmp")) / "twin.socket"
     control.touch()
-    assert run_cli(["live", str(path), "--control", str(control)]) == 1  # this file exists and is not a twin's socket
+    # this file exists and is not the socket of a twin
+    assert run_cli(["live", str(path), "--control", str(control)]) == 1
     assert "cannot be a socket" in capsys.readouterr().err
     control.unlink()
     thresholds = ("--set", "alarm_force=[20e3,1e9]", "--set", "alarm_duration=0.002")
     arguments = (str(path), "--follow", "--control", str(control), "--set", "excitation_timeout=3600", *thresholds)
     with _live(*arguments, "--record", str(tmp_path / "run")) as live:
         live.until_count("samples_used", 5000)
-        # within five seconds the force passes the threshold repeatedly, but the alarm is reported once
+        # within five seconds the force exceeds the threshold repeatedly, but the alarm is reported once
         (said,) = live.alarms
         values = said["values"]
         assert values["force_raised"] > values["force_threshold"] == 20e3 and values["force_place"] in PAIR_NAMES
@@ -547,7 +545,8 @@ def test_an_alarm_is_reported_once_with_value_pad_threshold_and_time_and_acknowl
             ("a\x1b[2Jb", "got 'a\\x1b[2Jb'"),
         ):
             assert run_cli(["call", str(control), "mark", text]) == 2 and got in capsys.readouterr().err
-            assert call(control, "mark", text) == (False, mark_problem(text))  # other programs can call the socket too
+            # other programs can use the socket without `plow-twin call`
+            assert call(control, "mark", text) == (False, mark_problem(text))
         for place, kind in ((path, "a file"), (tmp_path, "a folder"), (tmp_path / "none", "nothing there")):
             assert run_cli(["call", str(place), "mark", "x"]) == 1
             assert f"got {kind}, expected the socket that plow-twin live --control" in capsys.readouterr().err
@@ -571,19 +570,19 @@ def test_files_with_dates_are_waited_for_and_followed_from_one_to_the_next(
     mapping.write_text("excitation: {topic: load_*, unit: {fx: N}}\n")
     arguments = (str(tmp_path / "load_*.csv"), "--follow", "--map", str(mapping), "--set", "excitation_timeout=3600")
     with _live(*arguments) as live:
-        days[1].write_text("t,fx")  # the header is cut in the middle
+        days[1].write_text("t,fx")  # the header is incomplete
         time.sleep(0.5)
         days[1].write_text("t,fx,fy,m\n" + text(0, 100))
         live.until_count("samples_used", 100)
         with days[1].open("a") as before:
             days[2].write_text("t,fx,fy,m\n" + text(150, 200))
             live.until_count("samples_used", 150)
-            before.write(text(100, 150))  # these rows are written late, so the motion is corrected
+            before.write(text(100, 150))  # these rows are late, so the motion is corrected
         values = live.until_count("samples_used", 200)
         assert (values["samples_in"], values["rolled_back"]) == ("200", "50")
         assert live.stop() == 0
-    # without --follow the files are read in the order of the numbers in their names; the same mapping suits a single
-    # file with a date in its name
+    # without --follow, files are read in the order of the numbers in their names; the mapping also works for a single
+    # file
     days[0].write_text("t,fx,fy,m\n" + text(-30, 0))
     for source, count in ((arguments[0], 230), (str(days[0]), 30)):
         assert run_cli(["live", source, "--map", str(mapping), "--json"]) == 0
@@ -614,22 +613,22 @@ def test_nothing_of_a_followed_file_is_lost_unseen_when_it_is_cut_or_another_tak
         return [None if content is None else float(content.get("fx", math.nan)) for content in contents]
 
     assert read() == [10.0, 20.0]
-    path.write_text("4,40,0,0\n")  # the file is cut within a line, and its writer continues without a header
+    path.write_text("4,40,0,0\n")  # the file is truncated within a line, and its writer continues without a header
     assert read() == [None, 40.0]
     path.rename(tmp_path / "load.csv.1")
     with (tmp_path / "load.csv.1").open("a") as stream:
-        stream.write("5,50,0,0\n")  # the writer does not know that the file was cut
+        stream.write("5,50,0,0\n")  # the writer does not notice that the file was truncated
     assert read() == [50.0]
     path.write_text("m;fx;t;fy\n0;60;6;0\n")
     assert read() == [60.0]
-    path.write_text("0,7\n0,70,7,0\n")  # the file was cut within a line; the second half of this line is not used
+    path.write_text("0,7\n0,70,7,0\n")  # the file was truncated within a line; the second half of this line is ignored
     assert read() == [None, 70.0]
-    path.write_text("t,fx,fy,m\n" + "8,80,0,0\n" * 3)  # the file is written anew and becomes longer than before
+    path.write_text("t,fx,fy,m\n" + "8,80,0,0\n" * 3)  # the file is written again and becomes longer than before
     assert read() == [80.0] * 3
     path.unlink()
     assert read() == []
     path.write_text("a,b\n1,2\n")
-    assert repr(read()) == "[nan]"  # the new header names no load, so this row has no load
+    assert repr(read()) == "[nan]"  # the new header contains no load, so the row contains none
     files.close()
 
 
@@ -647,19 +646,19 @@ def test_lines_on_standard_input_are_taken_and_silence_is_held(tmp_path: Path) -
         assert (values["samples_used"], values["dropped_malformed"]) == ("100", "2")
         live.process.stdin = None
         live.process.communicate(timeout=60.0)
-        assert live.process.returncode == 3  # two lines were not used, so the exit code is that of a loss
+        assert live.process.returncode == 3  # two lines were not used, and the exit code shows a loss
     report = replay(tmp_path / "run")
     assert (report.samples, report.exit_code) == (100, 0)
 
 
 def test_a_closed_standard_input_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stdin", None)  # Python sets a closed stream to None
+    monkeypatch.setattr(sys, "stdin", None)  # Python sets `sys.stdin` to None if it is closed
     with pytest.raises(BridgeError, match="closed standard input"):
         StandardInput()
 
 
 class Endless:
-    """Endless samples at 1 kHz with poses and speeds in between; `look` is called before each batch."""
+    """Endless samples at 1 kHz with poses and speeds in between. `look` is called before each batch."""
 
     def __init__(self, look: Callable[[int], bool]) -> None:
         self.ends = self.finished = False
@@ -685,7 +684,7 @@ class Endless:
             row["speed"] = 1.0 if self._index % 100 == 0 else ""
             found.append(Arrived("load", time.time_ns(), row))
             self._index += 1
-        # every 50th batch comes in reverse order, so some rows are late
+        # every 50th batch is in reverse order, so some rows are late
         return found[::-1] if self._index % 1000 == 0 else found
 
     def close(self) -> None:
@@ -720,10 +719,9 @@ def test_nothing_lives_longer_than_the_time_remembered_but_the_index_of_the_reco
     finally:
         tracemalloc.stop()
     (_, _, _), (objects, size, before), (more, larger, after) = found
-    # between the two measurements 8,000 samples and 25,000 messages pass, so a leak would show; the number of objects
-    # kept for the last seconds varies by some hundreds
+    # between the measurements, 8,000 samples and 25,000 messages pass; the number of objects varies by some hundreds
     assert more - objects < 800 and larger - size < 100_000, found
-    # until a part ends, its index grows by about 140 B for each chunk, which is 2 MB an hour
+    # before a part ends, its index grows by about 140 B for each chunk, which is 2 MB per hour
     assert 0 < after - before < 20_000
     figures = front.parts()["input"][2]
     assert int(figures["samples_used"]) == int(figures["samples_in"]) and int(figures["rolled_back"]) > 0
@@ -821,12 +819,12 @@ def test_readers_of_metrics_that_ask_nothing_are_bounded() -> None:
                 with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=30.0) as page:
                     assert b"plow_twin_state_model_time_s 1.5" in page.read()
                 break
-            except OSError:  # the server has not noticed yet that the idle connections are gone
+            except OSError:  # the server has not noticed yet that the idle connections are closed
                 assert time.monotonic() < give_up
 
 
 def _expressions(board: dict[str, Any]) -> list[str]:
-    """Return the queries of a board for Grafana."""
+    """Return the queries in a Grafana dashboard."""
     return [target["expr"] for panel in board["panels"] for target in panel["targets"]]
 
 
@@ -836,7 +834,7 @@ def test_poses_gaps_and_speeds_that_cannot_be_are_not_used() -> None:
     inputs.active = inputs.started = True
     inputs.set_limits(value_limits(2.0, 1.0), pose_limits(load_scene("paper"), 0.05, 0.7), value_limits(0.1, 1.0))
     second = 10**9
-    # a speed of 2.5 is too large, and the change to -1.7 is too fast
+    # the speed 2.5 is too large, and the change to -1.7 is too fast
     for at, speed in ((1, 0.5), (2, 1.4), (3, 2.5), (4, -1.7), (5, 0.0)):
         used += [speed] if inputs.uses_travel(at * second, speed) else []
     assert used == [0.5, 1.4, 0.0] and inputs.travel.counts[Verdict.IMPLAUSIBLE] == 2
@@ -848,7 +846,7 @@ def test_poses_gaps_and_speeds_that_cannot_be_are_not_used() -> None:
     assert [pose[0] for pose in used[:2]] == [0.01, 0.04] and used[2][1] == 0.001 and len(used) == 3
     assert inputs.head_pose.counts[Verdict.IMPLAUSIBLE] == 2
     used.clear()
-    # the second message lacks pair 3, so the third message's change of pair 3 is taken from the first message
+    # the second message lacks pair 3, so the change of pair 3 is computed from the first and the third message
     for at, gaps in enumerate([{1: 0.01, 3: 0.01}, {1: 0.02}, {3: 0.09, 1: 0.02}, {1: 0.11}, {3: 0.05, 1: 0.03}]):
         used += [gaps] if inputs.uses_gaps(second + at * 20_000_000, gaps) else []
     assert used == [{1: 0.01, 3: 0.01}, {1: 0.02}, {3: 0.05, 1: 0.03}]
@@ -927,7 +925,7 @@ def test_a_file_that_ends_is_read_at_the_pace_of_the_twins_that_follow_and_this_
 ) -> None:
     path = _csv(tmp_path / "load.csv", 50)
     options = ["--set", "estimate=true", "--set", given, "--set", "follow_members=20"]
-    # exit code 3: the data are not enough for an estimate
+    # exit code 3: there are not enough data for an estimate
     assert run_cli(["live", str(path), "--scene", "paper", *options]) == 3
     assert ("20 twins follow the machine" in capsys.readouterr().err) == said
     if not said:
@@ -936,7 +934,7 @@ def test_a_file_that_ends_is_read_at_the_pace_of_the_twins_that_follow_and_this_
 
 
 def _mistaken(name: str) -> str:
-    """Return a file as a plant engineer may write it, with a mistake."""
+    """Return a file with a mistake that a plant engineer may make."""
     rows = [_row(index)[1:] for index in range(3000)]
     lines = {
         "decimal commas": lambda t, f: f"{t:.3f},{f[0]:.1f},{f[1]:.1f},{f[2]:.1f}".replace(".", ","),
@@ -995,7 +993,7 @@ def test_utf16_a_folder_that_is_taken_and_a_threshold_in_kilonewtons_are_named(
 
 
 def _troubled_rows(seed: int, count: int) -> Iterator[str]:
-    """Yield rows of a file: mostly a continuing load, sometimes unusual rows."""
+    """Yield rows of a file: mostly a continuous load, sometimes unusual rows."""
     rng = np.random.default_rng(seed)
     kinds = ["gap", "late", "twice", "stray", "text", "empty", "wild", "pose", "header", "integer", "triple"]
     stamp = 500.0
@@ -1029,7 +1027,7 @@ def _troubled_rows(seed: int, count: int) -> Iterator[str]:
 def _recorded(run: Path) -> tuple[list[Any], list[Any]]:
     """Return journal and outputs of a recording, with the number of entries before each output.
 
-    The status and the times of notes on unused messages are left out, because they depend on the wall clock.
+    Messages and entries that depend on the wall clock are omitted: the status, and the times of unused messages.
     """
     entries: list[EntryRecord] = []
     outputs = []
@@ -1062,7 +1060,7 @@ def test_a_file_gives_the_same_journal_outputs_and_counts_in_batches_as_row_by_r
         prepared = Preparation(settings).result(lambda: False)
         front = BridgeFront(Files([path], follow=False), None, settings, prepared, lambda *_: None, pytest.fail)
         if name == "single":
-            # an observer sees each sample, so with an observer the samples are used one by one
+            # an observer receives each sample, so with an observer the samples are processed one by one
             front.attach(_Onlooker())
         front.run(lambda: False)
         figures = front.parts()
@@ -1078,7 +1076,7 @@ def test_a_file_gives_the_same_journal_outputs_and_counts_in_batches_as_row_by_r
 
 
 class _Onlooker:
-    """An observer that does nothing."""
+    """An observer without methods of its own."""
 
     def publication(self, published: Any) -> None: ...
     def part(self, name: str, part: Part) -> None: ...

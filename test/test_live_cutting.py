@@ -21,7 +21,7 @@ def test_the_plough_runs_to_the_end_turns_and_comes_back_without_a_jump() -> Non
     assert position.max() > 199.99 and position[number == 1].min() < 0.01
     np.testing.assert_allclose(np.diff(position), 0.5 * (speed[1:] + speed[:-1]) * 1e-3, rtol=0.0, atol=1e-8)
     assert (speed[(number % 2 == 1)] <= 0.0).all() and np.abs(speed).max() == 2.0
-    # the speed changes by 2 m/s within 2 s, which is half of a turn of 4 s
+    # the speed changes by 2 m/s within 2 s, half the duration of a turn
     assert np.abs(np.diff(speed)).max() <= 1.0001e-3
 
 
@@ -33,7 +33,7 @@ def test_the_load_has_mean_variation_correlation_and_skewness_asked_for() -> Non
     assert fx.std() / fx.mean() == pytest.approx(0.5, rel=0.04)
     assert fx.min() > 0.0
     skewness = ((fx - fx.mean()) ** 3).mean() / fx.std() ** 3
-    # a Gamma distribution's skewness is twice its coefficient of variation
+    # the skewness of a Gamma distribution is twice its coefficient of variation
     assert skewness == pytest.approx(2.0 * 0.5, rel=0.15)
     assert abs(fy.mean()) < 400.0 and fy.std() == pytest.approx(5e3, rel=0.04)
     np.testing.assert_allclose(moment, 0.1 * fy - 0.7 * fx)
@@ -50,7 +50,7 @@ def test_the_coal_stays_where_it_is_and_each_pass_cuts_another_web() -> None:
     assert not np.allclose(replace(LOAD, seed=4).at(times), coarse)
     there, back = LOAD.at(np.array([52.0])), LOAD.at(np.array([52.0 + 102.0]))
     assert not np.allclose(there, back)
-    assert (LOAD.at(np.array([0.0])) == 0.0).all()  # at this time the head stands at the end of the face
+    assert (LOAD.at(np.array([0.0])) == 0.0).all()  # at this time, the head is at the end of the face
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,5 @@
-"""A live twin that follows its machine: estimates are adopted, undone, corrected, and reproduced from the journal."""
+"""A live twin that follows its machine: estimates are adopted, withdrawn, corrected, and reproduced from the journal.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +68,7 @@ MEMBERS, T0, SPAN_S = 24, 1_795_000_000_000_000_000, 1.0
 
 @pytest.fixture(scope="module")
 def truth() -> Truth:
-    """Return a machine with a soft contact, 8 mm more horizontal clearance than believed, and gains up to 10 % off."""
+    """Return a machine with a soft contact, 8 mm more horizontal clearance than assumed, and gain errors up to 10 %."""
     return draw(replace(GROUPS["plain"], stiffness=(3e6, 3e8), periods=2.2), 71003)
 
 
@@ -92,13 +93,13 @@ def _poses(truth: Truth, begin: float, end: float) -> list[Pose]:
 
 
 def _in_turn(truth: Truth, begin: float, end: float) -> list[Entry]:
-    """Return samples and poses in the order of their stamps."""
+    """Return samples and poses sorted by stamp."""
     entries: list[Sample | Pose] = [*_samples(truth, begin, end), *_poses(truth, begin, end)]
     return sorted(entries, key=lambda entry: (entry.stamp_ns, isinstance(entry, Pose)))
 
 
 def _known(truth: Truth, state: State = State.ESTIMATED) -> Estimated:
-    """Return an estimate with the accuracy of ten load periods."""
+    """Return an estimate with the accuracy of an estimate from ten load periods."""
     clearance, contact = truth.scene.clearance, truth.scene.contact
     assert contact.damping is not None
     fx, fy, m = (Interval.normal(gain, 0.003) for gain in truth.gain)
@@ -111,12 +112,12 @@ def _known(truth: Truth, state: State = State.ESTIMATED) -> Estimated:
     return Estimated(0, 1, 2, 3, (), (0.0,) * 6, json.dumps(found.as_dict()))
 
 
-#: A change of the model: a millimetre less clearance.
+#: A change of the model: the horizontal clearance is smaller by 1 mm.
 OTHER = SetModel(T0, json.dumps({"clearance.horizontal_m": 0.024}))
 
 
 class Live:
-    """A session of a following twin, with its journal and its publications."""
+    """A session of a twin that follows its machine, with its journal and its publications."""
 
     def __init__(self, scene: Scene, how: str = "full", *, defers: bool = False) -> None:
         self.journal: list[Entry] = []
@@ -143,7 +144,7 @@ class Live:
         return np.concatenate([one.rows[name] for one in self.published])
 
     def clearance(self) -> Array:
-        """Return the clearances that were published last, each with the ends of its interval, shape (2, 3)."""
+        """Return the newest published clearances, each with the ends of its interval, shape (2, 3)."""
         slow = next(one.slow for one in reversed(self.published) if len(one.slow))
         told = dict(zip(CLEARANCE_NAMES, slow["clearance"][-1].tolist(), strict=True))
         return np.array([[told[f"{axis}{end}"] for end in ("", "/p05", "/p95")] for axis in ("horizontal", "vertical")])
@@ -166,11 +167,10 @@ def test_an_estimate_that_stands_is_taken_over_and_undone_when_it_is_withdrawn(t
     assert known[:, 0] == pytest.approx(truth.clearance, abs=1e-6) and (np.ptp(known, axis=1) < 2e-4).all()
     fine = simulate(truth.scene, 6.0, 1e-3, 1e-6).force
     assert _error(nominal, fine[:3000:10][: len(nominal)]) > (0.3 if how == "parameters" else 0.1)
-    # a single twin starts with a wrong pose and forgets it only within some load periods; steered twins already had the
-    # machine's pose
+    # a single twin starts with a wrong pose and needs some load periods to forget it; twins steered by poses do not
     first, most, above = (150, 0.2, 1.3) if how == "parameters" else (50, 0.03, 1.1)
     assert _error(live.column("force")[first:], fine[3000::10][first : len(live.column("force"))]) < most
-    # the peaks show no impact when the estimate is adopted
+    # no impact occurs when the estimate is adopted
     assert (live.column("peak").max(axis=0) < above * fine[2900:].max(axis=0) + 2e3).all()
     assert (live.column("followed") == WITH_INTERVALS).all() == (how == "full")
     live.take([_known(truth, State.WITHDRAWN), *_in_turn(truth, 6.0, 6.3)])
@@ -199,7 +199,9 @@ def test_another_machine_is_followed_from_its_prior(truth: Truth, change: Entry)
 
 @pytest.mark.parametrize("before", ["nothing", "withdrawn", "other numbers"])
 def test_without_an_estimate_poses_leave_the_median_twin_alone(truth: Truth, before: str) -> None:
-    """The machine's clearances are 1.5 mm larger; steered to its poses, the nominal twin would press its walls."""
+    """The clearances of the machine are larger by 1.5 mm. The nominal twin, steered to its poses, would press its
+    walls.
+    """
     clearance, begin, end = truth.nominal.clearance, 0.0 if before == "nothing" else 1.0, 3.0
     wider = Clearance(clearance.horizontal_m + 1.5e-3, clearance.vertical_m + 1.5e-3)
     run = simulate(replace(truth.nominal, clearance=wider), end, 0.01, 1e-6)
@@ -231,7 +233,7 @@ def test_wear_continues_from_its_depth_and_widens_the_estimate(truth: Truth) -> 
     live.take(_in_turn(truth, 2.011, 4.0))
     grown = live.session.wear_depth - before
     assert (grown >= 0.0).all() and grown.max() > 1e-6
-    # the last message is 0.1 s old, so it lacks the wear of the last 0.1 s
+    # the last message is 0.1 s old, so it does not contain the wear of the last 0.1 s
     assert live.clearance()[0, 0] - at_first[0, 0] == pytest.approx(0.5 * grown[[1, 3, 5, 7]].sum(), rel=0.2)
 
 
@@ -241,7 +243,7 @@ def test_intervals_of_peaks_and_impulses_are_those_of_the_span_that_is_published
     for name in ("force", "peak", "impulse"):
         value, low, high = (live.column(f"{name}{end}") for end in ("", "_low", "_high"))
         assert (low <= value).all() and (value <= high).all() and (high > low).any()
-    # the peaks of one long publication are at least those of the short publications in the same time
+    # the peaks in a long publication are at least as large as those in the short publications of the same time
     other = Live(truth.nominal)
     for entry in _in_turn(truth, 0.0, 1.0):
         other.session.apply(entry)
@@ -253,7 +255,7 @@ def test_intervals_of_peaks_and_impulses_are_those_of_the_span_that_is_published
 
 
 def _again(journal: Sequence[Entry], scene: Scene, at_once: int = 1) -> Session:
-    """Run a journal again in batches of samples, and compare its digests."""
+    """Run a journal again in batches of samples, and compare the digests."""
     session, run = Session(follower(scene, "full", MEMBERS, 1e-9), rollback_span_s=SPAN_S), list[Sample]()
 
     def advance() -> None:
@@ -285,7 +287,7 @@ def test_late_samples_and_poses_end_in_the_bits_of_those_in_order_and_replay_giv
     entries = [*_in_turn(truth, 0.0, 1.0), _known(truth), *_in_turn(truth, 1.0, 2.0)]
     ordered, late = Live(truth.nominal), Live(truth.nominal)
     ordered.take(entries)
-    # samples come up to 0.3 s late, some after the estimate, so that poses act late too
+    # samples are late by up to 0.3 s, some after the estimate, so that poses are used late too
     rng = np.random.default_rng(1)
 
     def due(place: int) -> float:
@@ -304,13 +306,13 @@ def test_late_samples_and_poses_end_in_the_bits_of_those_in_order_and_replay_giv
 
 
 def test_publications_do_not_change_the_motion_where_poses_samples_and_a_hold_are_late(truth: Truth) -> None:
-    """Publications determine how far back a late sample can go."""
+    """The last publication limits how late a sample can be."""
     live, part = Live(truth.nominal), _in_turn(truth, 0.5, 1.5)
     live.take([*_in_turn(truth, 0.0, 0.5), _known(truth), *part[30:60], *part[:30], *part[90:120], *part[60:90]])
     live.take([Hold(_stamp(1.2)), *part[150:], _known(truth, State.WITHDRAWN), *_in_turn(truth, 1.5, 1.6)])
     live.session.close()
     assert isinstance(live.journal[-1], Digest)
-    # this second run publishes nothing, and has the same state
+    # the second run publishes nothing, and its state is bit-identical
     assert _again(live.journal, truth.nominal).twin.digest() == live.twin.digest()
 
 
@@ -327,7 +329,7 @@ def test_a_snapshot_holds_all_that_a_later_run_needs(truth: Truth) -> None:
     for name in ROW.names or ():
         assert np.array_equal(live.column(name), other.column(name)), name
     assert live.twin.digest() == other.twin.digest()
-    # restoring a snapshot restores the earlier motion, but keeps the present wear
+    # `restore` restores the earlier motion, but not the earlier wear
     live.take([Restore(_stamp(1.1), snapshot.data), *_in_turn(truth, 0.8, 0.9)])
     # the next sample continues from the restored time
     assert live.twin.time == pytest.approx(0.88) and np.isfinite(live.column("force")).all()
@@ -357,7 +359,7 @@ def test_live_and_offline_give_the_same_rows(truth: Truth) -> None:
 
 
 def test_twins_that_catch_up_later_give_the_same_bits(truth: Truth) -> None:
-    """Any event may come before the other twins: poses, late samples, an estimate, a hold, other parameters."""
+    """An event of any kind may occur before the delayed twins are advanced."""
     entries = [
         *_in_turn(truth, 0.0, 0.6), *_poses(truth, 0.3, 0.35), _known(truth), *_in_turn(truth, 0.6, 0.81),
         *_late(truth, 0.7), *_in_turn(truth, 0.81, 0.9), PartOfPose(_stamp(0.7), (0, 2), (0.001, 0.0)),
@@ -479,7 +481,7 @@ def test_waiting_poses_are_bounded_dropped_ones_counted_and_no_estimate_is_dropp
     live.take([Pose(_stamp(t), (0.0, 0.0, 0.0)) for t in (3601.0, 7200.0)])
     assert live.session.poses_dropped == 2
     before, more = live.twin.added, 10_050
-    # a late sample would need all of these poses again, so they are kept while the load is silent
+    # a late sample would need all of these poses, so they are stored while the load is silent
     live.take([Pose(_stamp(0.51) + 100_000 * index, (0.0, 0.0, 0.0)) for index in range(more)])
     assert live.session.poses_dropped == 2 + before + more - 10_000
     assert live.twin.poses_dropped == more - 10_000
@@ -513,7 +515,7 @@ def test_twins_that_do_not_keep_up_leave_one_that_the_parameters_follow(truth: T
 
 
 def _play(probe: Probe, send: Any, poses: Any, truth: Truth, begin: float, end: float) -> None:
-    """Send load and poses of a part of a simulated machine's data, faster than their stamps."""
+    """Send load and poses of a part of a simulated machine's data faster than in real time."""
     for index, entry in enumerate(_in_turn(truth, begin, end)):
         if isinstance(entry, Sample):
             send(entry.stamp_ns, entry.wrench)
@@ -576,7 +578,7 @@ def _seconds(message: JointState) -> float:
 
 
 class Front:
-    """A front that receives and keeps a runtime's messages."""
+    """A front end that stores the messages of a runtime."""
 
     name, follows_samples, sends_motion = "/plow_twin", False, True
     topics = {topic.name: f"/{topic.name}" for topic in TOPICS}  # noqa: RUF012

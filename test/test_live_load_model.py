@@ -1,4 +1,4 @@
-"""The load from the drive's signals: figures by hand, the interval from random draws, and the journal's entries."""
+"""The load from signals of the drive: values computed by hand, intervals from random draws, and journal entries."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def test_power_speed_and_depth_give_the_load_and_its_deviation() -> None:
     assert 60e3 < both < 62e3 and narrow < spread
     assert MODEL.cutting_force({"power": 5e3, "speed": 0.01}) == (0.0, 0.0)
     assert MODEL.cutting_force({"power": 5e3}) is None and MODEL.wrench({}) is None
-    assert MODEL.cutting_force({"chain_force": 1e3})[0] == 0.0  # type: ignore[index]  # the chain alone, nothing is cut
+    assert MODEL.cutting_force({"chain_force": 1e3})[0] == 0.0  # type: ignore[index]  # nothing is cut
 
 
 def test_absurd_telemetry_goes_through_to_where_it_is_counted_and_is_no_certainty(tmp_path: Path) -> None:
     for drive in ({"power": 1e200, "speed": 2.0}, {"chain_force": 1e308}, {"depth": -1e308}):
         found = MODEL.wrench(drive)
         assert found is not None and not max(map(abs, (*found[0], *found[1]))) < 1e100
-    # a slightly biased sensor may give a negative depth; this is no better evidence than the same positive depth
+    # a biased sensor may give a negative depth, which is no better evidence than the same positive depth
     (below, wide), (_, same) = (MODEL.cutting_force({"depth": depth}) for depth in (-0.08, 0.08))  # type: ignore[misc]
     assert (below, wide) == (0.0, same)
     (tmp_path / "map.yaml").write_text(MAP)

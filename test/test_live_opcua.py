@@ -1,4 +1,4 @@
-"""OPC UA inputs from a real server in its own process, with losses, breaks, history and certificates."""
+"""OPC UA inputs from a real server in a separate process, with losses, breaks, history and certificates."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ MS = 1_000_000
 
 
 class Plant:
-    """The server, and a connection to it that can be cut."""
+    """The server, and a connection to it that can be interrupted."""
 
     def __init__(self, *security: str, **environment: str) -> None:
         self.port, server_port = _free_port(), _free_port()
@@ -59,7 +59,7 @@ class Plant:
         self.mend()
 
     def do(self, name: str, *arguments: Any, **how: Any) -> None:
-        """Send a command to the server, and wait until it is carried out."""
+        """Send a command to the server, and wait until it has been carried out."""
         assert self._process.stdin is not None and self._process.stdout is not None
         self._process.stdin.write(json.dumps([name, arguments, how]) + "\n")
         self._process.stdin.flush()
@@ -71,13 +71,13 @@ class Plant:
         threading.Thread(target=self._let_in, args=(self._door,), daemon=True).start()
 
     def restart_as(self, other: Plant) -> None:
-        """Break all connections, and lead new connections to another server."""
+        """Close all connections, and forward new connections to another server."""
         self.cut()
         self._server = other._server
         self.mend()
 
     def cut(self) -> None:
-        """Break all connections and refuse new ones."""
+        """Close all connections and refuse new connections."""
         for found in (self._door, *self._sockets):
             with suppress(OSError):
                 found.shutdown(socket.SHUT_RDWR)
@@ -118,7 +118,7 @@ def _free_port() -> int:
 
 @pytest.fixture
 def server() -> Iterator[Plant]:
-    """A server for one test, because its history would also fill the breaks of another test."""
+    """Yield a server for one test. The history of a shared server would fill breaks in other tests."""
     plant = Plant()
     yield plant
     plant.close()
@@ -168,21 +168,21 @@ def test_values_of_a_stamp_are_a_sample_and_unchanged_fields_stay() -> None:
     samples.add("a", 10, 1.0, 0.0)
     samples.add("b", 10, 2.0, 0.1)
     samples.add("a", 20, 3.0, 0.2)
-    # the sample at 20 waits, because its value of b may still come
+    # the sample at 20 waits, because its value of b may still arrive
     assert samples.take(0.3) == [(10, {"a": 1.0, "b": 2.0})]
     samples.add("b", 30, 4.0, 0.4)
     samples.add("a", 30, 5.0, 0.4)
     assert samples.take(0.5) == [(20, {"a": 3.0, "b": 2.0}), (30, {"a": 5.0, "b": 4.0})]
     samples.add("b", 40, NOT_MEASURED, 0.6)
     assert samples.take(0.7) == [] and samples.take(1.7) == [(40, {"a": 5.0, "b": NOT_MEASURED})]
-    # this value is late: at its time, the value of b is no longer known, so it gives no sample
+    # this value is late: the value of b at its stamp is no longer stored, so there is no sample
     samples.add("a", 35, 6.0, 2.0)
     samples.add("b", 25, 7.0, 2.0)
     samples.add("a", 25, 8.0, 2.0)
     assert samples.take(2.1) == [(25, {"a": 8.0, "b": 7.0})]
     assert samples.take(9.0) == []
     assert samples.take_incomplete() == 1
-    samples.add("b", 40, 9.0, 9.0)  # the value of b at 40 came before, and is sent again
+    samples.add("b", 40, 9.0, 9.0)  # the value of b at 40 is repeated
     assert samples.take(99.0) == []
     # a value with an impossible stamp changes nothing
     samples.add_stray("a", 10**18, 1.0, 9.0)
@@ -221,7 +221,7 @@ def test_samples_come_with_the_sources_stamps_and_bad_values_are_counted(server:
         assert (stamp_ns, values["fx"]) == (start_ns + 77 * MS, pytest.approx(1e3 * _rows(start_ns, 77, 78)[0][1]))
         for index, status in ((200, "BadSensorFailure"), (201, "UncertainLastUsableValue"), (202, "GoodClamped")):
             server.do("rows", _rows(start_ns, index, index + 1), status=status)
-        server.do("write", start_ns + 203 * MS, [None, 7.0, None])  # the other values have not changed
+        server.do("write", start_ns + 203 * MS, [None, 7.0, None])  # the other values are unchanged
         *bad, good, last = (
             roles["excitation"].read(found)[1] for found in _until(bridge, lambda found: len(found) >= 4)
         )
@@ -255,7 +255,7 @@ def test_the_server_s_grants_are_compared_with_the_requests() -> None:
 def test_a_minute_without_a_connection_is_filled_and_ends_in_the_digest_of_the_uninterrupted_run(
     server: Plant, tmp_path: Path
 ) -> None:
-    """During the break the model follows the hold policy; after the break it goes back to the end of the samples."""
+    """During the break, the hold policy drives the model. After the break, the model goes back to the last sample."""
     (tmp_path / "map.yaml").write_text(MAP)
     run, step_ns = tmp_path / "run", 10 * MS
     start_ns = time.time_ns() // MS * MS - 63_000 * MS
@@ -296,7 +296,7 @@ def test_a_break_without_history_is_a_loss(server: Plant, roles: Any) -> None:
     with _bridge(server, roles) as bridge:
         server.do("rows", _rows(start_ns, 0, 10))
         _until(bridge, lambda found: start_ns + 9 * MS in _stamps(found))
-        # a single stamp that is a year ahead is passed on, and does not shorten the break
+        # a single stamp that is a year ahead is passed on, but does not end the break
         year_ns = start_ns + 31_536_000 * 1000 * MS
         server.do("rows", _rows(year_ns, 9, 10), keep=False)
         _until(bridge, lambda found: year_ns + 9 * MS in _stamps(found))
@@ -333,7 +333,7 @@ def test_a_history_that_lies_is_not_believed(kind: str, roles: Any) -> None:
             facts = bridge.part()[2]
             assert ((facts["history_strays"] != "0") is (kind == "future")) and bridge.lost == 1
             assert kind == "future" or "history" in facts["no_history"]
-            # the server's clock is put back by an hour
+            # the clock of the server steps back by an hour
             plant.do("rows", _rows(start_ns - 3_600_000 * MS, 0, 5))
             found = _until(bridge, lambda found: len(found) >= 5)
             assert _stamps(found) == [start_ns - 3_600_000 * MS + index * MS for index in range(5)]
@@ -460,7 +460,7 @@ def test_a_user_signs_in_by_certificate_and_no_other_one_does(
             assert len(_until(bridge, lambda found: len(found) >= 5)) >= 5
         finally:
             bridge.close()
-    # a certificate is refused if it was copied by someone who does not have its key
+    # the client has a copied certificate, but not its key
     stolen = replace(access, user_certificate=certificates / "user.pem", user_key=certificates / "other.key.pem")
     bridge = OpcUa(stolen, roles)
     with pytest.raises(BridgeError, match="refused"):

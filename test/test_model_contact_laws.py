@@ -1,4 +1,4 @@
-"""Contact laws: closed forms, the exact restitution, and the series against the value."""
+"""Contact laws: closed forms, the exact restitution, and the series compared with the formula."""
 
 from __future__ import annotations
 
@@ -22,13 +22,11 @@ from plow_twin.scene_file.presets import config_folder
 
 @kernel(entry=True)
 def normal_force(*numbers: float) -> float:
-    """Call the kernel of this name."""
     return contact.normal_force(*numbers)
 
 
 @kernel(entry=True)
 def free_force(*numbers: float) -> float:
-    """Call the kernel of this name."""
     return contact.free_force(*numbers)
 
 
@@ -48,7 +46,7 @@ def test_exact_damping_factor_satisfies_its_identity(e: float) -> None:
 
 
 def test_nearly_elastic_damping_is_its_series() -> None:
-    """D = 3/2 x (1 + x + ..) with x = 1 - e, where the identity's residual is lost in rounding."""
+    """D = 3/2 x (1 + x + ..) with x = 1 - e, for which rounding errors dominate the residual of the identity."""
     for x in 10.0 ** np.linspace(-15.0, -4.0, 45):
         e = 1.0 - x
         assert exact_damping_number(e) == pytest.approx(1.5 * (1.0 - e) * (2.0 - e), rel=1e-6)

@@ -1,4 +1,4 @@
-"""Geometry: the signed penetration against the paper's test, rates against differences, and the senses of contact."""
+"""Geometry: signed penetration compared with the paper's test, rates with differences, and directions of contacts."""
 
 from __future__ import annotations
 
@@ -25,12 +25,14 @@ def penetration(scene: Scene, q: np.ndarray) -> np.ndarray:
 
 
 def distance_sum_excess(scene: Scene, q: np.ndarray, pair: int) -> float:
-    """Return the paper's test (eq. 2): the corner's distances to the wall and to the opposite wall, minus the side."""
+    """Return the value of the paper's test (eq. 2): the sum of the distances to the wall and its opposite, minus the
+    side.
+    """
     width = scene.frame.width_m + scene.clearance.horizontal_m
     height = scene.frame.height_m + scene.clearance.vertical_m
     x, y, theta = q
     rotation = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
-    corners = {  # corners of the cavity, moved as in the paper's eq. (1)
+    corners = {  # corners of the cavity, moved by eq. (1) of the paper
         (sx, sy): rotation @ np.array([sx * width / 2, sy * height / 2]) + [x, y] for sx in (-1, 1) for sy in (-1, 1)
     }
     point = np.array([CORNER_X[pair] * scene.frame.width_m / 2, CORNER_Y[pair] * scene.frame.height_m / 2])
@@ -57,7 +59,7 @@ def test_the_papers_distance_sum_exceeds_the_side_by_twice_the_penetration(x: fl
 
 
 def _opposite_depth(scene: Scene, q: np.ndarray, pair: int) -> float:
-    """Return the depth of the corner past the opposite wall, the other side of the strip."""
+    """Return the depth of the corner behind the opposite wall of the strip."""
     size = scene.frame.height_m + scene.clearance.vertical_m
     if NORMAL_X[pair] != 0.0:
         size = scene.frame.width_m + scene.clearance.horizontal_m

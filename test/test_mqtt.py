@@ -35,16 +35,16 @@ from plow_twin.stream.journal import Digest
 from plow_twin.telemetry.mqtt import Broker, Message
 from plow_twin.telemetry.sparkplug import Payload
 
-#: Version of the broker. If the broker is older than 0.12, it closes a connection that it refuses.
+#: Version of the broker. Versions before 0.12 close connections that they refuse.
 AMQTT = tuple(map(int, version("amqtt").split(".")[:2]))
 STALE = ("--set", "excitation_timeout=3600")
 
 
 def _hash(password: str) -> str:
-    """Return a password in the form in which the broker's library keeps it."""
+    """Return the hash of a password in the format of the broker's library."""
     try:
         from pwdlib import PasswordHash
-    except ModuleNotFoundError:  # before amqtt 0.12
+    except ModuleNotFoundError:  # amqtt before 0.12
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)
             from passlib.apps import custom_app_context
@@ -55,7 +55,7 @@ def _hash(password: str) -> str:
 
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Access]:
-    """Yield a broker with TLS and one user, for whom it keeps messages during absence."""
+    """Yield a broker with TLS and one user, for whom it stores messages during a disconnection."""
     certificate, key = tmp_path / "broker.pem", tmp_path / "broker.key"
     subprocess.run(
         ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2",
@@ -90,7 +90,7 @@ def broker(tmp_path: Path) -> Iterator[Access]:
 
 
 class Subscriber:
-    """A client that receives all topics in order of arrival."""
+    """A client that stores the messages of all topics in order of arrival."""
 
     def __init__(self, port: int, access: Access | None = None, topics: str = "#") -> None:
         self.messages: list[tuple[str, bytes, bool]] = []
@@ -122,7 +122,7 @@ class Subscriber:
 
 
 class Sender:
-    """A telemetry box that sends numbered samples to the broker."""
+    """A telemetry device that sends numbered samples to the broker."""
 
     def __init__(self, access: Access) -> None:
         self.client = make_client("", clean=True)
@@ -161,7 +161,7 @@ def test_a_broker_keeps_messages_for_an_absent_twin_and_garbage_is_counted(broke
     )
     sender = Sender(broker)
     old = {"t": 3.0, "force": {"x": 1.0, "y": 1.0}, "moment": 1.0, "n": 9000}
-    # this message was sent before the twin began, so its sequence number starts no count
+    # this message was sent before the start of the twin, so the count of numbers does not begin with it
     sender.raw(json.dumps(old).encode(), retain=True)
     with _live(*arguments) as live:
         live.until_count("dropped_inactive", 1)
@@ -175,13 +175,13 @@ def test_a_broker_keeps_messages_for_an_absent_twin_and_garbage_is_counted(broke
     sender.send(50)
     with _live(*arguments) as live:
         values = live.until_count("samples_used", 50)
-        # the broker also keeps the empty message that removes the retained one
+        # the broker also delivers the empty message that removes the retained message
         assert (values["samples_lost"], values["dropped_malformed"]) == ("0", "1")
         assert live.stop() == 3
     sender.close()
 
 
-# paho leaves the socket of a failed handshake to the garbage collector
+# paho does not close the socket of a failed handshake; the garbage collector does
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_misspelt_topic_of_a_broker_is_no_success(
     broker: Access, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -193,10 +193,10 @@ def test_a_misspelt_topic_of_a_broker_is_no_success(
     arguments = ["live", broker.url, "--map", str(mapping), "--scene", "paper", "--seconds", "1", "--quiet"]
     assert run_cli([*arguments, *access]) == 3
     assert "no sample came on plough/mistaken" in capsys.readouterr().err
-    gc.collect()  # the socket is collected here, where its warning is ignored, and not during another test
+    gc.collect()  # the socket is closed here, where its warning is ignored, and not during another test
 
 
-# paho drops the socket of a failed handshake, and leaves closing it to the garbage collector
+# paho does not close the socket of a failed handshake; the garbage collector does
 @pytest.mark.filterwarnings("ignore:unclosed <ssl.SSLSocket:ResourceWarning")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_wrong_password_a_strange_certificate_and_a_broker_without_tls_are_refused(broker: Access) -> None:
@@ -218,7 +218,7 @@ def test_a_wrong_password_a_strange_certificate_and_a_broker_without_tls_are_ref
 
 @contextmanager
 def _hostile(*answers: bytes) -> Iterator[Access]:
-    """Yield a broker that gives these answers to the packets of each connection, and closes it at the next packet."""
+    """Yield a broker that answers the packets of each connection by `answers`, and closes it at the next packet."""
     listening = socket.create_server(("127.0.0.1", 0))
 
     def serve() -> None:
@@ -290,7 +290,7 @@ def _until(reached: Callable[[], bool], seen: object = None) -> None:
 
 @contextmanager
 def _open_broker(folder: Path, port: int) -> Iterator[None]:
-    """Yield a broker without TLS that admits everybody."""
+    """Yield a broker without TLS and without login."""
     config = {
         "listeners": {"default": {"type": "tcp", "bind": f"127.0.0.1:{port}"}},
         "plugins": {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}},
@@ -317,7 +317,7 @@ def test_a_broker_gets_all_groups_with_tls_and_says_when_the_twin_has_died(broke
         live.until_count("samples_used", 1500)
         live.until(lambda heard: heard.get("mqtt_out", {}).get("values", {}).get("sent", 0) > 8, "sent")
         assert broker.password not in Path(f"/proc/{live.process.pid}/cmdline").read_text()
-        # a late subscriber gets the newest message of each topic except the peaks, which are over
+        # a late subscriber gets the newest message of each topic except the peaks, which are not retained
         late = Subscriber(port, broker)
         late.until(lambda: late.newest("face/plough/alarms") is not None and len(late.messages) >= 7)
         groups = {"clearance", "wear", "life", "flags", "status", "alarms", "online"}
@@ -402,7 +402,7 @@ def test_messages_that_wait_for_a_broker_are_bounded_counted_and_come_in_order(t
 
 
 class EdgeNode:
-    """The messages of the node `mine/plough` at a Sparkplug B host."""
+    """The messages of the node `mine/plough`, as a Sparkplug B host receives them."""
 
     def __init__(self, port: int) -> None:
         self.subscriber = Subscriber(port, topics="spBv1.0/#")
@@ -416,8 +416,7 @@ class EdgeNode:
         return self.messages(kind)[count - 1]
 
     def ask_for_rebirth(self) -> None:
-        # field 2 of the payload is a metric; its fields are the name (1), the data type (4), here boolean, and the
-        # value (14)
+        # field 2 of the payload is a metric with name (1), data type (4, here boolean) and value (14)
         name = b"Node Control/Rebirth"
         metric = bytes([0x0A, len(name)]) + name + bytes([0x20, 11, 0x70, 1])
         for payload in (b"\xff\xff", bytes([0x12, len(metric)]) + metric):

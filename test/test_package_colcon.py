@@ -1,4 +1,4 @@
-"""colcon build, with and without links: `ros2 run` and `ros2 launch` find their files, and the programs start."""
+"""colcon build with and without links: `ros2 run` and `ros2 launch` find their files, and the programs start."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_colcon_build_gives_the_layout_of_ros2_run(options: list[str], tmp_path:
         assert installed == {path.name for path in (ROOT / folder).glob(pattern)}
         assert installed
 
-    if not options:  # an installation that copies the files must not refer to the sources
+    if not options:  # without links, the installation must not refer to the sources
         shutil.rmtree(source)
         shutil.rmtree(tmp_path / "build")
 
@@ -57,7 +57,7 @@ def test_colcon_build_gives_the_layout_of_ros2_run(options: list[str], tmp_path:
 
 #: Files that use ROS.
 OF_ROS = ("launch", "plow_twin/ros", "plow_twin/demo", "setup.py")
-#: ament's linters, with our line width and docstring style.
+#: The linters of ament, with the line width and docstring style of this project.
 LINTERS = (
     ("ament_xmllint", "package.xml", "config"),
     ("ament_flake8", "--linelength", "120", *OF_ROS),

@@ -40,7 +40,8 @@ def test_a_wheel_holds_package_data_executables_and_metadata(tmp_path: Path, ver
         "plow-twin", "plow-twin-node", "plow-twin-publisher"
     ]  # fmt: skip
     assert metadata["Description-Content-Type"] == "text/markdown" and "# plow_twin" in metadata.get_payload()
-    assert metadata["Requires-Python"] == ">=3.11,<3.13"  # pip refuses to install on another version and says why
+    # pip refuses to install for another version and names this requirement
+    assert metadata["Requires-Python"] == ">=3.11,<3.13"
     assert any("Python :: 3.12" in classifier for classifier in metadata.get_all("Classifier"))
     assert any(name.endswith("LICENSE") for name in names)
 

@@ -1,4 +1,4 @@
-"""The package in separate environments: with numpy, scipy and numba alone, and with all base dependencies."""
+"""The package in separate environments: with numpy, scipy and numba only, and with all base dependencies."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory, wheel: Path) -> Path:
-    """Return an environment, first with the core's three libraries, later with all base dependencies."""
+    """Return an environment, which first contains the three libraries of the core, and later all base dependencies."""
     folder = tmp_path_factory.mktemp("environment")
     python = make_environment(folder / "venv", "numpy", "scipy", "numba")
     install(python, "--no-deps", str(wheel))
@@ -68,7 +68,8 @@ def test_model_and_twin_need_numpy_scipy_and_numba_alone(environment: Path, tmp_
     assert Path(answer["file"]).is_relative_to(environment.parent.parent)
     fall = np.arange(5) * 0.1
     np.testing.assert_allclose(answer["y"][:5], -0.5 * 9.81 * fall**2, atol=1e-9)
-    assert answer["makes"] == 2  # in this second the cavity's top meets both upper corners of the frame once
+    # in the first second, the top of the cavity touches both upper corners of the frame once
+    assert answer["makes"] == 2
     assert answer["twin"] == pytest.approx(answer["y"][-1], abs=1e-8)
 
 
@@ -80,7 +81,7 @@ def test_pip_install_brings_the_command_and_the_presets(environment: Path, wheel
         "twin",
         "excitation_publisher",
     } & found
-    for name in ("twin", "excitation_publisher"):  # `ros2 run` looks in this folder
+    for name in ("twin", "excitation_publisher"):  # `ros2 run` searches this folder
         assert os.access(prefix / "lib" / "plow_twin" / name, os.X_OK)
     share = prefix / "share"
     assert (share / "ament_index" / "resource_index" / "packages" / "plow_twin").is_file()

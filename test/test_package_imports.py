@@ -1,4 +1,4 @@
-"""The subpackages: permitted imports between them, and permitted libraries."""
+"""Permitted imports between the subpackages, and the libraries that each subpackage may import."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "plow_twin"
 
 SOLVER = {"errors", "kernel", "model", "solve"}
 CORE = SOLVER | {"run"}
-#: For each subpackage, the subpackages that it may import.
+#: Subpackages that each subpackage may import.
 SUBPACKAGES = {
     "errors": set(),
     "build": set(),
@@ -46,13 +46,13 @@ SUBPACKAGES = {
     "__init__": CORE | {"scene_file", "record", "view"},
     "__main__": {"cli"},
 }
-#: Parts of scipy that may be imported only where they are used. The package scipy itself is always imported, by numba.
+#: Parts of scipy that must be imported lazily. numba always imports the package scipy itself.
 SCIPY = ("scipy.linalg", "scipy.optimize", "scipy.special")
 MESSAGES = {
     f"{name}_msgs"
     for name in ("diagnostic", "geometry", "lifecycle", "nav", "rosgraph", "sensor", "std", "visualization", "tf2")
 }
-#: For each subpackage, the libraries beside numpy that it may import.
+#: Libraries other than numpy that each subpackage may import.
 LIBRARIES = {
     "build": {"numba", "llvmlite"},
     "kernel": {"numba", "llvmlite"},
@@ -95,8 +95,7 @@ LIBRARIES = {
 }
 
 
-#: The study of the paper imports the library. In the library, only the placeholder of the study's verb refers to the
-#: study.
+#: The study of the paper imports the library. Only the placeholder of its command imports the study.
 PAPER_STUDY = PACKAGE.parent / "studies" / "paper" / "plow_twin_paper"
 PAPER_MAY_IMPORT = CORE | {"build", "scene_file", "stream", "record", "view", "study", "cli"}
 
@@ -149,7 +148,8 @@ def _module_name(path: Path) -> str:
 
 
 def _module_imports(path: Path, modules: set[str]) -> set[str]:
-    """Return the package's modules that a module imports, also lazily or for the type checker."""
+    """Return the modules of the package that a module imports, including lazy imports and imports for the type checker.
+    """
     found = set()
     for node in _statements(path):
         if isinstance(node, ast.Import):
@@ -171,13 +171,14 @@ def test_no_module_imports_itself_by_a_detour() -> None:
 
 
 def test_the_cache_stamp_and_the_build_fingerprint_cover_every_kernel() -> None:
-    """A changed kernel that they do not cover would be loaded from the cache, and its build would look unchanged."""
+    """A change in a kernel outside their coverage would load old code from the cache, and not change the fingerprint.
+    """
     compiled = [path for path in _modules() if "plow_twin.kernel.compiler.kernel" in _imported_names(path)]
     assert len(compiled) > 10
     subpackages = {path.relative_to(PACKAGE).parts[0] for path in compiled}
     assert subpackages <= {*KERNEL_FOLDERS} and {*KERNEL_FOLDERS} <= {*NUMERIC_SUBPACKAGES}
     assert all((PACKAGE / subpackage).is_dir() for subpackage in (*KERNEL_FOLDERS, *NUMERIC_SUBPACKAGES))
-    # only one file compiles without the stamp; it calls no kernel of another file, so numba notices its changes
+    # one file compiles without the stamp; it calls no kernel of another file, so numba detects its changes
     direct = {path.relative_to(PACKAGE).as_posix() for path in _modules() if "numba" in {*_imports(path)}}
     assert {name for name in direct if not name.startswith("kernel/")} == {"build.py"}
     unstamped = [path for path in _modules() if "plow_twin.kernel.compiler.kept" in _imported_names(path)]
@@ -223,7 +224,7 @@ def _imported_names(path: Path) -> set[str]:
                 "plow_twin.dashboard",
             },
         ),
-        # the screen's server, a process beside the twin, needs no numeric library
+        # the server of the screen needs no numeric library
         ("import numpy, plow_twin.dashboard.server", {"numba", "scipy", "plow_twin.model.scene", "plow_twin.live"}),
         ("import plow_twin.ros.node", {*SCIPY, "mcap", "rosbags", "rerun"}),
         (
@@ -247,7 +248,7 @@ def test_every_public_name_is_found_and_imported_on_first_use() -> None:
     assert {name for name in dir(plow_twin) if not name.startswith("_")} >= names
     for name in names:
         assert getattr(plow_twin, name) is not None
-    # these names need libraries of an extra, so `__all__` lacks them
+    # these names need optional libraries, so they are not in `__all__`
     assert set(plow_twin.__all__) == names - {"Recording", "read_recording", "plot_motion"}
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         plow_twin.nonsense  # noqa: B018

@@ -1,4 +1,4 @@
-"""Users' files: separator, time, columns and units are guessed, or the message names the option that states them."""
+"""Files of users: separator, time, columns and units are guessed, or the message names the option that sets them."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_a_spreadsheet_s_file_becomes_a_mapping_with_which_the_twin_runs(
     assert cli(run) == 0
     facts = json.loads(capsys.readouterr().out)
     assert (facts["input"]["samples_used"], facts["state"]["model_time_s"]) == ("600", "0.599")
-    # no existing file is overwritten
+    # existing files are not overwritten
     assert cli(["setup", str(file), "--out", str(out)]) == 2 and "is there already" in capsys.readouterr().err
 
 
@@ -118,7 +118,7 @@ def test_loads_far_too_large_for_the_scene_are_refused_before_a_file_is_written(
 
 
 def _in_terminal(folder: Path, *said: bytes) -> tuple[int, str]:
-    """Run `setup own.csv` in a terminal of its own and type an answer at each prompt; return exit code and screen."""
+    """Run `setup own.csv` in a terminal, and type one answer at each prompt. Return exit code and screen."""
     command = [sys.executable, "-m", "plow_twin", "setup", "own.csv", "--out", "out"]
     near, far = pty.openpty()
 
@@ -130,9 +130,9 @@ def _in_terminal(folder: Path, *said: bytes) -> tuple[int, str]:
     )
     os.close(far)
     screen, answers, seen = b"", list(said), 0
-    with suppress(OSError):  # reading fails once the program has closed its side of the terminal
+    with suppress(OSError):  # reading fails after the program has closed its side of the terminal
         while True:
-            # readline may miss a signal that comes just before it waits, so the key is pressed again
+            # readline may miss a signal just before it waits, so the key is pressed again
             while said[-1] == CTRL_C and not answers and not select.select([near], [], [], 5.0)[0]:
                 os.write(near, CTRL_C)
             found = os.read(near, 4096)

@@ -1,4 +1,4 @@
-"""A recording that is read from Python and exported has the messages' numbers, in SI, in every format."""
+"""Numbers read in Python and numbers in each export format equal those of the messages, in SI units."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_losses_of_a_recording_are_known_after_one_reading_of_its_tables(run: Ru
     cut.write_bytes(whole[: len(whole) * 3 // 4])
     alone, read = plow_twin.read_recording(cut), plow_twin.read_recording(cut)
     read["contact_peaks"].numpy()
-    cut.unlink()  # the file is no longer needed, because no byte is read a second time
+    cut.unlink()  # the file is no longer needed: it is not read a second time
     assert read.losses()
     cut.write_bytes(whole[: len(whole) * 3 // 4])
     assert alone.losses() == read.losses()
@@ -115,7 +115,7 @@ def test_an_export_of_a_cut_recording_says_so_and_of_a_place_that_takes_nothing_
     monkeypatch.setattr(Table, "arrow_batch", full)
     assert cli(["export", str(run.folder), "--to", "parquet", "--out", str(tmp_path / "none"), "--quiet"]) == 1
     assert "cannot be written: No space left" in capsys.readouterr().err
-    # no incomplete file is left, because it would look like a whole table
+    # no incomplete file remains, because it would seem complete
     assert not list((tmp_path / "none").iterdir())
     monkeypatch.undo()
     (tmp_path / "file").write_text("")

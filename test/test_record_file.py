@@ -1,4 +1,4 @@
-"""The recorded file: read by other programs, cut anywhere, damaged anywhere; entries are read back exactly."""
+"""The recorded file: read by other programs, truncated and damaged at any place, with exact entries."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ from plow_twin.stream.journal import (
 )
 
 JOURNAL = {Sample: "samples", Digest: "digests"}
-# a journal stores integers with 64 bits
+# a journal stores integers in 64 bits
 whole = st.integers(-(2**63), 2**63 - 1)
 counts = st.integers(1, 2**63 - 1)
 stamps = st.integers(-(2**31) * 10**9, (2**31 - 1) * 10**9)
@@ -86,7 +86,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 def test_every_entry_comes_back_exactly(entry: Entry | Dropped) -> None:
     message = to_message(entry, "slide_frame")
     again = from_message(decode(encode(message), message.TYPE))
-    # repr distinguishes -0.0 from 0.0, and 1 from 1.0 and True, but == does not
+    # repr distinguishes -0.0 from 0.0, and 1 from 1.0 and True; == does not
     assert repr(again) == repr(entry)
 
 
@@ -179,7 +179,7 @@ def test_a_file_cut_anywhere_gives_its_content_before_the_cut(run: Run, tmp_path
         cut_file.write_bytes(data[:cut])
         reader = RunReader(cut_file)
         records = list(reader)
-        # journal and outputs are in separate chunks, so a cut leaves the first records of each
+        # journal and outputs are in separate chunks, so a truncated file contains the first records of each
         for kind in (EntryRecord, OutputRecord):
             found = [record for record in records if isinstance(record, kind)]
             assert found == [record for record in whole if isinstance(record, kind)][: len(found)]
@@ -207,14 +207,14 @@ def test_a_damaged_byte_costs_one_chunk_and_is_reported(run: Run, tmp_path: Path
 
 
 def write_large(source: Path, target: Path, images: int, image_size: int, attachments: int) -> None:
-    """Copy a recording, and add a camera's messages and large attachments, whose bytes are holes in the file."""
+    """Copy a recording, and add messages of a camera and large attachments, whose bytes are holes in a sparse file."""
 
     def text(value: str) -> bytes:
         return struct.pack("<I", len(value)) + value.encode()
 
     data = source.read_bytes()
     head = 8
-    for _ in range(2):  # these two records are skipped: the header of the file, and the header of the run
+    for _ in range(2):  # skip the header of the file and the header of the run
         head += 9 + struct.unpack_from("<Q", data, head + 1)[0]
     schema = struct.pack("<H", 60_000) + text("sensor_msgs/msg/Image") + text("ros2msg") + text("uint8[] data")
     channel = struct.pack("<HH", 60_000, 60_000) + text("/camera") + text("cdr") + struct.pack("<I", 0)
@@ -234,7 +234,7 @@ def write_large(source: Path, target: Path, images: int, image_size: int, attach
 
 
 def check_large(run: Run, folder: Path, images: int, image_size: int, attachments: int) -> int:
-    """Replay such a recording in a process of its own; return the largest memory of the process [B]."""
+    """Replay such a recording in a separate process. Return the peak memory of the process [B]."""
     file = folder / "large.mcap"
     write_large(run.file, file, images, image_size, attachments)
     code = (
@@ -263,7 +263,7 @@ def test_ten_gigabytes_take_the_memory_of_some_chunks(run: Run, tmp_path: Path) 
 
 
 def test_a_file_that_another_program_rewrote_is_a_run(run: Run, tmp_path: Path) -> None:
-    """The run's header is behind the chunks, and is found even without an index at the end."""
+    """The header of the run is behind the chunks. It is found even if the file has no index at its end."""
     file = rewrite(run.file, tmp_path / "anew.mcap", metadata_last=True)
     report = replay(file)
     assert (report.exit_code, report.messages_compared) == (0, replay(run.file).messages_compared)
@@ -317,8 +317,8 @@ def test_the_extra_brings_every_library_that_is_imported(monkeypatch: pytest.Mon
     runpy.run_path("setup.py")
     wanted = [*declared["install_requires"], *declared["extras_require"]["record"]]
     names = {re.split("[^A-Za-z0-9_-]", requirement.replace("PyYAML", "yaml"))[0] for requirement in wanted}
-    names.add("llvmlite")  # llvmlite need not be declared, because numba requires it at a fixed version
-    # these libraries for tables need not be declared, because they are used only if installed
+    names.add("llvmlite")  # numba requires llvmlite at a fixed version, so it need not be declared
+    # these libraries are used only if they are installed, so they need not be declared
     names |= {"pandas", "pyarrow"}
     assert imported - names - sys.stdlib_module_names - {"plow_twin"} == set()
 
@@ -370,7 +370,7 @@ def test_frames_of_lz4_are_read_as_its_library_reads_them() -> None:
         direct = independent_blocks(memoryview(frame), len(content))
         assert direct is None or direct.tobytes() == content
         taken += direct is not None
-    assert taken >= 6  # at least the records that the recorder writes are read directly
+    assert taken >= 6  # at least the kinds of records that the recorder writes are read directly
     whole = np.frombuffer(lz4.frame.compress(contents[4][:5000], block_linked=False), np.uint8)
     for place in range(len(whole)):
         assert independent_blocks(whole[:place].data, 5000) is None

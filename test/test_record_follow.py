@@ -1,4 +1,4 @@
-"""A recording that is read while it is written: its parts, its end, and a writer that is killed."""
+"""A recording that is read during its recording: its parts, its end, and a writer that is killed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The messages of a recording's files in one order: by the stamps of their roles, keeping each file's order."""
+"""The messages of several files are merged by the stamps of their roles, without a change of the order in a file."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ def order(*streams: Iterator[Arrived]) -> list[tuple[str, float | None]]:
     ("one", "other", "expected"),
     [
         ((1, 3, 5), (2, 4), "ababa"),
-        ((1, None, 5), (2, 4), "aabba"),  # a message without a stamp stays in its place
+        ((1, None, 5), (2, 4), "aabba"),  # a message without a stamp remains at its place
         ((1, 3, 2.9, 5), (2, 4), "abaaba"),  # a late message
         ((10, 12, 1, 13, 15), (11, 14), "abaaaba"),  # a wrong stamp in the past
         ((10, 12, 99, 13, 15), (11, 14), "abaaaba"),  # a wrong stamp in the future
-        ((10, 12, 2, 4), (11, 3), "abaaba"),  # in both files the clock steps back
+        ((10, 12, 2, 4), (11, 3), "abaaba"),  # the clock steps back in both files
         ((-4, -3, 5), (-3.5, 0), "ababa"),
     ],
 )

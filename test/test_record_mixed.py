@@ -1,4 +1,4 @@
-"""For any input in any order, a replay of the recording gives every message and every alarm of the live run."""
+"""For all inputs in any order, a replay of the recording gives all messages and alarms of the live run."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ SCENE = replace(load_scene(scene_path("paper")), wear=WEAR)
 T0 = 1_795_000_000_000_000_000
 MS = NS_PER_S // 1000
 NOTHING = (0.0, 0.0, 0.0)
-#: with such a load no advance succeeds
+#: with this load, every advance fails
 ABSURD = (1e200, -1e200, 1e200)
 NAMES = {topic.name: f"/{topic.name}" for topic in TOPICS}
 
 
 class Front:
-    """A front that receives and keeps the messages."""
+    """A front end that stores the messages."""
 
     name, topics, follows_samples, sends_motion = "/plow_twin", NAMES, True, True
 
@@ -76,7 +76,7 @@ class Front:
 
 
 class Mixed:
-    """A recorded live twin, driven by calls at times `ms` of a steady clock."""
+    """A recorded live twin. The calls have times `ms` of a steady clock."""
 
     def __init__(self, folder: Path, **values: Any) -> None:
         self.settings = parameters.settings({"record_path": str(folder / "run")} | values)
@@ -87,7 +87,7 @@ class Mixed:
         bound = self.settings.max_evaluations or None
         twin = Twin(SCENE, tol=self.settings.tolerance, excitation="sampled", max_evaluations=bound)
         session = Session(twin, on_entry=self.recording.recorder.journal, rollback_span_s=self.settings.rollback_span)
-        # the input has no limits, so an absurd load reaches the model and its advance may fail
+        # the input has no limits, so an absurd load reaches the model and makes an advance fail
         intake = Intake(jump_back_s=60.0)
         every_sample = self.settings.publish_mode == "on_sample"
         self.driver = Driver(session, intake, policy(self.settings), every_sample=every_sample)
@@ -172,7 +172,7 @@ def test_after_a_hold_and_a_reset_samples_are_not_taken_for_held(tmp_path: Path)
 @pytest.mark.parametrize("hold", ["hold", "zero"])
 def test_a_blow_before_a_hold_raises_an_alarm_and_a_blow_in_the_hold_does_not(hold: str, tmp_path: Path) -> None:
     live = Mixed(tmp_path, publish_mode="fixed_rate", alarm_force=[6e4, 1e9], excitation_timeout=0.05, hold_policy=hold)
-    # after a short push the head continues without a sample until it meets the frame
+    # after a short push, the head moves on without samples until it meets the frame
     live.send(*(_at(index, (0.0, 40e3, 0.0)) for index in range(20)))
     live.publish_due()
     for _ in range(10):
@@ -220,7 +220,7 @@ def test_late_samples_at_the_edge_of_the_memory_give_the_same_however_they_came(
 
 
 def test_a_late_speed_at_the_edge_of_the_memory_acts_where_it_did(tmp_path: Path) -> None:
-    """A replay keeps no intermediate states, so whether a speed is too old must not depend on the stored states."""
+    """A replay has no intermediate states. They must not determine whether a speed is too old."""
     live = Mixed(tmp_path, rollback_span=0.1)
     live.send(*map(_swinging, range(300)))
     for ms in (50, 190, 198, 199, 201):
@@ -255,7 +255,7 @@ def _drive(live: Mixed, random: Random, calls: int) -> None:
             case "samples":
                 count = random.choice([1, 1, 2, 5, 40])
                 arriving = [_swinging(index + offset) for offset in range(count)]
-                if random.random() < 0.2 and skipped:  # late samples may come along with the new ones, in any order
+                if random.random() < 0.2 and skipped:  # late samples may arrive together with new samples, in any order
                     arriving += [_swinging(ms) for ms in skipped[-3:]]
                     del skipped[-3:]
                     random.shuffle(arriving)
@@ -268,7 +268,7 @@ def _drive(live: Mixed, random: Random, calls: int) -> None:
                 skipped += range(index, index + gap)
                 index += gap
             case "late" if skipped:
-                # the stamps of these samples are at the edge of the time that the twin remembers
+                # the stamps of these samples are at the limit of the time that the twin can go back
                 near = [ms for ms in skipped if abs(index - ms - span_ms) < 20]
                 chosen = near or random.sample(skipped, min(len(skipped), random.choice([1, 1, 4])))
                 skipped = [ms for ms in skipped if ms not in chosen]

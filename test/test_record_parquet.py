@@ -1,4 +1,4 @@
-"""Parquet instead of CSV: the same numbers, times of any zone, and files that are too large when unpacked."""
+"""Parquet instead of CSV files: equal numbers, times in any zone, and files that are too large when unpacked."""
 
 from __future__ import annotations
 
@@ -54,7 +54,6 @@ def _table(count: int, kind: pa.DataType = UTC_NS) -> pa.Table:
 
 
 def _samples(run: Path) -> list[tuple[int, list[float]]]:
-    """Return the samples of a journal."""
     parts = [batch.entries.samples() for batch in RunReader(run).batches(outputs=False)]
     return [row for stamps, wrench in parts for row in zip(stamps.tolist(), wrench.tolist(), strict=True)]
 
@@ -103,7 +102,7 @@ def test_instants_are_the_same_in_each_zone_and_naive_times_are_utc(tmp_path: Pa
             assert [stamp for name, stamp, _ in read if name == "excitation"] == (stamps * precision_ns).tolist()
             found.append([(name, values["fx"]) for name, _, values in read if name == "excitation"])
     assert all(rows == found[0] for rows in found)
-    # dates as texts give the same times
+    # dates as texts give equal times
     assert time_ns("2026-01-02T03:03:19.123456789Z") == time_ns("2026-01-02 04:03:19.123456789+01:00") == BEGIN_NS
     assert time_ns("2026-01-02 03:03:19.1234567") == BEGIN_NS - 89
     assert time_ns("2026-01-02T03:03:19.123Z") == BEGIN_NS - 456_789
@@ -147,7 +146,7 @@ def test_the_estimates_folder_calibration_and_setup_take_parquet(
     np.testing.assert_array_equal(found[0].poses, found[1].poses)
     assert len(found[0].load) == 200 and np.isnan(found[0].poses[:, 2]).all() and not found[0].unreadable
     (tmp_path / "c" / "load.csv").rename(tmp_path / "c" / "excitation.csv")
-    # if there are too many rows, the newest are kept, and the others are counted
+    # if there are too many rows, the newest are used, and the others are counted
     with monkeypatch.context() as patched:
         patched.setattr(measured, "MOST_ROWS", 50)
         newest = read_measured(tmp_path / "p", Path("paper")), read_recording(tmp_path / "c", Path("paper"))
@@ -189,7 +188,7 @@ def test_an_analysis_reads_a_folder_of_parquet_files(tmp_path: Path, capsys: pyt
     assert cli(["analyse", str(tmp_path / "plant"), *words]) == 0
     whole = json.loads(capsys.readouterr().out)
     assert whole["signals"] and whole["input"]["samples_used"] == 2000 and not whole["lossy"]
-    # every tenth pose has no value, which counts as a loss, so the exit code is 3
+    # every tenth pose has no value, which is a loss, so the exit code is 3
     assert cli(["live", str(tmp_path / "plant"), *words]) == 3
     assert json.loads(capsys.readouterr().out)["input"]["samples_used"] == "2000"
 

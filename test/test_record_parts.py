@@ -40,7 +40,7 @@ from plow_twin.stream.session import Session
 from plow_twin.study.analysis.analyse import analyse
 
 COUNT = 3000
-#: Options that split a run of `COUNT` samples into several parts.
+#: Options that divide a run of `COUNT` samples into several parts.
 SMALL: dict[str, Any] = {"part_bytes": 200_000, "flush_period_s": 0.01, "chunk_size": 50_000}
 
 
@@ -97,7 +97,7 @@ def test_a_recording_that_was_cut_off_is_repaired(share: float, tmp_path: Path) 
     assert repair(run.folder) == [run.file]
     after = examine(run.folder)
     assert after.problems == [] and after.status == FileStatus.COMPLETE.value
-    # the repaired file has every record that could be read before, but not always in the same order
+    # the repaired file contains every record that could be read before, but not always in the same order
     assert {repr(record) for record in RunReader(run.folder)} == {repr(record) for record in found}
     assert replay(run.folder).exit_code == 0
     with AnyReader([run.folder]) as reader:
@@ -117,7 +117,7 @@ def test_a_damaged_chunk_is_left_out_by_a_repair_and_the_gap_is_named(tmp_path: 
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), chunk_size=50_000)
     whole, spans = run.file.read_bytes(), chunk_spans(run.file)
     assert len(spans) > 6
-    for start, length in spans[2:6]:  # these are chunks of the journal and of outputs
+    for start, length in spans[2:6]:  # these are chunks of the journal and of the outputs
         data = bytearray(whole)
         data[start + length // 2] ^= 0xFF
         run.file.write_bytes(data)
@@ -156,9 +156,9 @@ def test_a_repair_keeps_every_old_file_and_lists_every_part(tmp_path: Path) -> N
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), **SMALL)
     parts = RunReader(run.folder).parts
     old = [parts[1].read_bytes()[:-1000]]
-    for _ in range(2):  # the file is cut, repaired and cut again
+    for _ in range(2):  # the file is truncated, repaired and truncated again
         parts[1].write_bytes(old[-1])
-        assert repair(parts[1]) == [parts[1]]  # one of several parts can be repaired alone
+        assert repair(parts[1]) == [parts[1]]  # a single part of a run can be repaired
         assert listed_parts(run.folder) == [part.name for part in parts]
         old.append(parts[1].read_bytes()[:-2000])
     kept = [parts[1].with_name(f"{parts[1].name}.damaged{ending}") for ending in ("", "_2")]
@@ -172,7 +172,7 @@ def test_topics_recorded_beside_a_run_are_examined_and_repaired(tmp_path: Path) 
     for index in range(100):
         writer.add(number, index, index, index, bytes(12))
         writer.flush()
-    writer.lost["/level"] = 7  # losses that the recorder has counted, as on a full disk
+    writer.lost["/level"] = 7  # losses that the recorder has counted, for example on a full disk
     writer.close()
     lost = "beside: 7 lost on /level, as counted by the recorder"
     assert examine(run.folder).problems == [lost]
@@ -182,7 +182,7 @@ def test_topics_recorded_beside_a_run_are_examined_and_repaired(tmp_path: Path) 
     with writer.path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None and summary.statistics is not None and summary.statistics.message_count > 5
-    # the type belongs to another package, so its hash is unknown and is written as zeros
+    # the type belongs to another package, so its hash is unknown and zeros are written
     assert summary.channels[1].metadata["topic_type_hash"] == "RIHS01_" + 64 * "0"
     assert "own/msg/Level" in (writer.folder / "metadata.yaml").read_text()
 
@@ -206,7 +206,7 @@ def test_a_part_that_stands_there_twice_is_named_and_read_once(tmp_path: Path) -
 
 
 def test_a_part_of_another_run_is_named_and_not_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Runs of one scene and node differ only by their identity."""
+    """Runs of one scene and node differ only in their random id."""
     run, other = (record_run(tmp_path / name, map(paper_sample, range(COUNT)), **SMALL) for name in ("run", "other"))
     parts = RunReader(run.folder).parts
     assert {RunReader(part).header.run_id for part in parts} == {RunReader(run.folder).header.run_id}
@@ -238,7 +238,7 @@ def test_a_stretch_that_stands_there_twice_is_counted_and_used_once(tmp_path: Pa
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), chunk_size=50_000)
     whole, spans = run.file.read_bytes(), chunk_spans(run.file)
     before = replay(run.folder)
-    head = 9 + 3 * 8 + 2 * 4 + len("zstd") + 8  # number of bytes of a chunk's record before its data
+    head = 9 + 3 * 8 + 2 * 4 + len("zstd") + 8  # number of bytes in the record of a chunk before its data
     # the repeated bytes begin with a journal chunk and end before an outputs chunk
     begin, end = spans[2][0] - head, spans[8][0] - head
     run.file.write_bytes(whole[:end] + whole[begin:end] + whole[end:])
@@ -253,7 +253,7 @@ def test_a_full_disk_is_named_and_a_repair_leaves_nothing_half_done(tmp_path: Pa
     run.file.write_bytes(run.file.read_bytes()[:-1000])
     there = sorted(run.folder.iterdir())
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))  # a write beyond this size fails as on a full disk
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))  # a write beyond this size fails, as on a full disk
     try:
         with pytest.raises(OSError, match="too large") as error:
             repair(run.folder)
@@ -275,7 +275,7 @@ def test_a_full_disk_ends_the_writing_of_a_replay_by_name(tmp_path: Path, capsys
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     said = capsys.readouterr().err
     assert str(full / "full_0.mcap") in said and "too large" in said and "Traceback" not in said
-    # the part that was written is a recording that is cut off, and the source is unchanged
+    # the written part is a truncated recording, and the source is unchanged
     assert run.file.read_bytes() == before and (full / "full_0.mcap").stat().st_size <= 200_000
     report = replay(full)
     assert (report.exit_code, report.status, report.divergences) == (3, FileStatus.TRUNCATED, 0)
@@ -332,7 +332,7 @@ def test_a_part_that_is_not_there_is_counted_and_no_load_drawn_over_its_hole(whi
     whole = analyse(run.folder)
     assert not whole.lossy and not read_recording(run.folder)[1]
     RunReader(run.folder).parts[which].unlink()
-    for listing in (True, False):  # without a listing, the parts' numbers show only a missing part in the middle
+    for listing in (True, False):  # without a listing, the numbers of the parts show only a missing part in the middle
         report, found, (facts, lossy) = replay(run.folder), analyse(run.folder), read_recording(run.folder)
         problems = examine(run.folder).problems
         if listing or which == 1:
@@ -344,25 +344,25 @@ def test_a_part_that_is_not_there_is_counted_and_no_load_drawn_over_its_hole(whi
         (run.folder / "metadata.yaml").unlink(missing_ok=True)
     assert found.input["samples_used"] == report.samples < COUNT
     times = np.diff(found.predictions[0].series()[0])
-    assert times.max() == 1_000_000  # none is missing among the rows that are left
+    assert times.max() == 1_000_000  # no row is missing among the remaining rows
     assert found.predictions[0].loads.duration_s < whole.predictions[0].loads.duration_s
 
 
 def test_parts_that_are_removed_while_others_are_read_are_passed_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If the oldest parts are removed (`record_keep_mb`), a reader may be slower than the recorder."""
-    # batches are so small that the reader takes the parts one by one
+    """With `record_keep_mb`, the oldest parts are removed, possibly before a slow reader has read them."""
+    # the batches are so small that the reader reads the parts one by one
     monkeypatch.setattr("plow_twin.record.reader._LEAST", 1)
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), **SMALL)
-    (run.folder / "metadata.yaml").unlink()  # without metadata.yaml the run looks as if it still went on
+    (run.folder / "metadata.yaml").unlink()  # without metadata.yaml, the run seems to be in progress
     parts = RunReader(run.folder).parts
     assert len(parts) >= 4
     reader = RunReader(run.folder)
     parts[0].unlink()
     records = iter(reader)
     first = next(records)
-    parts[1].unlink()  # the reader has this part open already, so it still reads the part to its end
+    parts[1].unlink()  # the reader has already opened this part, so it reads the part to its end
     parts[2].unlink()
     assert isinstance(first.entry, Snapshot)  # type: ignore[union-attr]
     assert len(list(records)) < sum(reader.counts.values()) < COUNT * 4
@@ -394,7 +394,7 @@ def test_estimate_and_forecast_report_missing_parts_and_rows_beyond_the_limit(
 
 
 def test_an_estimate_draws_no_load_over_a_damaged_chunk(tmp_path: Path) -> None:
-    """The gap is known, although it is shorter than half a second, the shortest silence."""
+    """The gap is detected although it is shorter than half a second, the shortest silence."""
     poses = [Pose(paper_sample(index).stamp_ns, (0.0, 0.0, 0.0)) for index in range(0, COUNT, 10)]
     entries = [entry for index in range(COUNT) for entry in (paper_sample(index), *poses[index : index + 1])]
     run = record_run(tmp_path / "run", entries, frame_every=10**9, flush_period_s=0.01)
@@ -409,7 +409,7 @@ def test_an_estimate_draws_no_load_over_a_damaged_chunk(tmp_path: Path) -> None:
     assert apart.max() == pytest.approx(1e-3, abs=1e-6) and found.lost["damaged_chunks"] == 1
     kept, aside = len(found.load), found.lost["samples_of_other_stretches"]
     assert kept > COUNT // 2 and 0 < aside < COUNT - kept and 0.02 < 1e-3 * (COUNT - kept - aside) < 0.5
-    assert found.load[0, 0] > 0.0  # times start at the first sample of the whole recording
+    assert found.load[0, 0] > 0.0  # times are counted from the first sample of the whole recording
 
 
 def test_a_part_of_a_foreign_recording_that_is_not_there_is_counted(tmp_path: Path) -> None:

@@ -132,8 +132,8 @@ def belt(speed: float) -> tuple[Scene, Slider]:
     """
     stiffness, deep, wide, static, kinetic, omega = 1e6, 1e-3, 0.02, 0.5, 0.3, 0.05
     friction = Friction(kinetic, stick_stiffness_n_m=1e7, static_coefficient=static)
-    # the four side pairs are the spring: both walls stay penetrated, which gives a force of 4 K x; the friction of
-    # these pairs acts along y, in which nothing moves
+    # the four side pairs act as a spring: both walls remain penetrated, which gives a force of 4 K x. The friction of
+    # these pairs acts along y, in which nothing moves.
     pull = 4.0 * stiffness * speed
     scene = Scene(
         Head(MASS, FIRM), Frame(0.3, 0.3), Clearance(-2.0 * wide, -2.0 * deep),
@@ -154,13 +154,13 @@ def test_a_block_on_a_moving_belt_sticks_and_slips_for_ever() -> None:
 
 
 def test_a_load_below_the_limit_is_held_without_creep() -> None:
-    """The block is pressed back and forth by up to 0.9 mu N. Its displacement is F / k, without creep in 20 periods."""
+    """The block is pressed to and fro by up to 0.9 mu N. Its displacement is F / k, without creep in 20 periods."""
     amplitude, omega = 0.9 * MU * MASS * G, 2.0 * math.pi
     load = Harmonic("pull", (amplitude, 0.0), omega_rad_s=omega)
     scene = replace(block(0.0, 0.0), friction=HELD, loads=(load,))
     result = simulate(scene, 20.0, output_dt=0.05, tol=1e-10, energy_balance=True)
     settled = result.t > 1.0
-    # the motion is a forced oscillation far below the grip's natural frequency
+    # the motion is a forced oscillation far below the natural frequency of the grip
     stiffness, lag = 2.0 * GRIP - MASS * omega**2, 2.0 * HELD_DAMPING * omega
     swing = amplitude / math.hypot(stiffness, lag)
     expected = swing * np.sin(omega * result.t - math.atan2(lag, stiffness))
@@ -169,7 +169,8 @@ def test_a_load_below_the_limit_is_held_without_creep() -> None:
     assert creeping.q[-1, 0] > 1000.0 * swing
 
 
-# this test compiles its own kernels; the quick run has `test_a_corner_grips_at_its_touch_as_with_fixed_steps` instead
+# this test compiles additional kernels; in the quick run, `test_a_corner_grips_at_its_touch_as_with_fixed_steps`
+# replaces it
 @pytest.mark.stress
 @pytest.mark.parametrize("name", ["paper", "bench_hc"])
 def test_fixed_steps_come_to_the_same_motion_and_the_energy_balances(name: str) -> None:
@@ -183,10 +184,10 @@ def test_fixed_steps_come_to_the_same_motion_and_the_energy_balances(name: str) 
     assert pose_error(scene, loose.q, events.q) < 1e-4
 
 
-@pytest.mark.stress  # implicit steps with stick compile kernels of their own
+@pytest.mark.stress  # implicit steps with stick need additional compiled kernels
 @pytest.mark.parametrize("damping", [1e10, 1e7])
 def test_strong_dampers_keep_to_the_tolerance(damping: float) -> None:
-    """A grip with a damper far stronger than its spring needs implicit steps."""
+    """A grip with a damper that is far stronger than its spring needs implicit steps."""
     friction = Friction(MU, stick_stiffness_n_m=GRIP, stick_damping_n_s_m=damping)
     push, omega = 1.3 * MU * MASS * G, 9.0
     scene = replace(block(0.0, 0.0), friction=friction, loads=(Harmonic("pull", (push, 0.0), omega_rad_s=omega),))
@@ -196,14 +197,14 @@ def test_strong_dampers_keep_to_the_tolerance(damping: float) -> None:
 
 
 def test_whether_a_corner_holds_from_its_touch_on_is_not_decided_by_rounding() -> None:
-    """The Kelvin-Voigt force is present from the touch on, so a slack grip holds."""
+    """The Kelvin-Voigt force exists from the touch on, so a grip without tension sticks."""
     scene = replace(preset("bench_kv"), friction=Friction(0.3, stick_stiffness_n_m=5e7))
     loose, tight = (simulate(scene, 1.0, output_dt=0.1, tol=tol, energy_balance=True) for tol in (1e-6, 1e-10))
     assert pose_error(scene, loose.q, tight.q) < 1e-8
 
 
 def test_whether_a_clipped_corner_that_pushes_again_holds_is_not_decided_by_rounding() -> None:
-    """The corner's force begins at zero, where with mu_s > mu both stick and slip are possible."""
+    """The force of the corner begins at zero. With mu_s > mu, both stick and slip are then possible."""
     friction = Friction(0.2, stick_stiffness_n_m=1e8, static_coefficient=0.28)
     scene = replace(
         preset("bench_kv"), contact=Contact("kelvin_voigt", 2.6e9, damping=1e7), friction=friction,
@@ -216,7 +217,7 @@ def test_whether_a_clipped_corner_that_pushes_again_holds_is_not_decided_by_roun
 
 @pytest.mark.parametrize("damping", [1e5, 1e6])
 def test_a_corner_grips_at_its_touch_as_with_fixed_steps(damping: float) -> None:
-    """The Kelvin-Voigt force is present from the touch on.
+    """The Kelvin-Voigt force exists from the touch on.
 
     The corner sticks from the touch on, or slips if its damper is too strong.
     """
@@ -229,7 +230,7 @@ def test_a_corner_grips_at_its_touch_as_with_fixed_steps(damping: float) -> None
 
 
 def test_painleves_case_is_an_impact_without_collision() -> None:
-    """A corner's own friction presses it into the wall; the force grows as cosh and stops the slip."""
+    """The friction of the corner presses it into the wall. The force grows as cosh and stops the slip."""
     mass, inertia, stiffness, mu = 1.0, 0.002, 1e8, 0.5
     scene = Scene(
         Head(mass, inertia), Frame(0.1, 0.6), Clearance(0.1, 0.1), Contact("kelvin_voigt", stiffness, damping=1e-3),
@@ -245,16 +246,16 @@ def test_painleves_case_is_an_impact_without_collision() -> None:
         assert result.energy_balance is not None and result.energy_balance.relative_imbalance < 1e-8
         p = 1.0 / mass + 0.05**2 / inertia - (1.0 if jams else -1.0) * mu * 0.05 * 0.3 / inertia
         assert (p < 0.0) == jams
-        # the corner moves by d'' = -p N while it slips
+        # the corner obeys d'' = -p N while it slips
         rate, t = math.sqrt(abs(p) * stiffness), result.t[1:40]
         expected = stiffness * 1e-3 / rate * (np.sinh(rate * t) if jams else np.sin(rate * t))
         assert result.force[1:40, pair] == pytest.approx(expected, rel=0.02)
-        # if the corner jams, it is thrown back far faster than it came; otherwise it just turns back
+        # a corner that jams rebounds far faster than it arrived; otherwise, its speed is only reversed
         assert (result.v[-1, 1] > 0.1) == jams and (result.statistics["top_right_top"]["max"] > 1e3) == jams
         assert result.force[-1, pair] == 0.0
 
 
-# the quick run has `test_solve_support.test_a_restored_twin_and_a_batch_go_on_alike` with friction
+# in the quick run, `test_solve_support.test_a_restored_twin_and_a_batch_go_on_alike` has friction
 @pytest.mark.stress
 @pytest.mark.parametrize("most", [None, 2000])
 def test_a_restored_twin_a_batch_and_a_bounded_twin_go_on_alike(most: int | None) -> None:
@@ -295,7 +296,7 @@ def test_contradictory_friction_is_refused() -> None:
 
 
 def held_scene(law: str, seed: int) -> Scene:
-    """Return a random head, light or heavy, with soft or stiff grips, which a moderate load drags along its walls."""
+    """Return a random head, light or heavy, with soft or stiff grips, which a moderate load moves along its walls."""
     random = np.random.default_rng(seed)
 
     def decades(low: float, high: float) -> float:
@@ -335,7 +336,7 @@ def held_scene(law: str, seed: int) -> Scene:
 
 
 def furthest_off(scene: Scene, tolerances: tuple[float, ...]) -> float:
-    """Return the largest error, in tolerances, of runs compared with a more accurate run; their work is limited."""
+    """Return the largest error, in tolerances, relative to a more accurate run. The work of the runs is limited."""
     tight = simulate(scene, 1.0, output_dt=0.01, tol=1e-12, max_steps=100_000)
     runs = [(tol, simulate(scene, 1.0, output_dt=0.01, tol=tol, max_steps=100_000)) for tol in tolerances]
     return max(pose_error(scene, run.q, tight.q) / tol for tol, run in runs)
@@ -351,13 +352,13 @@ def furthest_off(scene: Scene, tolerances: tuple[float, ...]) -> float:
     ],
 )
 def test_a_force_too_small_to_move_the_head_still_decides_whether_its_corner_holds(law: str, seed: int) -> None:
-    """Steps that are accurate for the motion alone would release sticking corners and move their anchors."""
+    """Steps that are accurate only for the motion would release sticking corners and move their anchors."""
     assert furthest_off(held_scene(law, seed), (1e-3, 1e-4, 1e-6, 1e-7, 1e-8)) < 10.0
 
 
 @pytest.mark.parametrize("seed", [6, 17])
 def test_a_soft_grip_at_a_tight_tolerance_stays_finite(seed: int) -> None:
-    """The corner does not cross the release penetration in less time than the series can resolve."""
+    """The corner must not cross the release penetration faster than the series can resolve."""
     scene = held_scene("hertz", seed)
     assert scene.friction is not None
     scene = replace(scene, friction=replace(scene.friction, stick_stiffness_n_m=1e8, stick_damping_n_s_m=None))
@@ -369,7 +370,7 @@ def test_a_soft_grip_at_a_tight_tolerance_stays_finite(seed: int) -> None:
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("law", ["kelvin_voigt", "exact_restitution", "hertz"])
 def test_calm_random_scenes_keep_to_the_tolerance(law: str) -> None:
-    """The scenes are those in which a displacement grows by less than a factor of 1e4."""
+    """In these scenes, a displacement grows by less than a factor of 1e4."""
     checked = 0
     for seed in range(200):
         scene = held_scene(law, seed)

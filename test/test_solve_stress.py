@@ -1,4 +1,4 @@
-"""Numerical stress: any scene gives a finite answer or a named error, with limited work."""
+"""Numerical stress: every scene gives a finite result or a named error, with limited work."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_extreme_scenes_are_solved(scene: Scene) -> None:
     for array in (result.q, result.v, result.force, result.penetration):
         assert np.isfinite(array).all()
     assert (result.force >= 0.0).all()
-    # in 2 s under the head's own weight and load, no scene takes more steps than the scene with the stiffest contact
+    # in 2 s under weight and load, no scene needs more steps than the scene with the stiffest contact
     assert result.solver["steps"] < 100_000
 
 
@@ -78,8 +78,8 @@ def test_violent_samples_give_finite_rows_or_a_status(kind: str) -> None:
         assert np.isfinite(array).all()
     good = series.status == Status.OK
     if kind == "spikes of 1e9 N":
-        # the first spike throws the head out of the model's range; from then on every row has this status and the last
-        # good pose
+        # the first spike throws the head out of the range of the model; all later rows have this status and the last
+        # valid pose
         left = int(np.argmin(good))
         assert 0 < left < 100 and (series.status[left:] == Status.OUT_OF_RANGE).all()
         assert (series.q[left:] == series.q[left - 1]).all()
@@ -99,7 +99,7 @@ def test_hours_at_rest_do_not_drift_and_cost_little(hours: float) -> None:
     late = simulate(scene, hours * 3600.0, output_dt=3600.0)
     assert np.abs(late.q[1:] - settled.q[-1]).max() < 1e-12
     assert late.force[-1, [0, 2]] == pytest.approx([2430.0 * 9.81 / 2] * 2, rel=1e-9)
-    # at rest the number of steps depends on time and not on contact: there are at most a few steps a second
+    # at rest, the number of steps depends only on time: at most a few steps per second
     assert late.solver["steps"] < 20 * hours * 3600.0
 
 

@@ -1,4 +1,4 @@
-"""A frame on springs: two coupled masses in closed form, independent references, and no code without springs."""
+"""A frame on springs: two coupled masses in closed form, independent references, and no unused code."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ from plow_twin.solve import compiled_scene
 from plow_twin.solve.state import STATE
 
 SUPPORT = Support(800.0, 60.0, 3e7, 5e7, 4e6, 2e4, 3e4, 5e3)
-#: Head and contact law that several tests have in common, so that they share compiled code.
+#: Head and contact law that several tests share, so that they share compiled code.
 HEAD, LAW = Head(2430.0, 1265.0), Contact("kelvin_voigt", 2e7, damping=6e4)
 
 
 def pressed(load: Harmonic) -> Scene:
-    """Return a head that lies on both upper corners of its frame, 0.6 mm deep."""
+    """Return a head that lies on both upper corners of its frame, with a penetration of 0.6 mm."""
     return Scene(
         HEAD, Frame(0.33, 0.27), Clearance(0.025, 0.030), LAW, loads=(load,), support=SUPPORT,
         initial=Initial((0.0, -0.0156, 0.0)),
@@ -49,12 +49,12 @@ def pressed(load: Harmonic) -> Scene:
 
 
 def test_two_masses_pressed_together_move_as_their_eigenmodes() -> None:
-    """Under weight and a swinging load the contact stays closed, so that the system is linear."""
+    """Under the weight and a harmonic load, the contact remains closed, so the system is linear."""
     omega, amplitude = 40.0, 4e3
     scene = pressed(Harmonic("up and down", (0.0, amplitude), omega_rad_s=omega))
     result = simulate(scene, 1.0, output_dt=0.01, tol=1e-10)
-    # the state has y of the head and v of the frame, both measured from the place where contact begins; then the rates
-    # of the two, the weight, and sine and cosine of the load
+    # The state contains y of the head and v of the frame, both measured from the begin of contact, and their rates. The
+    # weight, and sine and cosine of the load, follow.
     k, c, mass = 2.0 * LAW.stiffness, 2.0 * (LAW.damping or 0.0), HEAD.mass_kg
     matrix = np.zeros((7, 7))
     matrix[0, 2] = matrix[1, 3] = 1.0
@@ -74,7 +74,7 @@ def test_two_masses_pressed_together_move_as_their_eigenmodes() -> None:
 
 
 def reference(scene: Scene, times: np.ndarray) -> np.ndarray:
-    """Return head and frame, (n, 6), by SciPy with independent equations, set up from points in world axes."""
+    """Return head and frame, shape (n, 6), by SciPy with independent equations from points in world axes."""
     (load,) = scene.loads
     support, contact = scene.support, scene.contact
     assert isinstance(load, Harmonic) and support is not None and contact.damping is not None
@@ -126,7 +126,7 @@ def reference(scene: Scene, times: np.ndarray) -> np.ndarray:
 def test_a_tilted_throw_agrees_with_equations_of_its_own() -> None:
     """All six coordinates move, and corners touch and separate.
 
-    q is the head's pose relative to the frame, in the frame's turned axes.
+    q is the pose of the head relative to the frame, in the rotated axes of the frame.
     """
     load = Harmonic("cut", (4e4, 1.1e4), omega_rad_s=9.0, at_m=(0.1, -0.6))
     scene = replace(pressed(load), initial=Initial((1e-3, 2e-3, 0.01), (0.3, -0.2, 0.5)))
@@ -143,7 +143,7 @@ def test_a_tilted_throw_agrees_with_equations_of_its_own() -> None:
 
 
 def test_a_restored_twin_and_a_batch_go_on_alike() -> None:
-    """The state holds the frame's motion and the anchors of corners that stick."""
+    """The state contains the motion of the frame, and the anchors of corners that stick."""
     stick = Friction(0.3, stick_stiffness_n_m=5e7, stick_damping_n_s_m=1e5)
     scene = replace(pressed(Harmonic("unused", (1.0, 1.0))), initial=Initial(), friction=stick)
     times = np.linspace(0.01, 0.4, 23)
@@ -161,7 +161,7 @@ def test_a_restored_twin_and_a_batch_go_on_alike() -> None:
     assert twin.frame is not None and np.abs(twin.frame[:3]).max() > 1e-4
     assert np.array_equal(twin.frame, other.frame)
     assert not np.array_equal(members.q[0], members.q[1])
-    # a failed advance leaves both bodies in place
+    # a failed advance moves neither body
     held = Twin(scene, excitation="sampled", max_steps=1)
     held.restore(twin.snapshot())
     assert held.advance(0.9, [9e4, 0.0, 0.0]).status.name == "BUDGET" and np.array_equal(held.frame, twin.frame)
@@ -209,7 +209,7 @@ def test_fixed_steps_come_to_the_same_motion_and_energy_is_kept(name: str, frict
     scene = replace(preset(name), support=SUPPORT, friction=friction, wear=wear)
     events = simulate(scene, 1.0, output_dt=0.1, energy_balance=True)
     assert events.energy_balance is not None and events.energy_balance.relative_imbalance < 1e-10
-    # the Kelvin-Voigt force jumps at a touch, so fixed steps are accurate to first order only there
+    # the Kelvin-Voigt force jumps at a touch, for which fixed steps are accurate to first order only
     steps = simulate(scene, 1.0, output_dt=0.1, method="rk4", dt=2e-6)
     assert pose_error(scene, steps.q, events.q) < (1e-4 if name == "bench_kv" else 1e-6)
     bounded = Twin(scene, max_evaluations=20_000)

@@ -1,4 +1,4 @@
-"""Archard wear: both closed forms, and no code without wear."""
+"""Archard wear: two closed forms, and no unused code."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_constant_force_and_speed() -> None:
 
 
 def test_linear_feedback_of_wear_on_force() -> None:
-    """For F = F0 (1 + b h), h = (exp(b r t) - 1) / b; a head clamped by interference relaxes with b = -1/d0."""
+    """For F = F0 (1 + b h), h = (exp(b r t) - 1) / b. A head clamped by interference relaxes with b = -1/d0."""
     depth, stiffness, k_s, area, speed, t = 1e-4, 1e7, 2e-9, 0.015, 2.0, 2.0
     scene = pressed(Wear(k_s, area, speed), clearance=-2.0 * depth, gravity=0.0, stiffness=stiffness)
     result = simulate(scene, t, tol=1e-10)
@@ -61,18 +61,18 @@ def test_depth_is_the_wear_law_of_the_impulse_and_widens_the_clearance() -> None
     assert worn.q == pytest.approx(same.q, abs=1e-9)
 
 
-#: Wear with sliding and with running-in, so that the tests of both effects use one kernel.
+#: Wear with sliding and with running-in. The tests of both effects use one kernel.
 RUBBED = Wear(1e-11, 0.015, 2.0, sliding="total", running_in_ratio=4.0, running_in_depth_m=2e-5)
 
 
 def worn_by(exposure: float) -> float:
-    """Return h = h0 ln(r exp(E / h0) - r + 1), which solves dh/dE = 1 + (r - 1) exp(-h / h0)."""
+    """Return h = h0 ln(r exp(E / h0) - r + 1), the solution of dh/dE = 1 + (r - 1) exp(-h / h0)."""
     h0, ratio = RUBBED.running_in_depth_m, RUBBED.running_in_ratio
     assert h0 is not None
     return h0 * math.log(ratio * math.exp(exposure / h0) - ratio + 1.0)
 
 
-# implicit steps compile kernels of their own
+# implicit steps need additional compiled kernels
 @pytest.mark.parametrize(
     "contact",
     [
@@ -82,7 +82,7 @@ def worn_by(exposure: float) -> float:
 )
 @pytest.mark.parametrize(("along", "t"), [(0.0, 20.0), (0.4, 1.0)])
 def test_sliding_in_the_plane_and_running_in_under_a_constant_load(contact: Contact, along: float, t: float) -> None:
-    """A head that slides steadily along the bottom wears its pads by both motions, and more slowly as they run in."""
+    """A head that slides steadily along the bottom wears its pads by both motions, more slowly after running-in."""
     weight, stiffness = 2000.0 * 9.81, 1e7
     scene = dataclasses.replace(
         pressed(RUBBED, clearance=0.02, gravity=9.81, stiffness=stiffness),
@@ -95,12 +95,12 @@ def test_sliding_in_the_plane_and_running_in_under_a_constant_load(contact: Cont
     exposure = RUBBED.coefficient_m2_n / RUBBED.pad_area_m2 * 0.5 * weight * math.hypot(2.0, along) * t
     assert worn[[0, 2]] == pytest.approx([worn_by(exposure)] * 2, rel=1e-5)
     assert (twin._state.implicit_steps > 0) == (contact.law == "kelvin_voigt")
-    # running-in has a visible effect: when it is over, it has added h0 ln r to the depth
+    # running-in has added h0 ln r to the depth at its end
     assert worn[0] > exposure + 1.5e-5
 
 
 def test_sliding_in_the_plane_wears_by_the_way_of_the_corner() -> None:
-    """Each pad's depth is the integral of its force times its speed over the rows, also with fixed steps."""
+    """The depth of each pad is the integral of its force times its speed over the rows, with fixed steps too."""
     wear = dataclasses.replace(RUBBED, travel_speed_m_s=0.05)
     scene = dataclasses.replace(preset("paper"), wear=wear)
     t = np.arange(1, 40_001) * 1e-4
@@ -112,14 +112,14 @@ def test_sliding_in_the_plane_wears_by_the_way_of_the_corner() -> None:
     for pair, name in enumerate(PAIR_NAMES):
         x = half_w if "right" in name.rsplit("_", 1)[0] else -half_w
         y = half_h if "top" in name.rsplit("_", 1)[0] else -half_h
-        # the point of the head that is at the corner has this speed along the wall
+        # speed along the wall of the point of the head that is at the corner
         vx = result.v[:, 0] - result.v[:, 2] * (y - result.q[:, 1])
         vy = result.v[:, 1] + result.v[:, 2] * (x - result.q[:, 0])
         along = c * vx + s * vy if name.endswith(("top", "bottom")) else c * vy - s * vx
         corners.append(np.trapezoid(result.force[:, pair] * np.hypot(0.05, along), t))
     expected = [worn_by(wear.coefficient_m2_n / wear.pad_area_m2 * float(way)) for way in corners]
     impulse, worn = result.impulse.sum(axis=0), result.wear_depth[-1]
-    # the pads wear far more than they would by the travel alone
+    # the pads wear far more than by the travel alone
     assert worn.max() > 1.5 * worn_by(wear.coefficient_m2_n / wear.pad_area_m2 * 0.05 * impulse.max())
     assert worn == pytest.approx(expected, rel=1e-3, abs=1e-12)
     assert fixed.wear_depth == pytest.approx(worn, rel=0.02, abs=1e-11)
@@ -133,7 +133,7 @@ def test_a_twin_goes_on_wearing_from_a_snapshot_and_stands_still_without_wear() 
     other = Twin(scene)
     other.restore(parts.snapshot())
     assert np.array_equal(other.advance(2.0).wear_depth, expected)
-    # worn pads have run in, so with the same motion they wear more slowly than new pads
+    # worn pads have run in, so the same motion wears them more slowly than new pads
     other.reset(0.0, wear_depth=np.full(8, 1e-3))
     assert (other.advance(2.0).wear_depth - 1e-3).max() < 0.4 * expected.max()
     other.set_travel_speed(0.0)

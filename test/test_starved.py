@@ -1,4 +1,4 @@
-"""On a machine with a shortage the twin works, or names the shortage in one line."""
+"""With a shortage on the machine, the twin works, or names the shortage in one line."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _run(
     within: tuple[str, ...] = (),
     **environment: str | None,
 ) -> tuple[int, list[str]]:
-    """Run a command under a shortage; return its exit code and its standard error."""
+    """Run a command under a shortage. Return its exit code and the lines of its standard error."""
     given = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "10000", **environment}
     done = subprocess.run(
         [*within, sys.executable, "-m", "plow_twin", *words],
@@ -47,7 +47,7 @@ def _run(
 
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Compile into the cache first, because the compiler needs more than a run."""
+    """Compile into the cache first, because the compiler needs more resources than a run."""
     folder = tmp_path_factory.mktemp("compiled")
     _csv(folder / "load.csv", 100)
     assert _run(folder, *LIVE) == (0, [])
@@ -77,8 +77,8 @@ def test_a_run_works_and_is_repeated_where_little_is_there(lacking: dict[str, ob
     assert (report.exit_code, report.samples) == (0, 1500)
 
 
-#: Shell script that runs a command with read-only package, cache, home and /dev/shm, as for a user who runs another
-#: user's installation.
+#: Shell script that runs a command with package, cache, home and /dev/shm read-only, as if another user had installed
+#: the package.
 NOTHING_WRITABLE = """
 for place in "$PACKAGE" "$CACHE" "$HOME"; do
     mount --bind "$place" "$place"
@@ -133,7 +133,7 @@ def test_lacking_resources_are_named(lacking: dict[str, object], code: int, said
     assert len(lines) <= (2 if code == 3 else 1), lines  # a loss (exit code 3) may add a second line
 
 
-#: For each library of an extra, a command that needs it.
+#: A command that needs each library of an extra.
 NEEDING: dict[str, tuple[str, ...]] = {
     "mcap": LIVE,
     "paho": ("live", "mqtt://127.0.0.1:9", "--map", "map.yaml", "--scene", "paper"),
@@ -147,7 +147,7 @@ NEEDING: dict[str, tuple[str, ...]] = {
 }
 
 
-#: Program that runs each command in a fork that does not find its library.
+#: Program that runs each command in a fork in which its library cannot be imported.
 WITHOUT = """
 import os, sys
 from plow_twin.cli.app import run

@@ -1,4 +1,4 @@
-"""Alarms have two levels, hysteresis and a minimum duration, and are latched until acknowledged."""
+"""Alarms have two levels, hysteresis and a minimum duration, and remain latched until they are acknowledged."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_an_alarm_comes_after_its_duration_goes_below_its_hysteresis_and_stays_l
     assert _levels(alarms) == (Level.WARN, Level.WARN)
     _changes(alarms, _publication(5, 94.0))
     assert _levels(alarms) == (Level.NONE, Level.WARN)
-    # a level that lasts too short a time raises no alarm, and a level without samples is no evidence
+    # too short a time at a level raises no alarm, and publications without samples do not count
     _changes(alarms, _publication(6, 300.0))
     _changes(alarms, _publication(7, 0.0))
     for stamp in range(8, 20):
@@ -59,7 +59,7 @@ def test_an_alarm_comes_after_its_duration_goes_below_its_hysteresis_and_stays_l
     _changes(alarms, _publication(30, 150.0))
     assert alarms.acknowledge() == ["force"] and _levels(alarms) == (Level.WARN, Level.WARN)
     raised = alarms.alarms["force"].raised
-    # value and threshold are still those of the higher level, which the alarm has left
+    # value and threshold are those of the higher level, although the level has decreased
     assert raised is not None and (raised.value, raised.threshold) == (300.0, 100.0)
 
 
@@ -80,10 +80,10 @@ def test_a_residual_is_that_at_the_stamp_of_the_pose_early_and_late_alike() -> N
 
     for stamp_ms in range(0, 100, 10):
         _changes(alarms, moved(stamp_ms))
-    # a pose between two publications is compared with the model's pose at its time, not with the present pose
+    # a pose between two publications is compared with the pose of the model at its time
     assert not alarms.feed_pose(35 * MS, (0.036, 0.0, 0.0))
     assert abs(alarms.alarms["residual"].value - 0.001) < 1e-12
-    # a pose ahead of the model waits until the model reaches its time
+    # a pose ahead of the model waits until the model has reached its time
     assert not alarms.feed_pose(105 * MS, (0.110, 0.0, 0.0))
     assert not _changes(alarms, moved(100))
     assert _changes(alarms, moved(110))

@@ -1,4 +1,4 @@
-"""Effects of silence, jumps, failures and the scene's own loads on journal and motion."""
+"""Effects of silences, jumps, failures and loads of the scene on journal and motion."""
 
 from __future__ import annotations
 
@@ -56,12 +56,11 @@ def test_a_log_with_long_intervals_is_silent_only_where_it_stops() -> None:
 
 
 def _some(published: Published) -> Published | None:
-    """Return the publication, or None."""
     return published if len(published.rows) else None
 
 
 class Bench:
-    """A driver on a real twin, with its journal."""
+    """A driver on a real twin, and its journal."""
 
     def __init__(self, policy: Policy | None = None, excitation: str = "sampled", *, every_sample: bool = True) -> None:
         self.journal: list[Entry] = []
@@ -70,7 +69,7 @@ class Bench:
         self.driver = Driver(session, Intake(), policy or Policy(), every_sample=every_sample)
 
     def sample(self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int) -> Published | None:
-        """Return the publication of one sample."""
+        """Return the publication of one sample, or None."""
         return _some(Published.joined(list(self.driver.samples([(stamp_ns, wrench)], now_ns))))
 
     def silence(self, now_ns: int) -> Published | None:
@@ -98,7 +97,7 @@ def test_silence_is_bridged_that_far_behind_the_clock(hold: str) -> None:
     assert held == [first, Hold(T0 + 31 * MS)]
     assert driver.state is StreamState.STALE
 
-    # a sample that the model has passed is late; the next sample is used at once
+    # a sample with a stamp that the model has passed is late; the next sample is used at once
     assert bench.sample(T0 + 31 * MS, LOAD, now_ns=132 * MS) is None
     assert bench.sample(T0 + 32 * MS, LOAD, now_ns=132 * MS) is not None
     assert driver.state is StreamState.RUNNING
@@ -148,7 +147,7 @@ def test_a_late_burst_after_a_long_silence_is_dropped_and_the_model_goes_on() ->
     assert "Reset" not in bench.kinds()
     assert driver.session.twin.digest() == digest
     assert bench.sample(T0 + 3000 * MS, LOAD, now_ns=3000 * MS) is not None
-    # a repeated jump is not a step of the clock, and a duplicate right after a jump is not late
+    # a repeated jump is not a step of the clock, and a duplicate after a jump is not late
     assert bench.sample(T0 - 60 * NS_PER_S, LOAD, now_ns=3001 * MS) is None
     assert bench.sample(T0 - 60 * NS_PER_S, LOAD, now_ns=3001 * MS) is None
     assert bench.sample(T0 - 60 * NS_PER_S + MS, LOAD, now_ns=3001 * MS) is not None
@@ -176,7 +175,7 @@ def test_a_model_that_leaves_its_range_says_by_how_much_and_begins_again_as_soon
     failed = bench.driver.failed
     load = compile_loads(SCENE.loads).at(np.arange(4000) * 1e-3) * 3.0
     for index, wrench in enumerate(load.tolist()):
-        # the load's stamps advance, the clock does not
+        # the stamps of the load advance, but the clock does not
         bench.sample(T0 + index * MS, (wrench[0], wrench[1], wrench[2]), now_ns=0)
         if failed.count == 1:
             status = direct.advance_samples(np.arange(index + 1) * 1e-3, load[: index + 1]).status
@@ -229,7 +228,7 @@ def test_model_time_goes_on_where_it_was_after_an_inactive_hour() -> None:
     direct.advance(0.5)
     assert advance.rows["q"][0].tobytes() == direct.advance(700 * MS * 1e-9).q.tobytes()
     assert "Reset" not in bench.kinds()
-    # after a step of the clock, and after a reset, the motion starts at the clock's time
+    # after a step of the clock and after a reset, the motion starts at the time of the clock
     driver.clock_tick(T0 + 2 * hour, hour)
     assert bench.journal[-2:] == [Reset(T0 + 2 * hour, "clock jump_forward"), Hold(T0 + 2 * hour)]
     driver.resume(3 * hour)
@@ -283,7 +282,7 @@ def test_wrong_stamps_one_after_another_reset_no_more_than_five_times_and_keep_n
         bench.sample(T0 + index * MS + ahead_ns, LOAD, now_ns=index * MS)
     bench.driver.pause()
     counted = counters(bench.driver)
-    # within ten seconds there may be five steps of the clock, each with its return, so there are at most ten resets
+    # within ten seconds, there may be five steps of the clock and five steps back, so at most ten resets
     assert counted["resets"] <= 10
     assert counted["samples_used"] >= 1900
     assert counted["samples_used"] + counted["dropped_unsteady"] + counted["dropped_stray"] == 2000
@@ -345,7 +344,7 @@ def _troubled(seed: int, count: int) -> list[tuple[str, list[tuple[int, tuple[fl
             case "stray":
                 arrived[0] = (stamp + 100 * NS_PER_S, arrived[0][1])
             case "jump":
-                # the intake refuses another step of the clock that follows too soon
+                # the intake rejects a second step of the clock that follows too soon
                 stamp, now = stamp - 50 * NS_PER_S, now + 4 * NS_PER_S
             case "nan":
                 arrived[0] = (stamp, (math.nan, 0.0, 0.0))
@@ -359,7 +358,7 @@ def _troubled(seed: int, count: int) -> list[tuple[str, list[tuple[int, tuple[fl
 
 @pytest.mark.parametrize("max_steps", [DEFAULT_BUDGET, 3])
 def test_single_calls_of_the_session_give_the_driver_s_bits_for_any_input(max_steps: int) -> None:
-    """Messages, journal and the state for later samples are the same; with 3 steps an advance fails now and then."""
+    """Messages, journal and the state for later samples are equal. With 3 steps, an advance sometimes fails."""
 
     def new_session(journal: list[Entry]) -> Session:
         twin = Twin(SCENE, excitation="sampled", max_steps=max_steps)

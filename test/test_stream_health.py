@@ -1,4 +1,4 @@
-"""Figures of the running system, compared with numpy's results for the same numbers."""
+"""Statistics of the running system, compared with results of numpy for the same numbers."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_real_time_factor_is_model_time_over_wall_time() -> None:
 
 def test_periods_left_out_are_counted_and_the_others_described_since_the_last_look() -> None:
     periods = Periods(0.01)
-    for now_s in (1.0, 1.011, 1.02, 1.051, 1.06):  # the turn at 1.05 comes after two missed periods
+    for now_s in (1.0, 1.011, 1.02, 1.051, 1.06):  # the turn at 1.05 follows two missed periods
         periods.turn(now_s)
     mean, deviation, largest = periods.recent()
     passed = np.array([0.011, 0.009, 0.031, 0.009])

@@ -1,4 +1,4 @@
-"""The intake decides which samples are used; each unused sample is counted under its reason."""
+"""The intake decides which samples are used. Each unused sample is counted with its reason."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MS = NS_PER_S // 1000
         (T0 - NS_PER_S, 1.0, T0, Verdict.OUT_OF_ORDER),
         (T0 + MS, 1.0, T0 + 5 * MS, Verdict.LATE),
         (T0 + 5 * MS, 1.0, T0 + 5 * MS, Verdict.LATE),
-        # these samples come in a burst after a long silence, which the hold policy has bridged
+        # these samples arrive in a burst after a long silence, during which the hold policy was applied
         (T0 + MS, 1.0, T0 + 9 * NS_PER_S, Verdict.LATE),
         (T0 - MS, 1.0, T0 + 9 * NS_PER_S, Verdict.OUT_OF_ORDER),
         (T0 - NS_PER_S - 1, 1.0, T0 + 9 * NS_PER_S, Verdict.JUMP_BACK),
@@ -90,7 +90,7 @@ def test_missing_samples_are_counted_by_the_gaps_in_the_stamps(left_out: set[int
     intake = Intake(expected_rate_hz=1000.0)
     for number in range(202):
         if number not in left_out:
-            # the sender's stamps jitter by 40 % of a period, but no sample counts as missing for this reason
+            # the stamps of the sender jitter by 40 % of a period, but this must not make a sample missing
             intake.judge(T0 + number * MS + (number % 3 - 1) * MS // 5, (0.0,))
     assert intake.missing == len(left_out)
 

@@ -1,4 +1,4 @@
-"""Late, reordered and batched samples act at their stamps. Only the wear's own service sets the wear."""
+"""Late, reordered and batched samples take effect at their stamps. Only the service for the wear sets the wear."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _marks(frame: Published) -> tuple[bool, ...]:
 
 
 class Live:
-    """A driver on a real twin that remembers the last `SPAN_S` seconds, with its journal and its publications."""
+    """A driver on a real twin that can go back by `SPAN_S` seconds, with its journal and its publications."""
 
     def __init__(self, *, every_sample: bool = True, policy: Policy | None = None) -> None:
         self.journal: list[Entry] = []
@@ -101,7 +101,7 @@ def test_any_order_and_any_batches_end_in_the_bits_of_the_samples_in_order(
     while begin < 160:
         size = sizes[number % len(sizes)]
         live.send(*(_arrival(index) for index in arriving[begin : begin + size]), now_ns=begin * MS)
-        # every third time the clock advances by 0.9 s, so that the model runs ahead
+        # every third time, the clock advances by 0.9 s, so that the model runs ahead of the samples
         live.silence(begin * MS + 900 * MS * (number % 3 == 0))
         if number == 0:
             for index, speed in travels.items():
@@ -131,7 +131,7 @@ def test_a_lasting_rise_of_the_delay_does_not_stop_the_twin() -> None:
         live.silence(now * MS)
     assert _newest(live.frames[-1], "held") and _newest(live.frames[-1], "stamp_ns") > T0 + 1100 * MS
     held = len(live.frames)
-    for index in range(500, 1500):  # from then on everything is 0.8 s late
+    for index in range(500, 1500):  # from then on, all samples are late by 0.8 s
         live.send(_arrival(index), now_ns=(index + 800) * MS)
         live.silence((index + 800) * MS)
     assert live.motion == ordered.motion
@@ -196,7 +196,7 @@ def test_speeds_of_another_clock_act_from_the_time_reached_on_and_are_counted_an
         right = live.wear if right is None else right
         assert (live.wear == right).all()
     live = Live()
-    # while no sample comes, speeds wait to act if their stamps are within a step of the clock
+    # while no sample arrives, speeds are queued if their stamps are within a clock step of the newest sample
     live.send(*(_arrival(index) for index in range(10)))
     for index in range(0, 30_000, 10):
         live.driver.travel(T0 + index * MS, 2.0 + 1e-6 * index)
@@ -228,7 +228,7 @@ def test_clocks_out_of_step_end_in_an_error_and_not_in_resets_for_ever() -> None
     dropped = sum(count for key, count in counted.items() if key.startswith("dropped_"))
     assert counted["samples_used"] + dropped + (live.driver._steps._jumped is not None) == 400
     assert counted["dropped_unsteady"] > 50
-    # when the stamps are steady again, a jump counts as a step of the clock again
+    # when the stamps are steady again, a jump is treated as a step of the clock again
     live.send(_arrival(60_000), _arrival(60_001), now_ns=20_000 * MS)
     assert live.driver.resets == 6 and not live.driver.unsteady(20_000 * MS)
 

@@ -1,4 +1,4 @@
-"""Changes of the running model, and motions that are taken back: journaled, continuous, and exact in a second run."""
+"""Changes of the running model, and motions that are restored: journaled, continuous, and exact in a second run."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _same(first: list[Published], second: list[Published]) -> bool:
 
 
 def _again(scene: Scene, entries: list[Entry]) -> list[Entry]:
-    """Run a journal as read from a file, and return the emitted entries."""
+    """Run a journal as read from a file. Return the entries that the session writes."""
     emitted: list[Entry] = []
     session = Session(Twin(scene, excitation="sampled"), on_entry=emitted.append, rollback_span_s=0.5)
     for entry in entries:
@@ -78,7 +78,7 @@ def test_a_restored_motion_continues_as_after_its_snapshot_for_any_stamps() -> N
         assert again[0].rows["stamp_ns"][0] == T0 + 699 * MS + shift_ns
         assert (again[0].rows["q"] == bench.out[699].rows["q"]).all()
         assert _same(first, again[1:])
-        assert (again[-1].rows["makes"] >= makes).all()  # counts are never set back
+        assert (again[-1].rows["makes"] >= makes).all()  # counts never decrease
     assert bench.driver.resets == 0
     bench.driver.mark(bench.session.stamp_ns or 0, "after the third")
     bench.session.close()
@@ -123,7 +123,7 @@ def test_a_changed_model_goes_on_from_pose_rates_and_wear_and_a_snapshot_of_it_h
     bench.session.close()
     assert sum(isinstance(entry, SetModel) for entry in bench.journal) == 2
     assert _again(WORN, bench.journal) == bench.journal
-    # a later part of a recording has only the entries from the snapshot on
+    # a later part of a recording contains only the entries from the snapshot on
     index = max(number for number, entry in enumerate(bench.journal) if isinstance(entry, Snapshot))
     assert _again(WORN, bench.journal[index:]) == bench.journal[index:]
 

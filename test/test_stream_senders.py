@@ -1,4 +1,4 @@
-"""Losses by the sender's own numbering, and the choice of the sender."""
+"""Losses by the sequence numbers of the sender, and the choice of the sender."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_one_sender_is_followed_until_it_has_gone_or_a_switch_is_asked_for() -> 
     senders = Senders()
     assert not senders.switch()
     assert [senders.hear(ONE, 1), senders.hear(OTHER, 1), senders.hear(ONE, 2)] == [True, False, True]
-    # the list of present publishers does not contain the sender yet, but this is no evidence that the sender has gone
+    # the list of publishers does not contain the sender yet, which does not mean that the sender has gone
     senders.alive([])
     assert senders.followed == ONE
     senders.alive([ONE, OTHER])

@@ -1,4 +1,4 @@
-"""The session of live node and replay: equal entries give equal bits, and nothing is lost between publications."""
+"""The session of live node and replay: equal entries give bit-identical results, and publications lose nothing."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def _sample(index: int) -> Sample:
 
 
 def _entries() -> list[Entry]:
-    """Cover every kind of entry that changes the motion."""
+    """Return entries of all kinds that change the motion."""
     entries: list[Entry] = [_sample(index) for index in range(STEPS)]
     entries[700:700] = [Hold(T0 + 1398 * MS + 500_000), Travel(T0, 3.5)]
     entries[200:200] = [Reset(T0 + 398 * MS, "test"), Hold(T0 + 399 * MS)]
@@ -52,7 +52,7 @@ def _entries() -> list[Entry]:
 
 
 class Run:
-    """A session, with everything that it emitted and published."""
+    """A session, with everything that it has emitted and published."""
 
     def __init__(self) -> None:
         self.emitted: list[Entry] = []
@@ -67,12 +67,11 @@ class Run:
         return self
 
 
-#: Fields of a published row that are numbers, except the stamp.
+#: Numeric fields of a published row, except the stamp.
 NUMBERS = ("penetration", "rate", "force", "makes", "impulse", "peak", "q", "v")
 
 
 def _number(published: Published, name: str) -> np.ndarray:
-    """Return a field of the only row."""
     found: np.ndarray = published.rows[name][0]
     return found
 
@@ -122,7 +121,7 @@ def test_one_flipped_bit_of_a_sample_shows_in_the_next_digest(reference: Run) ->
         [entry for entry in run.emitted if isinstance(entry, Digest)],
         strict=False,
     )
-    # later digests may agree again, because damped contact forgets the last bits
+    # later digests may agree again, because a damped contact forgets differences in the last bits
     same = [(ours.stamp_ns < sample.stamp_ns, ours == theirs) for ours, theirs in pairs]
     before = sum(earlier for earlier, _ in same)
     assert 0 < before < len(same)
@@ -188,7 +187,7 @@ def test_clearance_is_base_plus_mean_wear_of_each_side_with_the_priors_interval(
     rows["wear_depth"] = np.arange(1.0, 9.0) * 1e-3
     published = outputs.add(rows, np.array([T0]), THE_ONE)
     named = dict(zip(CLEARANCE_NAMES, published.slow["clearance"][0], strict=True))
-    # the pads are 1 and 7 on the left, 3 and 5 on the right, 0 and 2 at the top, 4 and 6 at the bottom
+    # pads 1 and 7 are on the left, 3 and 5 on the right, 0 and 2 at the top, and 4 and 6 at the bottom
     assert named["horizontal"] == pytest.approx(0.025 + (2e-3 + 8e-3) / 2 + (4e-3 + 6e-3) / 2)
     assert named["vertical"] == pytest.approx(0.030 + (1e-3 + 3e-3) / 2 + (5e-3 + 7e-3) / 2)
     assert named["pad_top_right_right"] == 4e-3
@@ -233,7 +232,7 @@ def test_running_in_and_sliding_in_the_plane_wear_live_as_offline_and_go_on_afte
         return simulate(worn, 2e-3 * (STEPS - 1), 0.1, tol=Twin(scene).tol).wear_depth
 
     new = lived(WearKeeper(tmp_path, "head 7", scene))
-    # the wear is equal within the solver's tolerance of the motion
+    # the wear is equal within the tolerance of the motion
     assert new == pytest.approx(offline(np.zeros(8)), rel=1e-3, abs=1e-12)
     assert new.max() > 1.5 * wear.running_in_depth_m
     worn = lived(WearKeeper(tmp_path, "head 7", scene))
@@ -243,7 +242,7 @@ def test_running_in_and_sliding_in_the_plane_wear_live_as_offline_and_go_on_afte
 
 
 def test_a_speed_at_which_the_damping_lets_no_contact_last_is_refused_by_name() -> None:
-    """A force would wear a pad faster than it moves the head. The speed is refused before it acts and is journaled."""
+    """A force would wear a pad faster than it moves the head. The speed is rejected before it is journaled."""
     damping, area = 2e5, 0.015
     contact = Contact("kelvin_voigt", 1e9, damping=damping)
     scene = replace(SCENE, contact=contact, wear=Wear(area / (4.0 * damping), area, 2.0, prior_m2_n=(1e-15, 1e-6)))
@@ -258,7 +257,7 @@ def test_a_speed_at_which_the_damping_lets_no_contact_last_is_refused_by_name() 
     ):
         with pytest.raises(ArgumentError, match=r"got -?4.1, expected at most 4 m/s, .* contact.damping 200000.0 N"):
             refuse()
-    # while a speed waits to act, a damping that does not allow this speed is refused as well
+    # if such a speed is queued, a damping that does not allow this speed is rejected too
     with pytest.raises(ArgumentError, match=r"speed_m_s: got -3.9, expected at most 3.2 m/s"):
         session.check_model({"contact.damping": 1.25 * damping})
     session.check_model({"contact.damping": damping})

@@ -1,4 +1,4 @@
-"""Other programs' recordings through the twin: a sensor's bias and delay, files of every kind, and damage."""
+"""Analysis of recordings of other programs: bias and delay of a sensor, all kinds of files, and damage."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_values_of_another_clock_and_impossible_ones_are_counted(tmp_path: Path)
     pose.write_text("t,x,y,theta\n" + "".join(f"{t},{x},{y},{theta}\n" for t, x, y, theta in late))
     found = analyse(tmp_path, scene=PAPER, out=tmp_path / "out")
     assert found.facts()["outside"] == {"x": 10, "y": 11} and found.facts()["signals"]["x"]["n"] == 18
-    # no value of y lies within the time of the load
+    # no value of y is within the time of the load
     assert found.lost == {"measured_implausible": 1, "measured_outside_the_load": 11}
     write_report(found, tmp_path / "out")
     assert "outside the time of the load" in (tmp_path / "out" / "report.html").read_text()
@@ -141,7 +141,7 @@ def test_poses_in_the_journal_are_measured_ones(tmp_path: Path) -> None:
 
 
 def test_a_run_is_predicted_with_all_that_was_done_to_the_model_while_it_ran(tmp_path: Path) -> None:
-    """The contacts have the recorded forces despite other parameters, a restored motion, poses and speeds."""
+    """The forces are the recorded forces despite parameter changes, a restored motion, poses and speeds."""
     samples = [*map(paper_sample, range(1500))]
     session = Session(Twin(load_scene(PAPER), excitation="sampled"))
     for sample in samples[:400]:
@@ -150,7 +150,7 @@ def test_a_run_is_predicted_with_all_that_was_done_to_the_model_while_it_ran(tmp
     again = Restore(samples[999].stamp_ns, session.snapshot().data)
     poses = [Pose(sample.stamp_ns, (0.0, 0.0, 0.0)) for sample in samples]
     entries = [entry for both in zip(samples, poses, strict=True) for entry in both]
-    # the second speed is given ahead of the time at which it acts
+    # the second speed is given before it takes effect
     speeds = [Travel(BASE_NS, 1.0), Travel(BASE_NS + 300 * STEP_NS, -1.0)]
     entries = [*entries[:2], *speeds, *entries[2:1200], changes, *entries[1200:2000], again, *entries[2000:]]
     run = record_run(tmp_path / "run", entries, frame_every=1)
@@ -162,7 +162,7 @@ def test_a_run_is_predicted_with_all_that_was_done_to_the_model_while_it_ran(tmp
     assert mine.loads.impulse == pytest.approx(sum(message.velocity for message in peaks), rel=1e-9)
     np.testing.assert_array_equal(mine.loads.largest, force.max(axis=0))
     assert other.loads.impulse != pytest.approx(mine.loads.impulse, rel=0.01)
-    # a sample may stand alone between other entries, but the cycles are those of the whole series
+    # a sample may be alone between other entries, but the cycles are those of the whole series
     for name, counted in mine.loads.cycles().items():
         whole = rainflow.count_cycles(force[:, PAIR_NAMES.index(name)], nbins=loads.CYCLE_BINS)
         assert [one["count"] for one in counted] == [count for _, count in whole]
@@ -184,7 +184,7 @@ def test_a_measured_gap_is_compared_with_the_distance_to_the_wall(tmp_path: Path
     load = np.column_stack(motion()[:2])[:1000]
     pair = PAIR_NAMES.index("top_right_right")
     penetration = Twin(load_scene(PAPER), excitation="sampled").advance_samples(load[:, 0], load[:, 1:]).penetration
-    gap = np.column_stack([load[:, 0], 1e-3 - penetration[:, pair]])  # the gap is 1 mm too large
+    gap = np.column_stack([load[:, 0], 1e-3 - penetration[:, pair]])  # the gap is too large by 1 mm
     for name, rows, header in (("load", load, "t,fx,fy,m"), ("gaps", gap, "t,top_right_right")):
         np.savetxt(tmp_path / f"{name}.csv", rows, delimiter=",", header=header, comments="")
     found = analyse(tmp_path, scene=PAPER)
@@ -218,7 +218,7 @@ def test_a_partial_recording_beside_a_run_is_read_as_far_as_it_goes_and_its_loss
         stamp = BASE_NS + index * 10**7
         writer.add(number, index, stamp, stamp, bytes(pose_message(stamp, (1e-3, 0.0, 0.0))))
         writer.flush()
-    writer.lost["/pose"] = 7  # a loss that the recorder has counted, as on a full disk
+    writer.lost["/pose"] = 7  # a loss that the recorder has counted, for example on a full disk
     writer.close()
     counted = {"truncated_files": 1, "damaged_files": 1, "/pose": 7}
     found = analyse(run.folder)
@@ -267,15 +267,15 @@ def test_travel_makes_passes_of_the_face(tmp_path: Path) -> None:
     assert replay(tmp_path / "out" / "run").exit_code == 0
     again = analyse(tmp_path / "out" / "run").predictions[0].loads
     np.testing.assert_array_equal(again.impacts, loads.impacts)
-    # the journal contains the direction of travel, so passes and wear are the same
+    # the journal contains the direction of travel, so passes and wear are equal
     assert len(again.passes) == 2
     assert again.pad_wear == pytest.approx(loads.pad_wear, rel=1e-12)
     facts = loads.wear_facts()
     assert facts is not None and loads.pad_wear[0].max() > 0.0 < loads.pad_wear[1].max()
-    # the pads' wear in both directions adds up to the model's wear
+    # the sum of the wear of the pads in both directions is the wear of the model
     assert loads.pad_wear.sum(axis=0) == pytest.approx(prediction.clearance.series()[1][-1][2:10], rel=0.03)
-    # the slide's wear in total is the pads' wear times the ratio of pad length to distance; each place is worn by the
-    # pads that pass it
+    # the total wear of the slide is the wear of the pads times the ratio of pad length to distance; a pad wears each
+    # place that it passes
     whole = np.array(list(facts["slide_mean_m"].values())) * facts["slide_pieces"]
     assert whole == pytest.approx(0.3 * loads.pad_wear.sum(axis=0), rel=1e-12)
     assert {backward for backward, _ in loads.slide_wear} == {0, 1}
@@ -287,7 +287,7 @@ def test_travel_makes_passes_of_the_face(tmp_path: Path) -> None:
 @pytest.mark.parametrize("lag_s", [0.0, 0.0203, -0.4])
 @pytest.mark.parametrize(("rate_hz", "times_each"), [(1000, 1), (1000, 2), (200, 1), (37, 1)])
 def test_the_lag_is_found_at_any_rate_of_the_sensor(rate_hz: int, times_each: int, lag_s: float) -> None:
-    """The lag is found even if the signal is slow compared with the recorded time, and if rows are repeated."""
+    """The lag is found even if the signal is slow compared with the recorded time, or if rows are repeated."""
     t = np.arange(0.0, 3.0, 1e-3)
 
     def signal(at: np.ndarray) -> np.ndarray:
@@ -310,7 +310,7 @@ def test_lag_and_correlation_stay_within_their_bounds() -> None:
 
 
 def test_duty_is_a_share_of_time_however_coarsely_the_load_is_sampled(tmp_path: Path) -> None:
-    """The same load, linear between four knots, is given by its knots or by many samples on the lines."""
+    """One load, linear between four knots, is given by its knots, or by many samples on the lines."""
     knots, count = np.array([0.0, 0.7, 1.5, 2.0]), 2001
     wrench = np.array([[0, 0, 0], [32e3, -11e3, -45e3], [-32e3, 11e3, 45e3], [0, 0, 0]])
     found = {}
@@ -325,7 +325,7 @@ def test_duty_is_a_share_of_time_however_coarsely_the_load_is_sampled(tmp_path: 
     coarse, fine = (np.array(list(found[name].facts()["duty"].values())) for name in ("coarse", "fine"))
     assert 0.05 < fine.max() < 1.0
     assert coarse == pytest.approx(fine, abs=2e-3)
-    # duty is the share of time in contact, not the share of the intervals that have an impulse
+    # duty is the share of time in contact, not the share of the intervals with an impulse
     twin = Twin(load_scene(PAPER), excitation="sampled", tol=1e-9)
     force = twin.advance_samples(
         grid := np.arange(0.0, 2.0, 2e-5), np.column_stack([np.interp(grid, knots, column) for column in wrench.T])
@@ -335,7 +335,7 @@ def test_duty_is_a_share_of_time_however_coarsely_the_load_is_sampled(tmp_path: 
 
 @pytest.mark.parametrize("clock_s", [2.0, 3600.0])
 def test_measured_values_are_compared_with_the_stretch_they_belong_to(clock_s: float, tmp_path: Path) -> None:
-    """The clock steps back or an hour ahead; the stretches before and after the step are predicted as measured."""
+    """The clock steps back, or ahead by an hour. The stretches before and after the step are predicted as measured."""
     times, wrench, q = motion()
     short = 3000
     weak = 0.3 * wrench[:short]
@@ -352,10 +352,10 @@ def test_measured_values_are_compared_with_the_stretch_they_belong_to(clock_s: f
         assert signal["rms"] == pytest.approx(0.0, abs=2e-5) and signal["correlation"] == pytest.approx(1.0, abs=1e-4)
 
 
-# each rotation compiles its own kernel
+# each rotation needs its own compiled kernel
 @pytest.mark.parametrize("rotation", ["paper", pytest.param("consistent", marks=pytest.mark.stress)])
 def test_contacts_under_gravity_alone_take_the_energy_of_the_height_lost(rotation: str, tmp_path: Path) -> None:
-    """In flight they take none; up to rest they take m g times the drop of the centre, less the stored energy."""
+    """In flight, contacts dissipate nothing. Up to rest, they dissipate m g times the drop minus the stored energy."""
     scene = load_scene(PAPER)
     arm, height = scene.gravity.arm_m, 0.1
     assert arm > 0.1
@@ -382,7 +382,7 @@ def test_contacts_under_gravity_alone_take_the_energy_of_the_height_lost(rotatio
 
 
 def test_energy_stored_where_a_recording_begins_is_no_gain_of_the_contacts(tmp_path: Path) -> None:
-    """Contacts almost without damping take no energy, although 66 J are stored when the recording begins."""
+    """Contacts almost without damping dissipate nothing, although 66 J are stored at the begin of the recording."""
     scene = load_scene(PAPER)
     scene = replace(scene, initial=Initial(q=(0.0151, 0.0, 0.0)), contact=replace(scene.contact, damping=1e-9))
     (tmp_path / "scene.yaml").write_text(dump_scene(scene))
@@ -438,7 +438,7 @@ def test_late_repeated_and_non_finite_samples_are_counted_as_live(tmp_path: Path
 
 
 def mutate(data: bytes, rng: random.Random) -> bytes:
-    """Flip, cut, repeat, drop or overwrite some bytes."""
+    """Return the data with some bytes flipped, removed, repeated or overwritten."""
     changed = bytearray(data)
     for _ in range(rng.choice((1, 1, 3, 20))):
         place = rng.randrange(len(changed))
@@ -521,7 +521,7 @@ def test_cycles_are_those_of_the_whole_series_for_any_length(monkeypatch: pytest
     for part in np.array_split(forces, 7):
         series.add(reversals(part))
     expected = rainflow.count_cycles(forces, nbins=loads.CYCLE_BINS)
-    for _ in range(2):  # a run that is still being written is counted again at each poll
+    for _ in range(2):  # in a run that is still being written, cycles are counted again at each poll
         counted = rainflow.count_cycles(series, binsize=(series.high - series.low) / loads.CYCLE_BINS)
         np.testing.assert_allclose(counted, expected, rtol=1e-12)
 

@@ -1,4 +1,4 @@
-"""Calibration: known parameters from random starts, equal bits from equal seeds, and targets of each kind."""
+"""Calibration: known parameters from random starts, identical results from equal seeds, and targets of each kind."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from plow_twin.study.calibration.unknowns import Space, parse_unknown
 from plow_twin.study.parameters import StudyError, with_parameters
 from plow_twin.study.statistics import statistic
 
-#: Parameters of a scene that differs from the preset: stiffness, damping, a phase, a clearance and a sign.
+#: Parameters of a scene that differ from the preset: stiffness, damping, a phase, a clearance and a sign.
 TRUTH = {
     "contact.stiffness": 2.3e7,
     "contact.damping": 0.43,
@@ -40,7 +40,7 @@ RANGES = (
     "clearance.horizontal_m=0.015:0.035",
     "loads.fx2.sign",
 )
-#: Each start recovers each parameter within this relative error.
+#: Largest relative error of each parameter after each start.
 RECOVERED = 1e-6
 
 
@@ -53,7 +53,7 @@ def space() -> Space:
     return Space(tuple(parse_unknown(text, preset("paper")) for text in RANGES))
 
 
-#: Effort of a search that recovers the truth from each start.
+#: Effort of a search that finds the true parameters from each start.
 SEARCH = Search(screen=150, population=24, generations=24)
 
 
@@ -93,7 +93,7 @@ def test_the_same_seed_gives_the_same_bits_on_any_number_of_threads() -> None:
 
 def test_an_unseen_parameter_is_reported_as_such() -> None:
     scene = with_parameters(preset("paper"), {"contact.impact_speed_floor_m_s": 2e-3})
-    # a constant damping does not use the floor of the speed, so the recording does not determine the floor
+    # a constant damping does not depend on the floor of the speed, so the recording does not determine the floor
     unknowns = Space(
         tuple(parse_unknown(text, scene) for text in (RANGES[0], "contact.impact_speed_floor_m_s=1e-4:1e-2"))
     )
@@ -104,7 +104,7 @@ def test_an_unseen_parameter_is_reported_as_such() -> None:
 
 
 def figures(seconds: float) -> TargetSet:
-    """Return figures of the true motion as a paper might publish them: forces, means, shares and impulses."""
+    """Return figures of the true motion as a paper may publish them: forces, means, shares and impulses."""
     true = with_parameters(preset("paper"), TRUTH)
     members = simulate_many([true], seconds, seconds)
     paths = [
@@ -155,7 +155,7 @@ def test_the_command_fits_a_recording_and_marks_the_fitted_numbers(
     check_figure(figures[0])
     pose, residual = figures[0].axes[:2]
     np.testing.assert_allclose(pose.lines[0].get_ydata(), 1e3 * rec.q[:, 0])
-    # the residual in mm vanishes, because the recording is exact
+    # the recording is exact, so the residual vanishes
     assert np.abs(residual.lines[0].get_ydata()).max() < 1e-6
     assert figures[0].axes[-1].get_yticklabels()[0].get_text() == "contact stiffness [MN/mⁿ]"
     assert "singular values" in capsys.readouterr().out

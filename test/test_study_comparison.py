@@ -77,7 +77,7 @@ def test_a_window_without_a_message_of_the_clearance_has_that_of_its_neighbours(
 
 
 def test_windows_with_a_stretch_without_samples_are_left_out_and_named(runs: tuple[Run, Run], tmp_path: Path) -> None:
-    # in the first case a window has 97 % of its messages, which is enough
+    # in the first case, a window has 97 % of its messages, which is sufficient
     for first, end, timeout in ((4100, 4130, 0.02), (4100, 5200, 0.5)):
         samples = (paper_sample(index) for index in range(SECONDS * 1000) if not first <= index < end)
         run = record_run(tmp_path / str(end), samples, parameters={"excitation_timeout": timeout})
@@ -96,14 +96,13 @@ def test_windows_with_a_stretch_without_samples_are_left_out_and_named(runs: tup
 
 def test_the_window_is_the_period_of_the_load(runs: tuple[Run, Run]) -> None:
     starts = windows_of(read_recording(runs[0].folder)).start_ns
-    # the load's angular frequency is 2 rad/s, so its period is pi s; the data cover two and a half periods
+    # the angular frequency of the load is 2 rad/s, so its period is pi s; the data cover two and a half periods
     assert np.diff(starts)[0] * 1e-9 == pytest.approx(np.pi, rel=0.3)
 
 
 def change(
     before: tuple[np.ndarray, np.ndarray], after: tuple[np.ndarray, np.ndarray], random: Any, draws: int = 300
 ) -> Change | None:
-    """Return the change of one quantity."""
     return changes(*(Drawn(values[:, None], load, random, draws) for values, load in (before, after)))[0]
 
 
@@ -156,11 +155,11 @@ def test_a_lasting_change_of_a_load_that_windows_cut_through_is_the_load_s() -> 
     np.testing.assert_array_equal(
         with_neighbours(np.array([1.0, 2.0, 3.0]), np.array([0, 10, 90])), [[1, 1, 2], [2, 1, 2], [3, 3, 3]]
     )
-    # a slope is not valid at loads far from those to which it was fitted
+    # a slope is invalid at loads far from those to which it was fitted
     load = random.normal(1.0, 0.02, 40)
     apart = change((1e5 * load**2, load), (1.4e5 * load**2, 1.4 * load), random, draws=100)
     assert apart is not None and apart.verdict == "load or machine"
-    equal = np.full(93, 0.025)  # means of these equal numbers differ by rounding
+    equal = np.full(93, 0.025)  # the means of these equal numbers differ by rounding errors
     constant = change((equal[:62], np.ones(62)), (equal, np.ones(93)), random, draws=100)
     assert constant is not None and constant.verdict == "chance"
 
@@ -171,7 +170,7 @@ def test_days_and_shifts_begin_in_their_zone() -> None:
     assert by_time("day")("run", stamp) == "2027-01-15"
     assert by_time("day", zone=ZoneInfo("Europe/Berlin"))("run", stamp) == "2027-01-16"
     assert by_time("shift")("run", stamp) == "2027-01-15 22:00"
-    # 04:00 belongs to the night shift of the day before
+    # 04:00 belongs to the night shift of the previous day
     assert by_time("shift")("run", stamp + 5 * 3600 * 10**9) == "2027-01-15 22:00"
     assert by_time("shift", [time(0), time(12)])("run", stamp + 5 * 3600 * 10**9) == "2027-01-16 00:00"
 
@@ -191,7 +190,7 @@ def test_two_runs_are_compared_on_the_terminal_as_json_and_as_a_page(
     assert ratio == pytest.approx(1.3)
     changes = facts["changes"]["tuesday"]
     assert set(changes) == set(PAIR_NAMES) and changes["top_right_top"]["peak"]["verdict"] != "machine"
-    # the clearance has not changed, because the pads do not wear here
+    # the pads do not wear here, so the clearance is unchanged
     assert facts["clearance_changes"]["tuesday"]["horizontal"]["verdict"] == "chance"
     page = (tmp_path / "compare.html").read_text(encoding="utf-8")
     assert "tuesday compared with monday" in page and "data:image/png;base64," in page and "http" not in page

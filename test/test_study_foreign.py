@@ -1,4 +1,6 @@
-"""Files from others: cut off, half written, exported by a spreadsheet, and in encodings other than ROS 2's."""
+"""Files from other programs: truncated, incomplete, exported by a spreadsheet, and in encodings other than that of ROS
+2.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,7 @@ TYPE = "geometry_msgs/msg/WrenchStamped"
 
 
 def sqlite_bag(folder: Path) -> Path:
-    """Return a bag with the load; its last third is in the log that a killed recorder leaves behind."""
+    """Return a bag with the load. Its last third is in the write-ahead log of a killed recorder."""
     with BagWriter(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         connection = writer.add_connection("/load", TYPE, typestore=STORE)
         for index in range(2 * COUNT // 3):
@@ -49,7 +51,7 @@ def sqlite_bag(folder: Path) -> Path:
         live.execute("INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, ?)", (time_ns, data))
     live.commit()
     killed.mkdir()
-    for item in folder.glob("*.db3*"):  # the files are copied while the database is open, so the copy has no clean end
+    for item in folder.glob("*.db3*"):  # the copy is made while the database is open, so it has no clean end
         if not item.name.endswith("-shm"):
             shutil.copy(item, killed)
     live.close()
@@ -175,7 +177,7 @@ def test_columns_that_are_missing_or_there_twice_are_named(tmp_path: Path) -> No
 
 
 def test_a_mapping_without_a_field_or_stamp_is_named(tmp_path: Path) -> None:
-    """A typo of `header` must not be taken for `header`, and a typo of a field must be named, not only counted."""
+    """A misspelt `header` must not be read as `header`, and a misspelt field must be named and not only counted."""
     schema = STORE.generate_msgdef(TYPE, ros_version=2)[0].encode()
     times = [BASE_NS + i * STEP_NS for i in range(COUNT)]
     messages = [(time_ns, wrench_message(time_ns, paper_sample(i).wrench)) for i, time_ns in enumerate(times)]
@@ -197,7 +199,7 @@ def test_a_mapping_without_a_field_or_stamp_is_named(tmp_path: Path) -> None:
 
 
 def test_the_estimate_reads_csv_as_the_analysis_does(tmp_path: Path) -> None:
-    """A byte order mark must not become a part of `t`, semicolons separate columns, and dates are times."""
+    """A byte order mark must not become part of the name `t`. Semicolons separate columns, and dates are times."""
     scene, names = Path(PAPER), ("t", "x", "y", "theta")
     sheet(tmp_path / "load.csv", ",", comma=False, mark=False)
     sheet(tmp_path / "pose.csv", ",", comma=False, mark=False, header=names)
@@ -265,7 +267,7 @@ def test_a_part_that_a_killed_recorder_has_only_named_costs_nothing_before_it(tm
 
 
 def bag_of_parts(folder: Path, kind: StoragePlugin) -> list[Path]:
-    """Write a bag in three parts, each with 10 ms of load and without a gap, as rosbag2 does; return the parts."""
+    """Write a bag in three parts as rosbag2 does, each with 10 ms of load and without a gap. Return the parts."""
     ending, listed = kind.name.lower().replace("sqlite3", "db3"), []
     folder.mkdir()
     for part in range(3):
@@ -324,6 +326,6 @@ def test_a_bag_of_another_program_is_drawn_by_its_mapping(tmp_path: Path, monkey
 
 
 def analyse_force(folder: Path) -> float:
-    """Return the largest force [N] that an analysis of the same bag finds."""
+    """Return the largest force [N] that an analysis of the bag finds."""
     found = analyse(folder / "bag", scene=PAPER, mapping=folder / "map.yaml")
     return max(found.facts()["loads"]["largest_force_n"].values())

@@ -1,4 +1,4 @@
-"""Many recordings at once, with workers that die, and a recording that is analysed while it is written."""
+"""Analysis of many recordings with workers that are killed, and of a recording that is still being written."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ PAPER = Path("paper")
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return folders with loads as CSV; each analysis makes a run of its own."""
+    """Return folders with loads as CSV. Each analysis writes its own run."""
     folder = tmp_path_factory.mktemp("runs")
     for number in range(RUNS):
         (folder / f"r{number}").mkdir()
@@ -75,7 +75,7 @@ def test_a_killed_worker_loses_nothing_and_a_second_call_uses_finished_chunks(ru
     assert process.returncode == 0
     assert [facts["input"]["samples_used"] for facts in report["runs"]] == [2000 + n for n in range(RUNS)]
     assert len(list(out.glob("*/analysis.json"))) == RUNS
-    # a second call keeps complete results and repeats interrupted ones
+    # a second call keeps complete results and repeats interrupted tasks
     (out / "r2" / "asked.json").unlink()
     stored = [task.stored() for task in tasks(runs, out)]
     assert [facts is None for facts in stored] == [False, False, True, False]
@@ -88,7 +88,7 @@ def test_a_killed_worker_loses_nothing_and_a_second_call_uses_finished_chunks(ru
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.stress)])
 def test_an_interrupt_ends_the_call_and_its_workers_at_once(number: signal.Signals, tmp_path: Path) -> None:
-    for run in range(2):  # each run gives a worker some minutes of work
+    for run in range(2):  # each run needs several minutes of work
         (tmp_path / "runs" / f"r{run}").mkdir(parents=True)
         rows = (f"{60 * i},{','.join(map(str, paper_sample(60_000 * i).wrench))}" for i in range(2000))
         (tmp_path / "runs" / f"r{run}" / "load.csv").write_text("t,fx,fy,m\n" + "\n".join(rows))
@@ -100,7 +100,7 @@ def test_an_interrupt_ends_the_call_and_its_workers_at_once(number: signal.Signa
             time.sleep(0.05)
         workers = workers_of(process)
         if number == signal.SIGINT:
-            os.killpg(process.pid, number)  # a terminal also sends Ctrl-C to the whole process group
+            os.killpg(process.pid, number)  # a terminal sends Ctrl-C to the whole process group
         else:
             process.send_signal(number)
         said = process.communicate(timeout=20)[1]
@@ -160,7 +160,7 @@ def test_a_run_is_analysed_while_it_is_recorded(tmp_path: Path) -> None:
     reported = threading.Event()
 
     def entries() -> Iterator[Entry]:
-        """Yield samples; the second half comes when the first half has been reported."""
+        """Yield samples; the second half follows after the first half has been reported."""
         for index in range(4000):
             if index == 2000:
                 assert reported.wait(100)
@@ -169,7 +169,7 @@ def test_a_run_is_analysed_while_it_is_recorded(tmp_path: Path) -> None:
     kept: dict[str, Any] = {"flush_period_s": 0.05}
     writer = threading.Thread(target=record_run, args=(tmp_path / "run", entries()), kwargs=kept)
     writer.start()
-    (out := tmp_path / "out").mkdir()  # this folder has the result of an earlier analysis of another recording
+    (out := tmp_path / "out").mkdir()  # this folder contains the result of an earlier analysis of another recording
     for name in ("asked.json", "predicted_1.parquet"):
         (out / name).write_text("{}")
     command = [sys.executable, "-m", "plow_twin", "analyse", str(tmp_path / "run"), "--watch", "0.1", "--json"]
@@ -210,7 +210,7 @@ def test_no_recording_of_a_folder_is_left_out_unsaid(tmp_path: Path, capsys: pyt
     table = parquet.read_table(out / "runs.parquet")
     assert table.column("lost").to_pylist() == [None, 0, None]
     assert table.column("error").to_pylist()[1:] == [None, "left out: no recording"]
-    # one recording has none of its parts, so the exit code is 1
+    # all parts of one recording are missing, so the exit code is 1
     assert cli(["analyse", str(tmp_path), "--json", "--quiet"]) == 1
     assert json.loads(capsys.readouterr().out)["left_out"] == [str(tmp_path / "empty")]
     shutil.copytree(tmp_path / "good", inner := tmp_path / "good" / "inner")
@@ -266,7 +266,7 @@ def test_an_interrupted_analysis_goes_on_and_a_run_that_a_twin_recorded_stays(ru
     half = tmp_path / "out" / "run" / "run_0.mcap"
     half.write_bytes(half.read_bytes()[:-4000])
     other = Task(runs / "r1", PAPER, None, (), tmp_path / "out")
-    other.clear()  # a task begins with this call, also if it is interrupted later
+    other.clear()  # a task begins with this call, even if it is interrupted later
     assert task.stored() is None and not half.exists()
     assert task.run()["loads"] == first["loads"]
     recorded = record_run(tmp_path / "mine" / "run", map(paper_sample, range(10))).file
@@ -281,7 +281,7 @@ def test_no_input_is_removed_and_results_of_two_recordings_never_stand_side_by_s
     narrow.write_text(dump_scene(replace(scene, clearance=replace(scene.clearance, horizontal_m=0.02))))
     Task(runs / "r0", PAPER, None, (narrow,), out).run()
     assert (out / "predicted_1.parquet").exists()
-    # one file is the task's own input, the other belongs to another task
+    # one file is an input of this task, and the other belongs to another task
     for path in (out / "run", out / "run" / "run_0.mcap"):
         with pytest.raises(RecordingError, match="would replace it"):
             Task(path, None, None, (), out).run()
@@ -293,7 +293,7 @@ def test_no_input_is_removed_and_results_of_two_recordings_never_stand_side_by_s
     with pytest.raises(RecordingError):
         Task(broken, PAPER, None, (), out).run()
     assert not [path.name for path in out.iterdir() if path.is_file()]
-    # another scene, or the same scene in another role, makes another task
+    # with another scene, or the same scene in another role, it is another task
     Task(runs / "r0", PAPER, None, (narrow,), out).run()
     assert Task(runs / "r0", PAPER, None, (narrow,), out).stored() is not None
     assert Task(runs / "r0", PAPER, narrow, (), out).stored() is None

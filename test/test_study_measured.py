@@ -1,4 +1,4 @@
-"""The contact model, compared with impacts and drops that others have measured (`benchmark/data/measured`)."""
+"""The contact model compared with published measurements of impacts and drops (`benchmark/data/measured`)."""
 
 from __future__ import annotations
 
@@ -28,12 +28,11 @@ def impacts() -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def drops() -> Drops:
-    """Return the measured drops of the square."""
     return Drops.load(DATA / "square_drops.npz")
 
 
 def misses(found: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return the norm of the velocities' errors in m/s."""
+    """Return the norm of the velocity errors [m/s]."""
     return np.linalg.norm((found - after)[:, 3:] * [1.0, 1.0, GYRATION], axis=1)
 
 
@@ -46,7 +45,7 @@ def test_measured_impacts_are_met_better_than_by_a_rigid_impact(impacts) -> None
     missed = misses(impact(before), after)
     assert np.sqrt((missed**2).mean()) < 0.245
     assert np.median(missed) < 0.15
-    # without the decrease of restitution and without the spring's damper, the model is no better than a rigid one
+    # without the decrease of restitution and the damper of the spring, the model is no better than a rigid model
     plain = replace(ELLIPSE, fall=0.0, fall_along=0.0, restitution=0.54, tilt=0.0, stick_damping=0.0)
     assert np.sqrt((misses(impact(before, plain), after) ** 2).mean()) > 0.27
 
@@ -54,7 +53,7 @@ def test_measured_impacts_are_met_better_than_by_a_rigid_impact(impacts) -> None
 def test_preset_computes_measured_impacts_whole_as_the_function_does(impacts) -> None:
     before, after = impacts
     found = simulated_impact(before)
-    # an impact of finite time turns the ellipse a little, so the two results differ
+    # during an impact of finite duration, the ellipse rotates slightly, so the two results differ
     assert misses(found, impact(before)).max() < 0.015
     missed = misses(found, after)
     assert np.sqrt((missed**2).mean()) < 0.245
@@ -67,7 +66,7 @@ def test_impact_is_an_impulse_at_the_lowest_point_that_gains_no_energy(impacts) 
     after = impact(before, contact)
     change = after - before
     along, up = contact_arms(before[:, 2])
-    # the data's x has the opposite sign of an x that is right-handed with theta, hence the plus
+    # x and theta of the data form a left-handed system, hence the plus sign
     moment = along * change[:, 4] + up * change[:, 3]
     np.testing.assert_allclose(change[:, 5], moment / GYRATION**2, atol=1e-9)
     assert (energy(after) < energy(before)).all()
@@ -92,7 +91,7 @@ def test_tossed_block_moves_as_the_preset_computed_by_the_solver(drops) -> None:
         half=0.5 * scene.frame.width_m - radius, radius=radius, gyration=scene.head.inertia_kg_m2**0.5, table=0.0,
         stiffness=contact.stiffness, tangential=friction.stick_stiffness_n_m / contact.stiffness,
         tangential_damping=0.5 * friction.stick_damping_n_s_m / friction.stick_stiffness_n_m**0.5,
-        # restitution of an impact at 1 m/s, with a mass relative to that of an impact on the square's edge
+        # restitution of an impact at 1 m/s, with a mass relative to that of an impact on the edge of the square
         restitution=contact.restitution * (1.5**power * (contact.restitution_speed_m_s or 1.0)) ** fall,
         restitution_fall=fall, mass_power=power, friction=friction.coefficient, friction_fall=0.0,
         gravity=scene.gravity.acceleration_m_s2, drag=0.0, spin_drag=0.0,
@@ -104,14 +103,14 @@ def test_tossed_block_moves_as_the_preset_computed_by_the_solver(drops) -> None:
         measured = drops.pose[index, first:until]
         x, z, theta, *rates = MARKER.state_of_block(fit_flight(drops.pose[index, : first + 1]).state)
         if z < radius + float(block["half"]) * (abs(np.cos(theta)) + abs(np.sin(theta))):
-            continue  # this state penetrates the table, so a scene would start within an impact
+            continue  # this state penetrates the table, so the scene would begin within an impact
         start = Initial((x, z - 1.0, theta), (rates[0], rates[1], rates[2]))
         solved = simulate(replace(scene, initial=start), t_end=len(measured) / 250.0, output_dt=0.004).q
         found = toss(np.array([[x, z, theta, *rates]]), len(solved), np.array([block], block.dtype))[0, :, :3]
         apart.append(np.abs(found[:20] - solved[:20] - [0.0, 1.0, 0.0]).max(axis=0))
         off = MARKER.measured(solved + np.array([0.0, 1.0, 0.0]))[: len(measured), :2] - measured[:, :2]
         far.append(np.hypot(*off.T).mean())
-    # impacts enlarge the difference between fixed steps and exact events
+    # impacts amplify the difference between fixed steps and event detection
     assert (np.max(apart, axis=0) < [2e-3, 2e-3, 0.1]).all()
     assert (np.median(apart, axis=0) < [4e-4, 3e-4, 0.03]).all()
     # a model with rigid impacts has an error of 10 mm
@@ -186,7 +185,7 @@ def test_marker_is_turned_as_the_angles_at_rest_show(drops) -> None:
 def test_marker_s_state_is_the_block_s_and_back() -> None:
     state = np.random.default_rng(0).standard_normal((20, 6))
     np.testing.assert_allclose(MARKER.state_of_block(MARKER.measured(state)), state, atol=1e-12)
-    # the marker moves with a point of the block
+    # the marker moves like a point of the block
     h = 1e-6
     moved = state.copy()
     moved[:, :3] += h * state[:, 3:]

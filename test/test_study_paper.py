@@ -88,7 +88,7 @@ def test_the_command_leaves_a_report_its_table_and_the_run(tmp_path: Path, capsy
     assert document["recording_error_m"] < 1e-6
     assert replay(out / "run").divergences == 0
 
-    assert run(["study", "paper", "--out", str(out)]) == 2  # no existing file is overwritten
+    assert run(["study", "paper", "--out", str(out)]) == 2  # existing files are not overwritten
     assert "expected a new folder" in " ".join(capsys.readouterr().err.split())
 
 
@@ -125,7 +125,7 @@ def test_disagreements_are_listed(study: PaperStudy) -> None:
     assert row(study, "a is loaded more than c and d, largest force").verdict is Verdict.DISAGREES
     assert row(study, "b is loaded more than c and d, largest force").verdict is Verdict.AGREES
     assert "at c" in row(study, "counter-clockwise: largest force is at a").computed
-    # the set `a` lasts for 0.8 ms only, too short to count
+    # the set `a` lasts only 0.8 ms, which is too short to count
     assert row(study, "clockwise: {a} occurs").verdict is Verdict.DISAGREES
     quoted = [entry for entry in study.rows if "contact at 5" in entry.what]
     assert [entry.verdict for entry in quoted] == [Verdict.DISAGREES] * 6
@@ -135,8 +135,8 @@ def test_disagreements_are_listed(study: PaperStudy) -> None:
 
 
 def test_a_second_reconstruction_gets_its_own_verdicts(study: PaperStudy) -> None:
-    # with other signs of loads and arms, and another contact, the scene fits the forces at a and b, but misses one more
-    # trend
+    # with other signs of loads and arms and another contact, the scene reproduces the forces at a and b, but misses
+    # another trend
     scene = preset("paper")
     fx1, fx2, fx3, fy = scene.loads
     loads = (
@@ -155,7 +155,7 @@ def test_a_second_reconstruction_gets_its_own_verdicts(study: PaperStudy) -> Non
     ):
         assert row(second, what).value == pytest.approx(value, abs=0.5)
     np.testing.assert_array_equal(np.round(second.runs.vertical.on_grid()[:4, 1] / 1e3), [157, 155, 152, 146])
-    falls = "point b: largest force against vertical clearance"  # the curve falls from its start
+    falls = "point b: largest force against vertical clearance"  # the curve decreases from its first point
     assert [row(each, falls).verdict for each in (study, second)] == [Verdict.AGREES, Verdict.DISAGREES]
 
 
@@ -194,7 +194,7 @@ def test_published_forces_are_those_of_the_calibration_s_targets() -> None:
 def test_a_set_counts_from_five_milliseconds_on() -> None:
     timeline = [Hold(0.0, 1.0, ""), Hold(1.0, 1.004, "a"), Hold(1.004, 1.010, "ab"), Hold(1.010, 1.014, "a")]
     figures = paper_sets.figures(timeline)
-    # two stretches of 4 ms do not add up to a stretch of 5 ms
+    # two times of 4 ms do not count as one time of 5 ms
     assert (figures["a"].count, figures["ab"].count) == (0, 1)
     assert figures["a"].share == pytest.approx(8 / 14)
     distance, hold = paper_sets.nearest(timeline, 1.009, "a") or (None, None)
@@ -207,7 +207,7 @@ def test_a_set_counts_from_five_milliseconds_on() -> None:
     [
         ([1.0, 2.0, 3.0], True, False),
         ([1.0, 3.0, 2.0], False, True),
-        ([100.0, 110.0, 109.8, 120.0], True, False),  # a printed curve would not show this step back
+        ([100.0, 110.0, 109.8, 120.0], True, False),  # this decrease would not be visible in a printed curve
         ([100.0, 110.0, 105.0, 120.0], False, False),
         ([100.0, 100.2, 100.0], False, False),
         ([3.0, 2.0, 1.0], False, False),
@@ -263,8 +263,8 @@ def test_the_exact_rigid_body_falls_without_turning(study: PaperStudy) -> None:
     np.testing.assert_array_equal(rotation.results[0].q, study.runs.case.q)
     head, t = study.runs.scene.head, study.runs.case.t[20]
     turned = [float(result.q[20, 2]) for result in rotation.results]
-    # gravity's moment turns the first body at once; the second body turns about its centre of mass, about which gravity
-    # has no moment; the loads add a term in t^3
+    # the moment of gravity rotates the first body at once; it has no moment about the centre of mass of the second
+    # body, which only the loads rotate, in proportion to t^3
     assert turned[0] == pytest.approx(-0.5 * head.mass_kg * 9.81 * 0.255 / head.inertia_kg_m2 * t**2, rel=0.15)
     assert abs(turned[1]) < 0.15 * abs(turned[0])
     values = {entry.what: entry for entry in study.rotation}

@@ -1,4 +1,4 @@
-"""The page of a run is one file, which a real browser opens without a network."""
+"""The page of a run is a single file, which a real browser opens without a network."""
 
 from __future__ import annotations
 

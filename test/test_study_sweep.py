@@ -1,4 +1,4 @@
-"""Sweeps have the same bits as single runs, even after kills."""
+"""Sweeps give bit-identical results to single runs, even after kills."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_a_killed_sweep_goes_on_where_it_was(tmp_path: Path, capsys: pytest.Capt
         process.wait()
     stored = len(list(killed.glob("chunks/*.npz")))
     assert process.returncode == -signal.SIGKILL and 2 <= stored < 8
-    # a killed write or a broken disk leaves such files
+    # a killed write or a defective disk leaves such files
     (killed / "chunks" / ".00007.npz.1").write_bytes(b"half")
     first = killed / "chunks" / "00000.npz"
     first.write_bytes(first.read_bytes()[:100])

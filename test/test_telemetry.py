@@ -1,4 +1,4 @@
-"""Outputs to a plant other than MQTT: real servers and clients in other processes get the recording's numbers."""
+"""Outputs to a plant other than MQTT: real servers and clients in other processes receive the recorded numbers."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Heard:
         self.events.append(event)
 
     def states(self) -> list[tuple[bool, bool]]:
-        """Return for each event whether the condition was active, and acknowledged."""
+        """Return for each event whether the condition was active, and whether it was acknowledged."""
         return [(getattr(event, "ActiveState/Id"), getattr(event, "AckedState/Id")) for event in self.events]
 
 
@@ -58,7 +58,7 @@ async def _call_acknowledge(condition: Any, *arguments: ua.Variant) -> str:
 
 
 async def _conditions(client: Client) -> Heard:
-    """Subscribe to conditions, and request the existing ones."""
+    """Subscribe to conditions, and request their present state."""
     heard = Heard()
     subscription = await client.create_subscription(50, heard)
     alarm_type = client.get_node(ua.NodeId(ua.ObjectIds.ExclusiveLevelAlarmType))
@@ -92,7 +92,7 @@ def test_opcua_clients_read_a_typed_model_and_acknowledge_alarms_where_that_is_a
             await _soon(lambda: _is_good(horizontal))
             value, low = await horizontal.read_data_value(), await node("clearance.horizontal.p05").read_value()
             assert (value.Value.Value, low, unit.DisplayName.Text) == (pytest.approx(0.025), pytest.approx(0.025), "m")
-            # this is the last sample's time
+            # the time of the last sample
             assert value.SourceTimestamp.timestamp() == pytest.approx(1.0 + 1499e-3, abs=0.01)
             assert not (await node("life.seconds.p50").read_data_value(raise_on_bad_status=False)).StatusCode.is_good()
             for written in (horizontal, node("flags.stream"), node("alarms.force")):
@@ -119,7 +119,7 @@ def test_opcua_clients_read_a_typed_model_and_acknowledge_alarms_where_that_is_a
 
 
 def _meanwhile(live: Live, work: Coroutine[Any, Any, Any]) -> Any:
-    """Call a function while the twin's output is read, because the twin waits for its readers."""
+    """Run a coroutine while the output of the twin is read, because the twin would wait for its readers."""
     with ThreadPoolExecutor(1) as pool:
         done = pool.submit(asyncio.run, work)
         live.until(lambda _: done.done(), "done")
@@ -220,5 +220,5 @@ def test_influxdb_gets_lines_also_from_the_time_while_it_was_down(tmp_path: Path
     clearance = [line for line in lines if line.startswith("plow_twin_clearance,head=plough_head ")][-1]
     fields, _, stamp = clearance.partition(" ")[2].rpartition(" ")
     assert "horizontal=0.025," in fields and "horizontal/p05=" in fields
-    assert int(stamp) == 1_000_000_000 + 499 * 1_000_000  # this is the last sample's time
+    assert int(stamp) == 1_000_000_000 + 499 * 1_000_000  # the time of the last sample
     assert any('stream="running"' in line for line in lines if line.startswith("plow_twin_flags"))

@@ -1,4 +1,4 @@
-"""Outputs of a node to a plant: a process beside the node sends the numbers of its topics and calls its service."""
+"""Outputs of a node to a plant: a separate process sends the values of its topics and calls its service."""
 
 from __future__ import annotations
 
@@ -36,8 +36,9 @@ def test_a_process_beside_a_node_sends_its_results_and_ends_with_them(tmp_path: 
                         "the alarm")  # fmt: skip
             peaks = max(max(filter(None, found["values"].values()), default=0.0) for found in heard.all("face/peaks"))
             assert peaks > 1e4 and heard.newest("face/clearance")["values"]["horizontal"] == pytest.approx(0.025)
-            assert "influx" in beside.output() or "http" in beside.output()  # the message names the absent receiver
-            # points for an absent database are lost, so the exit code is that of a loss
+            # the message names the unreachable receiver
+            assert "influx" in beside.output() or "http" in beside.output()
+            # points for the unreachable database are lost, and the exit code shows a loss
             assert beside.stop() == 3
             probe.until(lambda: heard.newest("face/online") is False, "the end")
         finally:

@@ -1,4 +1,4 @@
-"""Promises of the checks: new examples in each stress run, and exactly the lowest versions."""
+"""Properties of the checks: each stress run draws new examples, and the lowest versions are exact."""
 
 from __future__ import annotations
 
@@ -61,17 +61,17 @@ def test_the_lowest_versions_are_those_that_setup_names(metadata: dict[str, Any]
         match = VERSION.fullmatch(line)
         assert match is not None, line
         stated[match[1]] = match[2]
-    stated["lz4"] = "4.3"  # this is the first version with a wheel for Python 3.11; Ubuntu's 4.0.2 needs a compiler
+    stated["lz4"] = "4.3"  # the first version with a wheel for Python 3.11; version 4.0.2 in Ubuntu needs a compiler
     lines = (ROOT / "requirements" / "lowest.txt").read_text().splitlines()
     lowest = dict(line.split("==") for line in lines if not line.startswith("#"))
     assert lowest.keys() == stated.keys()
     for name, version in stated.items():
-        # `6` stands for the first release of version 6, and `1.26` for the last patch of 1.26
+        # `6` means the first release of version 6, and `1.26` the last patch of 1.26
         assert lowest[name].removesuffix(".*").split(".")[: len(version.split("."))] == version.split("."), name
     assert "1.26" in lowest["numpy"]
 
 
-#: Code that holds the interpreter's lock, so that no signal handler and no thread runs.
+#: Code that holds the interpreter lock, so that no signal handler and no other thread can run.
 HANGING = """
 import ctypes
 

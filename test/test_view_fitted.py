@@ -1,4 +1,4 @@
-"""The picture of a fit: measured and fitted motion, residuals, and values beside their priors."""
+"""The picture of a fit: measured and fitted motion, residuals, and values with their priors."""
 
 from __future__ import annotations
 

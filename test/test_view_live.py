@@ -60,7 +60,7 @@ def test_a_stopped_viewer_does_not_disturb_the_node_and_catches_up_later(tmp_pat
             node.probe.until(lambda: len(forces) >= 4000, "every publication")
             recorder, output = node.probe.figures("recorder"), node.probe.figures("output")
             assert recorder["lost"] in ("", "0", "{}") and recorder["error"] == "" and output["withheld"] == "0"
-            os.kill(shown.pid, signal.SIGCONT)  # the process continues alone, and nobody reads its messages
+            os.kill(shown.pid, signal.SIGCONT)  # the process continues, although nothing reads its messages
             assert node.twin.stop() == 0
         assert written.wait(WAIT_S) == 0
         reader = RunReader(run)
@@ -71,7 +71,7 @@ def test_a_stopped_viewer_does_not_disturb_the_node_and_catches_up_later(tmp_pat
         until(lambda: b" read" in log.read_bytes(), "all to be shown")
         shown_rows = re.search(r" of (\d+) read", log.read_text())
         assert shown_rows is not None and int(shown_rows[1]) == published
-        # the process is ended while the viewer does not answer
+        # the process is ended while the viewer does not respond
         os.kill(viewer, signal.SIGSTOP)
         shown.terminate()
         assert shown.wait(10.0) in (0, 1)

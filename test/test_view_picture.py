@@ -1,4 +1,4 @@
-"""The picture of a recording: envelopes of long runs, clearances in millimetres, and annotations inside their axes."""
+"""The picture of a recording: envelopes of long runs, clearances in mm, and annotations inside the axes."""
 
 from __future__ import annotations
 
@@ -27,14 +27,13 @@ from plow_twin.view.run_curves import RunCurves
 
 @pytest.fixture
 def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """Return a list that receives the figures that are drawn."""
     return kept_figures(monkeypatch)
 
 
 def test_an_hour_of_load_fills_the_same_band_everywhere() -> None:
     envelope = Envelope(1)
     times = np.arange(72_000) / 20.0
-    for part in np.array_split(times, 300):  # rows come in parts, as in the batches of a recording
+    for part in np.array_split(times, 300):  # rows arrive in parts, as in the batches of a recording
         envelope.add(part, np.sin(2.0 * part)[:, None])
     at, least, largest = envelope.bands(0)
     assert 300 <= len(at) <= 700
@@ -100,7 +99,7 @@ def test_a_stretch_without_samples_is_shaded_and_crossed_by_no_line(tmp_path: Pa
     def held(first: int, last: int) -> list[Entry]:
         return [Hold(BASE_NS + index * STEP_NS) for index in range(first, last)]
 
-    # the second silence is filled by late samples and is not shaded; the third lasts until the end
+    # late samples fill the second silence, so it is not shaded; the third silence lasts until the end
     entries: list[Entry] = [*map(paper_sample, range(200)), *held(200, 500), *map(paper_sample, range(500, 700))]
     entries += [*held(750, 751), *map(paper_sample, range(700, 900)), *held(900, 1000)]
     run = record_run(tmp_path / "run", entries, rollback_span_s=0.2)
@@ -118,7 +117,7 @@ def test_a_stretch_without_samples_is_shaded_and_crossed_by_no_line(tmp_path: Pa
 def test_every_force_of_the_instant_shown_has_its_arrow_and_its_value_inside_the_axes(
     tmp_path: Path, figures: list[Figure]
 ) -> None:
-    load = map(paper_sample, range(0, 3000, 50))  # the samples are so far apart that the peaks lie between the stamps
+    load = map(paper_sample, range(0, 3000, 50))  # the samples are so far apart that the peaks are between the stamps
     run = record_run(tmp_path / "run", load)
     to_png(run.folder, tmp_path / "run.png")
     check_figure(figures[0])

@@ -1,4 +1,4 @@
-"""The .rrd file of a recording, read back with rerun's own reader."""
+"""The rerun file of a recording, read with rerun's own reader."""
 
 from __future__ import annotations
 
@@ -49,7 +49,8 @@ def view(run: Run) -> tuple[ViewSummary, dict[str, pa.Table]]:
 
 
 def read(path: Path) -> dict[str, pa.Table]:
-    """Return each entity's rows in time from a .rrd file; colours that change in time are under `<entity> colors`."""
+    """Return the rows in time of each entity in a rerun file. Colours that change in time are under `<entity> colors`.
+    """
     batches: dict[str, list[pa.RecordBatch]] = {}
     for chunk in RrdReader(str(path)).stream():
         if not chunk.is_static:
@@ -60,7 +61,7 @@ def read(path: Path) -> dict[str, pa.Table]:
 
 
 def curve_names(path: Path) -> dict[str, str]:
-    """Return the name of each curve in the legend of a .rrd file."""
+    """Return the name of each curve in the legend of a rerun file."""
     names: dict[str, str] = {}
     for chunk in RrdReader(str(path)).stream():
         batch = chunk.to_record_batch()
@@ -70,7 +71,7 @@ def curve_names(path: Path) -> dict[str, str]:
 
 
 def journal_around_the_hole(folder: Path) -> list[Sample]:
-    """Return the samples before and after the place of missing entries."""
+    """Return the samples before and after the missing entries."""
     samples = [
         (record.sequence, record.entry)
         for record in RunReader(folder)
@@ -138,7 +139,7 @@ def test_the_growth_of_the_clearance_is_drawn_in_micrometres(tmp_path: Path) -> 
         index = sent[0].name.index(name)
         np.testing.assert_allclose(best, [1e6 * (m.position[index] - new_m) for m in sent], rtol=0, atol=1e-9)
         assert 0.0 < low[-1] < 0.2 * best[-1] < best[-1] < 0.2 * high[-1]
-        # the legend shows the colour of a band's first stroke, so this stroke is not faint
+        # the legend shows the colour of the first stroke of a band, so this stroke is not faint
         colors = tables[f"/growth/band/{name} colors"]["SeriesLines:colors"].to_pylist()
         assert [color[0] & 0xFF for color in colors] == [255, layout._BAND_ALPHA]
 
@@ -151,7 +152,7 @@ def test_the_cross_section_moves_with_the_head(run: Run, view: tuple[ViewSummary
     cavity = np.array([355.0, 300.0])
     for strips, pose in zip(head["LineStrips2D:strips"].to_pylist(), poses, strict=True):
         inner = np.array(strips[0])[:4]
-        # the drawing is in mm with y down; the centre is the pose, and the first side is the top side, turned by theta
+        # the drawing is in mm with y down; its centre is the pose, and its first side is the top side, rotated by theta
         centre = inner.mean(axis=0)
         np.testing.assert_allclose(centre, [1e3 * pose.position[0], -1e3 * pose.position[1]], atol=1e-3)
         top = inner[1] - inner[0]
@@ -184,7 +185,7 @@ def test_forces_along_the_face_measured_poses_and_other_scenes_are_drawn(tmp_pat
     twin, offset = Twin(scene, excitation="sampled"), np.array([1e-3, -5e-4, 2e-3])
     for index in range(COUNT):
         sample = paper_sample(index)
-        if index in (0, 700):  # the second speed is given ahead of the time at which it acts
+        if index in (0, 700):  # the second speed is given before it takes effect
             entries.append(Travel(BASE_NS + (index and 999) * STEP_NS, -2.0 if index else 2.0))
         entries.append(sample)
         pose = twin.advance(index * 1e-3, sample.wrench).q + offset
@@ -202,12 +203,12 @@ def test_forces_along_the_face_measured_poses_and_other_scenes_are_drawn(tmp_pat
     for name, value in (("x", 1.0), ("y", -0.5), ("theta", 2.0)):
         residual = scalars(tables[f"/residual/{name}"])
         assert len(residual) >= COUNT // 10 - 1
-        # the poses come from a twin whose pads do not wear, hence the tolerance
+        # the poses are from a twin whose pads do not wear, so the tolerance is larger
         np.testing.assert_allclose(residual, value, atol=0.01)
     largest, same, other = (scalars(tables[f"/what_if/{number}"]) for number in range(3))
     np.testing.assert_allclose(same, largest, rtol=0.01, atol=1.0)
     assert len(same) == COUNT and np.abs(other - largest).max() > 10.0
-    # the pads' depths are drawn as bars at the corners of the frame, with texts
+    # bars and texts at the corners of the frame show the depths of the pads
     depths = tables["/exaggerated/pads/wear"]["Points2D:labels"].to_pylist()[-1]
     assert len(depths) == 8 and all(depth.endswith(" µm") for depth in depths)
     for group in ("clearance", "growth"):
@@ -259,7 +260,7 @@ def test_a_touch_that_is_over_is_not_drawn_on_in_a_thinned_run(tmp_path: Path) -
 
 
 def test_finished_pieces_are_not_redrawn(tmp_path: Path) -> None:
-    """The pieces shown are a load that has fallen to zero, a held load, and the wear of replaced pads."""
+    """The pieces are a load that has decreased to zero, a held load, and the wear of replaced pads."""
     wear = Wear(1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0)
     end = BASE_NS + 1000 * STEP_NS
     silent: list[Entry] = [Hold(end), *(Unload(end + index * 10 * STEP_NS) for index in range(1, 30))]
@@ -280,7 +281,7 @@ def test_finished_pieces_are_not_redrawn(tmp_path: Path) -> None:
 def test_an_arrow_pushes_the_wall_off_its_corner() -> None:
     section = Section.of(load_scene(scene_path("paper")))
     force = np.zeros(8)
-    force[2] = 1e5  # at the top right corner the top wall pushes the head up, which is towards -y on the screen
+    force[2] = 1e5  # at the top right corner, the top wall pushes the head up, which is -y on the screen
     origins, vectors, pairs = section.arrows((0.0, 0.0, 0.0), force)
     np.testing.assert_allclose(origins, [[165.0, -135.0]])
     np.testing.assert_allclose(vectors, [[0.0, -ARROW_MM_PER_N * 1e5]], atol=1e-9)
@@ -291,7 +292,7 @@ def test_a_block_moves_in_its_guide_and_a_wall_pushes_its_corner_inwards() -> No
     scene = load_scene("paper")
     section = Section.of(replace(scene, head=replace(scene.head, carries="corners")))
     np.testing.assert_allclose(np.abs(section.frame_strip()).max(axis=0), 0.5 * section.cavity)
-    # turned by more than 45 degrees, the former bottom right corner is the top right corner
+    # after a rotation by more than 45 degrees, the former bottom right corner is the top right corner
     pose = (0.01, 0.02, 0.5 * np.pi + 0.1)
     (outline,) = section.head_strips(pose)
     corners = section.corners(pose)
@@ -334,7 +335,7 @@ def test_a_long_run_is_thinned_without_losing_a_peak(run: Run, tmp_path: Path) -
     tables = read(thin.path)
     for pair, name in enumerate(PAIR_NAMES):
         values = scalars(tables[f"/force/{name}"])
-        # each span has at most three values, and the end of a batch also ends a span
+        # a span has at most three values; the end of a batch ends a span too
         assert len(values) <= 750 < COUNT and values.max() == efforts[:, pair].max() / 1e3
     assert thin.section_rows < COUNT // 10
 
@@ -353,7 +354,7 @@ def test_gaps_are_drawn_as_wide_as_asked_with_their_wear() -> None:
     np.testing.assert_allclose(top[:, 1], -(135.0 + 20.0))
     np.testing.assert_allclose(right[:, 0], 165.0 + 60.0)
     np.testing.assert_allclose(bottom[:, 1], 135.0 + 10.0)
-    # the left wall is slanted and passes through its points beside the corners
+    # the left wall is inclined, and passes through its points beside the corners
     slope = (left[0, 0] - left[1, 0]) / (left[0, 1] - left[1, 1])
     np.testing.assert_allclose(
         left[0, 0] + slope * (np.array([-135.0, 135.0]) - left[0, 1]), [-165.0 - 40.0, -165.0 + 2.0]
@@ -416,8 +417,8 @@ def test_the_lane_of_contact_sets_has_room_in_a_low_window() -> None:
     curves = blueprint.root_container.contents[1]
     names = [getattr(part, "name", None) for part in curves.contents]
     share = curves.row_shares[names.index("Corners that carry force")] / sum(curves.row_shares)
-    # in a window of 1000 x 620 pixels the curves have 555 of the 620, and the lane needs 87 for itself, its title, axis
-    # and name
+    # in a window of 1000 x 620 pixels, the curves have a height of 555; the contact sets need 87 for lane, title and
+    # axis
     assert share * 555.0 > 87.0
 
 
@@ -425,15 +426,16 @@ def test_the_legends_of_the_clearance_are_not_cut_in_a_low_window(
     view: tuple[ViewSummary, dict[str, pa.Table]],
 ) -> None:
     curves = layout.blueprint(Section.of(load_scene(scene_path("paper"))), 3.0).root_container.contents[1]
-    height = curves.row_shares[-1] / sum(curves.row_shares) * 555.0 - 46.0  # the plot's title and axis take 46 pixels
+    # the title and the axis of the plot take 46 pixels
+    height = curves.row_shares[-1] / sum(curves.row_shares) * 555.0 - 46.0
     for group in ("growth", "clearance"):
         names = {
             name
             for entity, name in curve_names(view[0].path).items()
             if entity.startswith(f"/{group}/") and not entity.endswith(("/p05", "/p95"))
         }
-        # each line of a legend takes 23 pixels, and equal names share a line; in a plot 112 pixels high, a legend of 94
-        # pixels lost its last line
+        # each line of a legend takes 23 pixels, and equal names share a line; with 94 of 112 pixels, a legend lost its
+        # last line
         assert names >= {"horizontal", "vertical"} and 23 * len(names) + 2 < 0.77 * height
 
 

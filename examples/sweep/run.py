@@ -1,5 +1,4 @@
-"""Sweep of the largest contact force over clearance and stiffness. All members are computed in one call on all cores.
-"""
+"""Sweep of the largest contact force over clearance and stiffness. One call computes all members on all cores."""
 
 from __future__ import annotations
 

@@ -27,8 +27,7 @@ class DashboardError(InputError):
 
 @dataclass(frozen=True)
 class PageAccess:
-    """Address and token of the screen. Without a token, all users of this machine can read it and acknowledge alarms.
-    """
+    """Address and token of the screen. Without a token, all users of this machine can see it and acknowledge alarms."""
 
     host: str
     port: int

@@ -1,2 +1,1 @@
-"""The demo: a publisher of excitation, and the node with its recorder, as processes; then a summary of the recording.
-"""
+"""The demo: a publisher of excitation and the node with its recorder, as processes, and a summary of the recording."""

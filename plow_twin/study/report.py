@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 
 
 def require(*modules: str) -> None:
-    """Raise `ModuleNotFoundError` if a module is missing, so that a long computation does not end without its report.
-    """
+    """Raise `ModuleNotFoundError` if a module is missing, so that a long computation does not end without a report."""
     for module in modules:
         import_module(module)
 

@@ -74,8 +74,7 @@ class Credentials:
         return str(self.sections.get(section, {}).get(key, otherwise))
 
     def file(self, section: str, key: str) -> str | None:
-        """Return the absolute path of a file, or None if it is not given. Raise `AccessError` if the file is missing.
-        """
+        """Return the absolute path of a file, or None if it is not given. Raise `AccessError` if it does not exist."""
         name = self.text(section, key)
         if not name:
             return None

@@ -54,8 +54,7 @@ class FittedValue:
         return " to ".join(signed(number, self.digits) for number in self.prior[1:])
 
     def places(self) -> Array:
-        """Return value, low and high on a scale on which low, middle and high of the prior are -1, 0 and 1, shape (3,).
-        """
+        """Return value, low and high on a scale with -1, 0 and 1 at low, middle and high of the prior, shape (3,)."""
         if self.prior is None:
             return np.full(3, np.nan)
         scale = np.log if self.is_log else np.asarray

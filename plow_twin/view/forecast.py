@@ -17,8 +17,7 @@ _COLOURS = ("#1f4e9c", "#d62728")
 
 
 def draw_forecast(found: Forecast, path: FilePath, title: str) -> None:
-    """Draw a PNG with P10, P50 and P90 of both clearances over time, and the probability that a limit has been reached.
-    """
+    """Draw a PNG with P10, P50 and P90 of both clearances over time, and the probability that a limit is reached."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13.0, 4.8), layout="constrained", dpi=110)

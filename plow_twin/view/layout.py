@@ -168,15 +168,13 @@ def style_curves(stream: rr.RecordingStream) -> None:
 
 
 def band_colors(entity: str) -> list[tuple[int, ...]]:
-    """Return two colours of a band: of the opaque first stroke, which the legend shows, and of the faint other strokes.
-    """
+    """Return two colours of a band: of the opaque first stroke, which the legend shows, and of the other strokes."""
     color = _CLEARANCE_COLORS[entity.rpartition("/")[2]]
     return [(*(part // 2 for part in color), 255), (*color, _BAND_ALPHA)]
 
 
 def style_load(stream: rr.RecordingStream, largest: Iterable[float]) -> None:
-    """Put the largest loads into the names of the load curves, because the axis of a low plot shows only powers of ten.
-    """
+    """Put the largest loads into the names of the load curves, because the axis of a low plot has too few labels."""
     for entity, name, unit, color, value in zip(LOAD, *_LOAD_NAMES, _LOAD_COLORS, largest, strict=True):
         named = f"{name}, to {value:.3g} {unit}" if value else f"{name} [{unit}]"
         _style(stream, entity, named, color)

@@ -28,6 +28,7 @@ def run_many(
 
     A task with a stored result does not run again. The tasks run in `workers` processes, or on the Dask cluster with
     the scheduler at `dask`. The workers of the cluster must have access to the same files.
+
     Raises
     ------
     StudyError

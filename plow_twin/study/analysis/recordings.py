@@ -33,8 +33,7 @@ def _is_recording(folder: Path, results: Sequence[Path]) -> bool:
 
 
 def left_out(path: Path, results: Sequence[Path] = ()) -> list[Path]:
-    """Return the items in a folder that `expand` omits: empty folders, tables beside runs, and runs inside other runs.
-    """
+    """Return the items in a folder that `expand` omits: empty folders, tables beside runs, and runs in other runs."""
     if not path.is_dir():
         return []
     folders = [item for item in sorted(path.iterdir()) if item.is_dir()]
@@ -48,6 +47,7 @@ def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
     """Return the recordings at the given paths, and those directly inside the given folders.
 
     The folders `results` contain results of an earlier analysis and are not recordings.
+
     Raises
     ------
     RecordingError

@@ -123,8 +123,7 @@ def _picture(found: Analysis) -> str:
 
 
 def write_table_of_runs(rows: list[dict[str, Any]], out: Path, left_out: Sequence[Path] = ()) -> None:
-    """Write `runs.parquet`, with a row for each recording, and a row with the reason for each folder that was left out.
-    """
+    """Write `runs.parquet`: a row for each recording, and a row with the reason for each folder that was left out."""
     flat = []
     for facts in [*rows, *({"run": str(path), "error": LEFT_OUT} for path in left_out)]:
         lost = sum(facts["lost"].values()) if "lost" in facts else None

@@ -49,6 +49,7 @@ class ThinnedSignal:
         self._came, self._stride = 0, 1
 
     def add(self, stamp_ns: int, value: float, stretch: int = 0) -> None:
+        """Add a value with its stamp [ns] and the number of its stretch."""
         if self._came % self._stride == 0:
             self._stamps.append(stamp_ns)
             self._values.append(value)

@@ -49,8 +49,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Start:
-    """Result of a start: its point in the cube, the values of the unknowns, and the objective before and after stage 3.
-    """
+    """Result of a start: its point in the cube, the unknowns, and the objective before and after stage 3."""
 
     number: int
     point: Array

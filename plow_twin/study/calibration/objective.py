@@ -53,8 +53,7 @@ class TargetObjective:
         self.scene = replace(self.scene, marks={})
 
     def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:
-        """Return the residual times the square root of the weight, for every candidate and target, shape (m, targets).
-        """
+        """Return the residual times the square root of the weight, shape (m, targets), for m candidates."""
         targets, settings = self.targets.targets, self.targets.settings
         paths = sorted({path for target in targets for path in target.paths})
         table = np.full((len(candidates), len(settings), len(paths)), np.nan)

@@ -62,8 +62,7 @@ class Unknown:
 
 
 def parse_unknown(text: str, scene: Scene) -> Unknown:
-    """Parse `PATH=LOW:HIGH[:log]`, `PATH=CHOICE,CHOICE..`, or `PATH` alone for a sign; raise a `StudyError` otherwise.
-    """
+    """Parse `PATH=LOW:HIGH[:log]`, `PATH=CHOICE,CHOICE..`, or `PATH` for a sign; raise a `StudyError` otherwise."""
     path, equals, rest = text.partition("=")
     check_path(scene, path)
     if not equals:

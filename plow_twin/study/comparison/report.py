@@ -67,8 +67,7 @@ def _figure(found: Comparison) -> Figure:
 
 
 def _lines(axis: Any, found: Comparison) -> None:
-    """Draw the median and the 95 % point of each pair's peaks as lines, because box plots of many groups would overlap.
-    """
+    """Draw the median and the 95 % point of each pair's peaks as lines, because box plots of many groups overlap."""
     peaks = [windows.pairs["peak"] / 1e3 for windows in found.groups.values()]
     places = np.arange(len(peaks))
     median, high = (np.array([np.percentile(values, point, axis=0) for values in peaks]) for point in (50.0, 95.0))

@@ -99,8 +99,7 @@ class _Sums:
             self.rows[number] = reduce(self.rows[number], value) if number in self.rows else value
 
     def of(self, numbers: list[int]) -> Array:
-        """Return the sums of the windows `numbers`, shape (len(numbers), width); a window without values has the sum 0.
-        """
+        """Return the sums of the windows `numbers`, shape (len(numbers), width), or 0 for a window without values."""
         return np.array([self.rows.get(number, np.zeros(self.width)) for number in numbers]).reshape(-1, self.width)
 
 
@@ -241,8 +240,7 @@ def _risen(part: Batched, window: Indexes) -> tuple[Batched, Indexes]:
 
 
 def _powers(part: Batched, newest: tuple[Indexes, Array] | None) -> tuple[Indexes, Array, Array]:
-    """Return stamps, the power into each contact [W], and whether the contact carries force. Begin at the row `newest`.
-    """
+    """Return stamps, the power into each contact [W], and whether it carries force, beginning with the row `newest`."""
     stamps, values = part.stamp_ns, part.values
     if newest is not None and newest[0][0] < stamps[0]:
         stamps, values = np.concatenate((newest[0], stamps)), np.concatenate((newest[1], values))

@@ -47,8 +47,7 @@ class Drops:
         return [i for i, given in enumerate(self.flight_rows) if given > LEAST_ROWS and len(self.bounces[i]) > 1]
 
     def until(self, index: int, bounce: int) -> int:
-        """Return the row of a bounce, counted from 0. If the drop has fewer bounces, return the row of the last bounce.
-        """
+        """Return the row of a bounce, counted from 0, or the row of the last bounce if the drop has fewer bounces."""
         return self.bounces[index][min(bounce, len(self.bounces[index]) - 1)]
 
     def inside(self, index: int) -> NDArray[np.bool_]:

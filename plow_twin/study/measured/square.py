@@ -184,8 +184,7 @@ def _free_flight(block: NDArray[np.void], axis: int, times: Array) -> tuple[Arra
 
 
 def _leaves_flight(rows: Array) -> bool:
-    """Return whether the last row follows an impact: its angle deviates from the line before, or it rises after a fall.
-    """
+    """Return whether the last row follows an impact: its angle deviates from a line, or it rises after a fall."""
     t = np.arange(-3.0, 1.0)
     turn = float(np.polyval(np.polyfit(t[:3], rows[-4:-1, 2], 1), t[3]))
     return bool(

@@ -79,7 +79,7 @@ def _labels(runs: PaperRuns) -> Contradiction:
     return Contradiction(
         'section 1 (l_ab = 0.27 m) and section 3 ("the upper points a and b")',
         "If a and b are the upper points, side ab is horizontal, and the frame is 0.27 m wide and 0.33 m high. The "
-        'Chinese words can also mean "points a and b on the frame". Fig. 1, which would show the labels, is not in the text.',
+        'words can also mean "points a and b on the frame". Fig. 1, which would show the labels, is not in the text.',
         f"this scene: a {frame.labels['a']}, b {frame.labels['b']}; ab {sides['ab']:g} m, ad {sides['ad']:g} m long, "
         f"frame {frame.width_m:g} m wide, {frame.height_m:g} m high",
     )
@@ -103,8 +103,8 @@ _WORDS: Final = (
     ),
     Contradiction(
         "section 5, captions of Figs 14 and 15",
-        "By the Chinese captions, the vertical clearance varies in Fig. 14 and the horizontal clearance in Fig. 15. The "
-        "English captions state the reverse. This study follows the Chinese captions.",
+        "By the Chinese captions, the vertical clearance varies in Fig. 14 and the horizontal clearance in Fig. 15. "
+        "The English captions state the reverse. This study follows the Chinese captions.",
         "Figs 10 and 11 have the order of the Chinese captions",
     ),
 )
@@ -114,9 +114,9 @@ def _check_length() -> Contradiction:
     first = min(moment.time_s for moment in MOMENTS)
     return Contradiction(
         "section 5, Fig. 13",
-        f"The check with RecurDyn ends at {FACE_T_END_S:g} s, and the quoted contacts occur after {first:g} s, so their "
-        "times cannot be compared. The check shows contacts of one face (counter-clockwise) and of two and three faces "
-        "(clockwise), but no numbers of forces.",
+        f"The check with RecurDyn ends at {FACE_T_END_S:g} s, and the quoted contacts occur after {first:g} s, so "
+        "their times cannot be compared. The check shows contacts of one face (counter-clockwise) and of two and "
+        "three faces (clockwise), but no numbers of forces.",
         "three contact states and two trends are the only evidence that the check confirms the model",
     )
 
@@ -124,9 +124,9 @@ def _check_length() -> Contradiction:
 _GAPS: Final = (
     Contradiction(
         "sections 2 and 3",
-        "The paper does not state the stiffness, damping and exponent of the contact law, or the signs of loads and "
-        "arms. The initial state, the step, and the time over which a force is averaged are missing too. The text lacks "
-        "equations (5) and (6).",
+        "The paper does not state the stiffness, damping and exponent of the contact law, or the signs of loads "
+        "and arms. The initial state, the step, and the time over which a force is averaged are missing too. The text "
+        "lacks equations (5) and (6).",
         "in the preset paper, each number that replaces a missing number is marked as reconstructed or assumed",
     ),
     Contradiction(

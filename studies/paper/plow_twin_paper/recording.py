@@ -38,8 +38,7 @@ _MIN_FREE_B: Final = 64 * 1024 * 1024
 
 @dataclass(frozen=True)
 class Recording:
-    """The files of a recorded run, and the pose of the head, shape (n, 3), at the times t of the samples, shape (n,).
-    """
+    """The files of a recorded run, and the pose of the head, shape (n, 3), at the times t of samples, shape (n,)."""
 
     mcap: Path
     rrd: Path

@@ -25,8 +25,7 @@ PARTED_M = 1e-3
 
 @dataclass(frozen=True)
 class Rotation:
-    """Results of the three models: constant moment, I about the centre of mass, and I about the centre of the cavity.
-    """
+    """Results of the models: constant moment, I about the centre of mass, and I about the centre of the cavity."""
 
     scenes: tuple[Scene, Scene, Scene]
     results: tuple[Result, Result, Result]

@@ -22,6 +22,7 @@ class Verdict(Enum):
 
     @staticmethod
     def of(agrees: bool) -> Verdict:
+        """Return the verdict for a statement that agrees or disagrees."""
         return Verdict.AGREES if agrees else Verdict.DISAGREES
 
 

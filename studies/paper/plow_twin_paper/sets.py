@@ -33,7 +33,9 @@ class Hold:
 
 @dataclass(frozen=True)
 class SetFigures:
-    """Figures of one set: share of its direction's contact time, total and longest hold [s], and number of long holds.
+    """Figures of one set: total and longest hold [s], and two further figures.
+
+    `share` is the share of the contact time for its direction of swing, and `count` the number of long holds.
     """
 
     share: float
