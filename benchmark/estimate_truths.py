@@ -210,8 +210,7 @@ def cutting(rng: np.random.Generator, t: Array) -> Array:
 
 
 def _motion(scene: Scene, group: Group, times: Array, end: float) -> tuple[Array, Array, Array]:
-    """Return the true poses at `times`, (n, 3), the final clearances, (2,), and the forces every `_FINE` [s], (k, 8).
-    """
+    """Return the poses at `times`, (n, 3), the clearances at the end, (2,), and the forces every `_FINE` s, (k, 8)."""
     if not group.jam_m:
         run = simulate(scene, end, _FINE, 1e-6)
         q = np.stack([np.interp(times, run.t, column) for column in run.q.T], axis=1)

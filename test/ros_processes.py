@@ -40,7 +40,6 @@ _numbers = itertools.count()
 
 
 class Process:
-
     def __init__(self, module: str, arguments: Sequence[str], log: Path) -> None:
         self._log = log
         with log.open("wb") as stream:
@@ -72,8 +71,7 @@ class Process:
         return self._process.wait()
 
     def close(self) -> None:
-        """End the process by a signal that it handles, because a killed process would leave its shared memory behind.
-        """
+        """End the process by a signal that it handles, because a killed process would leave its shared memory behind."""
         if self.running:
             self._process.terminate()
             try:

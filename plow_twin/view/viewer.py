@@ -104,9 +104,7 @@ def page_port(asked: int) -> int:
         try:
             probe.bind((LOOPBACK, asked))
         except OSError as error:
-            raise RecordingError(
-                f"web port: got {asked}, expected a free port, or 0 ({error.strerror})"
-            ) from error
+            raise RecordingError(f"web port: got {asked}, expected a free port, or 0 ({error.strerror})") from error
     return asked
 
 
