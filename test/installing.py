@@ -65,7 +65,7 @@ def run(*command: str | Path, cwd: Path, env: dict[str, str] | None = None, code
 
 
 def make_environment(folder: Path, *requirements: str) -> Path:
-    """Create a virtual environment with the given requirements at the locked versions. Return the path of its Python."""
+    """Create a virtual environment with the given requirements at the locked versions. Return its Python."""
     run(sys.executable, "-m", "venv", folder, cwd=folder.parent)
     python = folder / "bin" / "python"
     install(python, *requirements)

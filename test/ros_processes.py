@@ -71,7 +71,7 @@ class Process:
         return self._process.wait()
 
     def close(self) -> None:
-        """End the process by a signal that it handles, because a killed process would leave its shared memory behind."""
+        """End the process by a signal that it handles, because a killed process would not release its shared memory."""
         if self.running:
             self._process.terminate()
             try:

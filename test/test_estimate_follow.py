@@ -81,7 +81,7 @@ def _run(follower: Follower, truth: Truth, end: float, begin: float = -1.0, late
 
 
 def _take(follower: Follower, found: Estimate) -> bool:
-    """Add an estimate at the present time. Return whether the twins follow it; otherwise, they follow the prior again."""
+    """Add an estimate at the present time. Return whether the twins follow it; if not, they follow the prior again."""
     before = follower.drawn
     follower.add_estimate(json.dumps(found.as_dict()), follower.time)
     return follower.drawn != before

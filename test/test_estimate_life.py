@@ -262,7 +262,7 @@ def test_a_path_that_does_not_come_to_its_end_is_no_limit_never_reached() -> Non
 
 
 def test_a_clearance_hardly_known_is_not_below_zero() -> None:
-    """A clearance drawn from its prior can be -70 mm, from which the path to the limit leaves the range of the model."""
+    """A clearance drawn from its prior can be -70 mm, from which the path leaves the range of the model."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     found = forecast(scene, Plan(0.026, 0.031, 1e3, draws=50), (0.03, 0.03))
     assert found.now.min() > 0.0

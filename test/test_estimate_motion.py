@@ -1,4 +1,4 @@
-"""The estimate from a measured motion: its intervals contain the values of a simulated machine, or it states why not."""
+"""The estimate from a measured motion: its intervals contain the true values, or the result states why not."""
 
 from __future__ import annotations
 

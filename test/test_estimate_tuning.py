@@ -1,4 +1,4 @@
-"""The numbers of the estimator: each number is in the documented table, or a comment states its origin."""
+"""Each number of the estimator is in the table of tuned numbers, or a comment states its origin."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ ORIGIN = re.compile(r"\b(definition|derived|bounds?|guards?|steps?|prior)\b", re
 
 
 def unexplained(source: str) -> list[str]:
-    """Return the numeric constants of a module whose comments do not state their origin.
+    """Return the numeric constants of a module without a comment that states their origin.
 
-    A comment applies to the assignments after it, up to another comment or an empty line.
+    A comment applies to all following assignments, up to another comment or an empty line.
     """
     lines, found, explained_until = source.split("\n"), [], -1
     for node in ast.parse(source).body:

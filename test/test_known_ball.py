@@ -97,7 +97,7 @@ def one_bounce_a_period(gamma: float, r: float, stiffness: float) -> bool:
 
 
 def existence_threshold(r: float, stiffness: float) -> float:
-    """Return the smallest gamma with one bounce per period, to 1e-4. The search begins at the value of a rigid table."""
+    """Return the smallest gamma with one bounce per period, to 1e-4. The search begins at the rigid table's value."""
     rigid = math.pi * (1.0 - r) / (1.0 + r)
     low, high = 0.97 * rigid, 1.02 * rigid
     assert one_bounce_a_period(high, r, stiffness) and not one_bounce_a_period(low, r, stiffness)

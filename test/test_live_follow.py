@@ -1,4 +1,4 @@
-"""A live twin that follows its machine: estimates are adopted, withdrawn, corrected, and reproduced from the journal."""
+"""A live twin that follows its machine: estimates are adopted, withdrawn, corrected, and replayed."""
 
 from __future__ import annotations
 

@@ -148,7 +148,7 @@ def _module_name(path: Path) -> str:
 
 
 def _module_imports(path: Path, modules: set[str]) -> set[str]:
-    """Return the modules of the package that a module imports, including lazy imports and imports for the type checker."""
+    """Return the modules of the package that a module imports, including lazy and type-checking imports."""
     found = set()
     for node in _statements(path):
         if isinstance(node, ast.Import):
@@ -170,7 +170,7 @@ def test_no_module_imports_itself_by_a_detour() -> None:
 
 
 def test_the_cache_stamp_and_the_build_fingerprint_cover_every_kernel() -> None:
-    """A change in a kernel outside their coverage would load old code from the cache, and not change the fingerprint."""
+    """After a change in an uncovered kernel, old code would be loaded from the cache without a new fingerprint."""
     compiled = [path for path in _modules() if "plow_twin.kernel.compiler.kernel" in _imported_names(path)]
     assert len(compiled) > 10
     subpackages = {path.relative_to(PACKAGE).parts[0] for path in compiled}

@@ -49,7 +49,7 @@ def view(run: Run) -> tuple[ViewSummary, dict[str, pa.Table]]:
 
 
 def read(path: Path) -> dict[str, pa.Table]:
-    """Return the rows in time of each entity in a rerun file. Colours that change in time are under `<entity> colors`."""
+    """Return the rows of each entity in a rerun file. Colours that change in time are under `<entity> colors`."""
     batches: dict[str, list[pa.RecordBatch]] = {}
     for chunk in RrdReader(str(path)).stream():
         if not chunk.is_static:
