@@ -214,8 +214,8 @@ class Twin:
 
         Raises
         ------
+        ArgumentError
             The arguments are not valid (see `advance`). The twin is unchanged.
-            As for `advance`; the twin is unchanged.
         """
         if self.excitation != "sampled":
             raise ArgumentError("advance_samples: got excitation='scene', expected excitation='sampled'")
