@@ -97,8 +97,8 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
     ----------
     scene : Scene
         A scene with wear; `wear.prior_m2_n` is the prior. Its clearances are replaced by the first row of the history.
-        history : History
-            Clearances against travel.
+    history : History
+        Clearances against travel.
 
     Raises
     ------

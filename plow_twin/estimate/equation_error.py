@@ -88,8 +88,8 @@ class EquationError:
     ----------
     unknowns : Unknowns
         The scene, and the reference force at which penetrations are stated.
-        load : Load
-            The measured load.
+    load : Load
+        The measured load.
     t : ndarray, shape (n,)
         Times of the poses in s.
     """

@@ -85,8 +85,8 @@ def estimate(
     scene : Scene
         The nominal scene. Its geometry, masses and gravity are assumed to be exact. Its clearances and contact are
         means of the prior.
-        load : Load
-            The measured load.
+    load : Load
+        The measured load.
     poses : Poses
         The measured poses.
     lost : int

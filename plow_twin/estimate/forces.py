@@ -91,9 +91,9 @@ class ForceEnsemble:
         The estimate from which members are drawn; it must not be withdrawn.
     members : int
         Number of members, at least 20.
-        seed : int
-            Seed of the random numbers.
-        start : float
+    seed : int
+        Seed of the random numbers.
+    start : float
         Time in s at which all members are in the scene's initial state.
 
     Raises

@@ -188,8 +188,8 @@ def forecast(
     scene : Scene
         A scene with wear, the present clearances and the expected loads. `wear.prior_m2_n` contains the 5 % and 95 %
         quantiles of the log-normal distribution of the wear coefficient.
-        plan : Plan
-            Limits and operation of the machine.
+    plan : Plan
+        Limits and operation of the machine.
     deviation_m : tuple of float
         Standard deviations of the present clearances in m.
     known : Coefficient or None

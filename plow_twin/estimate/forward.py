@@ -44,8 +44,8 @@ class Forward:
     ----------
     scene : Scene
         The nominal scene, whose loads and wear are not used.
-        load : Load
-            The measured load.
+    load : Load
+        The measured load.
 
     Raises
     ------

@@ -48,8 +48,8 @@ class Poses:
         x, y [m] and theta [rad]; NaN where a component was not measured.
     deviation : tuple of 3 float
         Stated standard deviation of each component; 0 if not stated.
-        assumed : ndarray, shape (n, 3), optional
-            Poses of a model, which replace a component that was never measured where all three components are needed.
+    assumed : ndarray, shape (n, 3), optional
+        Poses of a model, which replace a component that was never measured where all three components are needed.
     """
 
     t: Array

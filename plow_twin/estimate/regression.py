@@ -17,8 +17,8 @@ def ridge(basis: Array, penalty: float, weight: Array | None = None) -> tuple[Ar
     ----------
     basis : ndarray, shape (n, k)
         Design matrix. The first column is the constant term, which is not penalised.
-        penalty : float
-            Number that is added to the diagonal of the normal matrix.
+    penalty : float
+        Number that is added to the diagonal of the normal matrix.
     weight : ndarray, shape (n,), optional
         Weights of the rows.
     """

@@ -1,4 +1,4 @@
-"""The estimate: values with 90 % intervals, their states, and whether model and sensor can be trusted."""
+"""The result of an estimate: values with 90 % intervals, states of the values, and faults of model and sensor."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from plow_twin.estimate.unknowns import CORRELATED, QUANTITIES
 
 Array = NDArray[np.float64]
 
-#: Derived: quantile of the normal distribution at which a 90 % interval ends.
+#: 95 % quantile of the standard normal distribution, derived with `scipy.special.ndtri`.
 NORMAL_P95: Final = float(ndtri(0.95))
-#: Guard: number of standard deviations beyond which the tail of the normal distribution is nearly exponential.
+#: Bound in standard deviations beyond which the tail of the normal distribution is treated as exponential.
 _FAR = 30.0
 _STANDARD: Final = NormalDist()
 
 
 class State(Enum):
-    """Reliability of a value."""
+    """Reliability of an estimated value."""
 
     ESTIMATED = "estimated"
     ROUGH = "rough"  #: the machine differs from the model, or the interval is wide
@@ -43,7 +43,7 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class Interval:
-    """A value with the 5 % and 95 % points of its distribution."""
+    """A value with the 5 % and 95 % quantiles of its distribution."""
 
     mean: float
     p05: float
@@ -51,21 +51,21 @@ class Interval:
 
     @staticmethod
     def normal(mean: float, deviation: float) -> Interval:
-        """Return mean, 5 % and 95 % point of a normal distribution."""
+        """Return mean, 5 % quantile and 95 % quantile of a normal distribution."""
         half = NORMAL_P95 * float(deviation)
         return Interval(float(mean), float(mean) - half, float(mean) + half)
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of the normal distribution that has these 5 % and 95 % points."""
+        """Standard deviation of the normal distribution with the same 5 % and 95 % quantiles."""
         return (self.p95 - self.p05) / (2.0 * NORMAL_P95)
 
     def times(self, unit: float) -> Interval:
-        """Return the interval with its value and both points multiplied by a unit."""
+        """Return the interval with value and quantiles multiplied by `unit`."""
         return Interval(self.mean * unit, self.p05 * unit, self.p95 * unit)
 
     def above(self, least: float) -> Interval:
-        """Return the interval of this normal distribution truncated at `least`."""
+        """Return the interval of the normal distribution after truncation below `least`."""
         deviation = self.deviation
         if deviation <= 0.0 or (least - self.mean) < -4.0 * deviation:
             return self
@@ -74,11 +74,11 @@ class Interval:
 
 
 def _tail(least: float) -> tuple[float, float, float]:
-    """Return mean, 5 % and 95 % points of a standard normal variable that is above `least`.
+    """Return mean, 5 % quantile and 95 % quantile of the standard normal distribution truncated below `least`.
 
-    scipy's `truncnorm` is not used, because its import takes half a second.
+    `scipy.stats.truncnorm` is not used, because its import takes half a second.
     """
-    if least > _FAR:  # beyond `_FAR` the tail is nearly exponential
+    if least > _FAR:  # the tail is treated as exponential, because `erfc` underflows
         return least + 1.0 / least, least - math.log(0.95) / least, least - math.log(0.05) / least
     share = 0.5 * math.erfc(least / math.sqrt(2.0))
     mean = math.exp(-0.5 * least * least) / (math.sqrt(2.0 * math.pi) * share)
@@ -89,10 +89,10 @@ def _tail(least: float) -> tuple[float, float, float]:
 class Cell:
     """Estimated properties of a load cell.
 
-    rows : number of rows in or near contact with its pair
+    rows : number of rows in which the pair of the cell is in or near contact
     gain : measured force divided by true force
-    offset, noise : mean and standard deviation of its readings in flight, in N
-    left_over : share of its force that the fit does not explain, beyond the noise
+    offset, noise : median and standard deviation of the readings during flight in N
+    left_over : share of the force that remains unexplained beyond noise
     """
 
     rows: int
@@ -104,11 +104,11 @@ class Cell:
 
 @dataclass(frozen=True)
 class ForcesUsed:
-    """How measured contact forces were used.
+    """Use of measured contact forces in an estimate.
 
-    cells : the cells, by pair
-    delay : delay of their stamps behind the motion in s
-    unused : reason why the forces do not improve the estimate; empty if they do
+    cells : properties of the load cells, by pair
+    delay : delay in s of the stamps of the forces relative to the motion
+    unused : reason why the forces were not used; empty if they were used
     """
 
     cells: dict[str, Cell] = field(default_factory=dict)
@@ -116,7 +116,7 @@ class ForcesUsed:
     unused: str = ""
 
     def in_units(self, force: float, time: float) -> ForcesUsed:
-        """Return the result converted from these units of force and time to SI."""
+        """Return the result converted to SI from given units of force and time."""
         cells = {
             name: replace(cell, offset=cell.offset * force, noise=cell.noise * force)
             for name, cell in self.cells.items()
@@ -124,7 +124,7 @@ class ForcesUsed:
         return replace(self, cells=cells, delay=None if self.delay is None else self.delay.times(time))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the result for JSON."""
+        """Return the result as JSON values."""
         cells = {
             name: {
                 "rows": cell.rows,
@@ -142,10 +142,11 @@ class ForcesUsed:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The measured motion, and the model's motion as the sensor would show it, that is with bias and delay.
+    """The measured motion, and the fitted motion of the model with the bias and the delay of the sensor.
 
     t : (n,) stamps in s
-    measured, model : (n, 3) x, y in m, theta in rad; NaN where not measured, and where the model was not fitted
+    measured : (n, 3) x, y in m and theta in rad, NaN without a measurement
+    model : (n, 3) fitted motion in the same units, NaN where the model was not fitted
     """
 
     t: Array
@@ -154,60 +155,63 @@ class Motion:
 
     @property
     def residual(self) -> Array:
-        """Measured minus model, shape (n, 3)."""
+        """Measured motion minus fitted motion, shape (n, 3)."""
         return self.measured - self.model
 
     def in_units(self, length: float, time: float) -> Motion:
-        """Return the result converted from these units of length and time to SI."""
+        """Return the motion converted to SI from given units of length and time."""
         scale = np.array([length, length, 1.0])
         return Motion(self.t * time, self.measured * scale, self.model * scale)
 
     def moved(self, by: Array) -> Motion:
-        """Return both motions moved by x, y, theta."""
+        """Return the motion after `by` (x, y, theta), shape (3,), has been added to measured and fitted poses."""
         return Motion(self.t, self.measured + by, self.model + by)
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Everything that is estimated from one window.
+    """Result of the estimate from one window.
 
     Attributes
     ----------
     t_start, t_end : float
-        The window in s.
+        Beginning and end of the window in s.
     horizontal, vertical : Interval
-        Clearances in m. Their states are `horizontal_state` and `vertical_state`.
+        Clearances in m. The fields `horizontal_state` and `vertical_state` contain the states of the clearances.
     stiffness, damping : Interval
-        Stiffness K in N/m^n, and the law's damping or restitution.
+        Stiffness K in N/m^n, and damping or restitution of the contact law.
     gain_fx, gain_fy, gain_m : Interval
-        True load divided by believed load.
+        True load divided by measured load.
     bias_x, bias_y, bias_theta : Interval
         Measured minus true pose in m, m, rad.
     delay : Interval
-        Delay of the stamps behind the motion, in s.
+        Delay in s of the stamps of the poses relative to the motion.
     noise : tuple of float
         Standard deviation of the measured x, y, theta in m, m, rad.
     model, sensor : str
-        `ok` or `suspect`; `reasons` holds the causes.
+        Either `ok` or `suspect`; the field `reasons` contains the causes.
     lost : int
-        Rows that could not be used.
+        Number of rows that could not be used.
     correlation : tuple of tuple of float
-        Correlation matrix of the quantities in `CORRELATED`. An error of the clearance can partly be offset by an error
-        of the stiffness.
+        Correlation matrix of the quantities in `CORRELATED`. For example, errors of clearance and stiffness can
+        partly compensate each other.
     groups : dict of str to (Interval, State)
-        Clearance between facing pads: `horizontal_top`, `horizontal_bottom`, `vertical_left`, `vertical_right`, in m.
+        Clearance in m between facing pads: `horizontal_top`, `horizontal_bottom`, `vertical_left`,
+        `vertical_right`.
     forces_measured : ForcesUsed, optional
-        How contact forces were used, if they were measured.
+        Use of measured contact forces; None if no forces were measured.
     differs : dict of str to (float, float, float)
-        For each further quantity of machine and sensor: the probability that it differs from the scene, and mean and
-        standard deviation of the difference if it does.
+        For each further quantity of machine and sensor, the probability of a difference from the scene, and mean
+        and standard deviation of the difference.
     apparent : tuple of (Interval, Interval), optional
-        Clearances in m with which a machine that has exactly the scene's frame would move like the measured machine.
-        They are given if they are known better than the true clearances; twins are then drawn from them.
+        Clearances in m with which a machine with exactly the scene's frame would move like the measured machine.
+        They are present if they are more accurate than the true clearances. Twins are then drawn from the apparent
+        clearances.
     load_harmonics : Harmonics, optional
-        Harmonics that the measured load lacks, if the motion shows them; their times are those of the window.
+        Harmonics that are missing from the measured load, with times of the window; None without evidence of
+        harmonics.
     motion : Motion, optional
-        The fitted motion; None if the motion is not known moment by moment. It is not part of `as_dict`.
+        The fitted motion; None if the fit does not give the motion at each time. It is not part of `as_dict`.
     """
 
     t_start: float
@@ -241,7 +245,7 @@ class Estimate:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Estimate:
-        """Return the estimate from `data`, made by `as_dict`, without groups, figures and motion."""
+        """Return the estimate from `data`, a result of `as_dict`, but without groups, figures and motion."""
 
         def clearance(name: str) -> tuple[Interval, State]:
             one = data[name]
@@ -266,7 +270,7 @@ class Estimate:
         )  # fmt: skip
 
     def _repr_html_(self) -> str:
-        """Return the values with their intervals as a table, which notebooks show."""
+        """Return a table of the values with intervals for notebooks."""
         states = {"horizontal": self.horizontal_state, "vertical": self.vertical_state}
         values, rows = self.values(), []
         for one in (quantity for quantity in QUANTITIES if quantity.name in values):
@@ -281,16 +285,16 @@ class Estimate:
         return f"<table><caption>{title}</caption><tr>{heads}</tr>{body}</table>{reasons}"
 
     def in_scene_frame(self) -> tuple[Interval, Interval]:
-        """Return the clearances of a machine that has exactly the scene's frame: `apparent` if it is known."""
+        """Return the clearances for a frame of exactly the scene's size: `apparent` if present, else the clearances."""
         return self.apparent or (self.horizontal, self.vertical)
 
     def values(self) -> dict[str, Interval]:
-        """Return all estimated values by the names of `QUANTITIES`."""
+        """Return all estimated values, by the names of `QUANTITIES`."""
         every = ((quantity.name, getattr(self, quantity.name)) for quantity in QUANTITIES)
         return {name: value for name, value in every if value is not None}
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the estimate for JSON, as `plow-twin estimate --json` prints it."""
+        """Return the estimate as JSON values, in the format of `plow-twin estimate --json`."""
 
         def clearance(value: Interval, state: State) -> dict[str, Any]:
             return {"mean_m": value.mean, "p05_m": value.p05, "p95_m": value.p95, "state": state.value}

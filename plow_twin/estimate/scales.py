@@ -1,8 +1,8 @@
-"""Test of the sensor's scales, because an error of a scale causes an error of the clearances.
+"""Test of the sensor's scale factors, because an error of a scale factor causes an error of the clearances.
 
-The scales can be tested because accelerations in flight are known from the load, the mass and gravity, and because the
-frame determines the reach of x and y of a turned head. Three scales are further unknowns beside a fit. One linearised
-step estimates them, with all other unknowns eliminated (score test).
+The motion determines the scale factors in two ways: load, mass and gravity give the accelerations during flight, and
+the size of the frame gives the displacement of a rotated head. The scale factors are estimated in one linearised step
+from a fit, with all other unknowns eliminated (score test).
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Scales:
-    """Estimated scales.
+    """Estimated scale factors of the sensor.
 
-    scale : (3,) measured divided by true x, y, theta
-    chi2 : chi^2 of the three scales, on average 3 if they are right
+    scale : (3,) measured values divided by true values of x, y and theta
+    chi2 : chi^2 of the three scale factors, 3 on average if the factors are 1
     """
 
     scale: Array
@@ -31,7 +31,7 @@ class Scales:
 
 
 def scales_of(problem: Problem, found: Fit) -> Scales:
-    """Return the sensor's scales from the residuals of a fit."""
+    """Return the scale factors of the sensor from the residuals of a fit."""
     motion = np.nan_to_num(problem.window.poses.q - found.point.residual - found.shared[BIAS])
     columns = motion[:, :, None] * np.eye(3)
     step, covariance = joint_step(problem, found, columns, np.full(3, NO_PRIOR), np.zeros(3))

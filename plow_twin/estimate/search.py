@@ -1,4 +1,8 @@
-"""Search for the best fit: the horizon of each swing grows while candidates are dropped."""
+"""Search for the best fit.
+
+The search has several stages. From stage to stage, the *horizon*, which is the fitted part at the beginning of each
+swing, grows, and the number of candidates decreases.
+"""
 
 from __future__ import annotations
 
@@ -21,26 +25,30 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Stage:
-    """A round: horizon as a share of the period, number of iterations, and number of candidates kept afterwards."""
+    """A stage of the search.
+
+    horizon : horizon as a share of the period
+    iterations : number of iterations of each fit
+    keep : number of candidates for the next stage
+    """
 
     horizon: float
     iterations: int
     keep: int
 
 
-#: Derived: smallest numbers of rows within a horizon and within a swing, so that each component has more values than
-#: the six unknowns of the swing's start.
+#: Smallest numbers of rows within a horizon and within a swing, derived from the six unknowns of the start of a swing.
 _FEWEST_ROWS = (8, 12)
-#: Prior: the differences of a machine that differs from the model only by a slow low pass of its sensor.
+#: Differences of a machine with a low pass of the sensor as the only difference, from its prior standard deviation.
 LOW_PASS: Final = np.array([0.0] * LAG + [UNSTATED["filter"]])
-#: Bound: the rounds of the search; each round keeps fewer candidates than the previous round.
+#: Stages of the search, with bounds of the horizon, of the iterations and of the number of candidates.
 STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
-#: Bound: largest number of swings, because the cost of a fit grows with their number.
+#: Upper bound of the number of swings, which determines the cost of a fit.
 _MOST_SWINGS = 350
 
 
 def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float) -> tuple[Problem, Fit] | None:
-    """Return the best fit to the beginnings of the first swings, or None if no start could be run."""
+    """Return the best fit to the beginnings of the first swings; None if no starting point could be simulated."""
     interval = poses.interval()
     first = poses.between(float(poses.t[0]), float(poses.t[0]) + tuning.FIRST_PERIODS * period)
     window = cut(unknowns.scene, first, period, max(0.2 * period, _FEWEST_ROWS[1] * interval))
@@ -65,10 +73,10 @@ def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float)
 
 
 def _have_met(fits: list[Fit], newest: Fit) -> bool:
-    """Return whether the newest and another fit agree in clearances and loss, and no fit is better than these two.
+    """Return whether the two best fits agree in clearances and loss, and one of the two is the fit `newest`.
 
-    `fits` are ordered, best first. If starts of different stiffness lead to the same point, it is the optimum. If only
-    the clearances agree, one of the two fits is in a false optimum of a swing's starting state.
+    `fits` are sorted by loss. Two starting points with different stiffness that lead to the same clearances and loss
+    have found the optimum. If only the clearances agree, a starting state in one of the fits is in a false optimum.
     """
     if len(fits) < 2 or newest not in fits[:2]:
         return False
@@ -78,10 +86,11 @@ def _have_met(fits: list[Fit], newest: Fit) -> bool:
 
 
 def behind_low_pass(problem: Problem, found: Fit) -> Fit | None:
-    """Fit the same swings again, with the sensor's low pass fixed at its prior standard deviation.
+    """Return a fit of the same swings with the time constant of the sensor's low pass fixed at its prior deviation.
 
-    Returns None if this fit is not clearly better, or if the poses are too rare to show a low pass. A fit without a low
-    pass does not lead to a slow one, because impacts are shorter than its time constant.
+    The result is None if the new fit is not clearly better, or if the poses are too rare to show a low pass. The
+    separate fit is needed because steps from a fit without a low pass do not lead to a slow low pass, whose time
+    constant exceeds the duration of an impact.
     """
     if problem.window.poses.interval() > RESOLVING:
         return None
@@ -96,20 +105,37 @@ def refine(
     forward: Forward, unknowns: Unknowns, poses: Poses, period: float, shared: Array, noise: Array, drift: Array | None,
     differences: Array | None = None, close: bool = False,
 ) -> tuple[Problem, Fit] | None:  # fmt: skip
-    """Fit all poses from a good start, first the beginning of each swing only.
+    """Return a fit to all poses from a good starting point; None if it cannot be simulated.
 
-    If the start is `close` to the optimum, long swings with a hard contact converge too.
+    The beginnings of the swings are fitted first, then whole swings.
 
-    `drift`, shape (3,), is the spectral density of the acceleration due to the unknown part of a broad-band load, in
-    m2/s3 and rad2/s3; None for any other load. `differences`, shape (7,), stay fixed.
+    Parameters
+    ----------
+    forward, unknowns : Forward, Unknowns
+        Forward model and prior.
+    poses : Poses
+        The measured poses.
+    period : float
+        Period of the load in s.
+    shared : ndarray, shape (SIZE,)
+        Starting point.
+    noise : ndarray, shape (3,)
+        First guess of the standard deviation of the measurements.
+    drift : ndarray, shape (3,), or None
+        Spectral density of the acceleration due to the unknown part of a broad-band load in m2/s3 and rad2/s3; None for
+        any other load.
+    differences : ndarray, shape (7,), optional
+        Fixed differences from the model.
+    close : bool
+        Whether the starting point is close to the optimum. The fit then converges with long swings even if the contact
+        is hard.
     """
     hard = not close and bool(np.exp(shared[SOFTNESS]) < tuning.HARD)
     rows = poses.interval() * np.array(_FEWEST_ROWS)
     shortest = tuning.SHORTEST[0 if hard else 1 if drift is None else 2]
     horizon = tuning.HARD_HORIZON if hard else np.inf
     if drift is not None and not hard:
-        # during a swing, the unknown part of the load may move the head by no more than the sensor's noise, so swings
-        # must be short
+        # swings must be so short that the unknown part of the load moves the head by no more than the noise
         shortest = min(max(shortest, float(np.cbrt(3.0 * noise**2 / drift).min()) / period), tuning.SHORTEST[1])
     shortest = max(shortest * period, rows[1], float(poses.t[-1] - poses.t[0]) / _MOST_SWINGS)
     horizon = max(horizon * period, rows[0])
@@ -118,7 +144,7 @@ def refine(
         forward, unknowns, window, horizon=min(near_horizon(poses, period), horizon), differences=differences
     )
     starts = [shared]
-    if unknowns.is_hard(shared):  # this second start is useful only for hard contacts
+    if unknowns.is_hard(shared):  # other contacts need no second starting point
         starts.append(range_of_hard(unknowns, poses, shared))
     fits = []
     for start in starts:
@@ -134,12 +160,12 @@ def refine(
 
 
 def near_horizon(poses: Poses, period: float) -> float:
-    """Return the horizon in s of a fit to the beginnings of swings."""
+    """Return the horizon in s for a fit to the beginnings of swings."""
     return max(0.2 * period, _FEWEST_ROWS[0] * poses.interval())
 
 
 def range_of_hard(unknowns: Unknowns, poses: Poses, shared: Array) -> Array:
-    """Return a start with a hard contact and with the range of motion as clearances."""
+    """Return a starting point with a hard contact and with the range of motion as clearances."""
     start = unknowns.nominal()
     clearance, bias = range_of_motion(unknowns.scene, poses)
     start[[GX, GY]], start[BIAS][:2] = clearance, bias
@@ -149,14 +175,14 @@ def range_of_hard(unknowns: Unknowns, poses: Poses, shared: Array) -> Array:
 
 
 def states_at(window: Window, shared: Array) -> Array:
-    """Return the guesses of the starting states without the bias, shape (s, 6)."""
+    """Return the first guesses of the starting states without the bias of the sensor, shape (s, 6)."""
     states = window.states.copy()
     states[:, :3] -= shared[BIAS]
     return states
 
 
 def better_states(problem: Problem, shared: Array, states: Array) -> Array:
-    """Replace each starting state by the end of the previous swing, if that fits the swing's first poses better."""
+    """Return starting states in which the end of the previous swing replaces a state if it fits the poses better."""
     window, scene = problem.window, problem.unknowns.scene_of(shared)
     gain = shared[GAIN]
     poses = window.poses

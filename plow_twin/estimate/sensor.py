@@ -1,8 +1,8 @@
-"""Sensors with a lever arm, and sensors that follow the pose with a lag.
+"""Models of a sensor with a lever arm, and of a sensor with a low pass.
 
-A sensor with a lever arm measures a point away from the head's centre, which also moves when the head turns. A
-first-order low pass y follows the pose u by tau dy/dt = u - y. Its mean delay tau is part of the stamps' delay. For a
-small tau the remaining difference is tau^2 / 2 times the acceleration.
+A sensor with a lever arm measures a point that is not at the centre of the head, and which therefore moves when the
+head rotates. A first-order low pass y of the pose u obeys tau dy/dt = u - y. The mean delay tau of the low pass is part
+of the delay of the stamps. For a small tau, the remaining difference is tau^2 / 2 times the acceleration.
 """
 
 from __future__ import annotations
@@ -16,13 +16,16 @@ from plow_twin.estimate.measurements import Poses, filled
 
 Array = NDArray[np.float64]
 
-#: Derived: number of rows to which a parabola is fitted for the measured pose at a swing's start. The poses of a slow
-#: sensor round off a kink over as many rows.
+#: Number of rows to which a parabola is fitted for the measured pose at the start of a swing, derived from the number
+#: of rows over which a slow sensor smooths a kink.
 _ROWS: Final = 7
 
 
 def moved_by_lever(q: Array, v: Array, lever: Array) -> tuple[Array, Array]:
-    """Return poses and rates, (n, 3) each, as measured with a lever arm (2,) in m, without the constant arm itself."""
+    """Return poses and rates, (n, 3) each, as a sensor with a lever arm measures them.
+
+    `lever`, shape (2,), is the lever arm in m in the axes of the head. Its constant value at theta = 0 is subtracted.
+    """
     c, s = np.cos(q[:, 2:]), np.sin(q[:, 2:])
     arm, across = lever, np.array([-lever[1], lever[0]])
     place, rate = q.copy(), v.copy()
@@ -32,7 +35,7 @@ def moved_by_lever(q: Array, v: Array, lever: Array) -> tuple[Array, Array]:
 
 
 class Memory:
-    """The measured pose as a smooth curve, which gives the state of a low pass at the start of a swing."""
+    """Smoothed measured poses, which give the initial state of a low pass at the start of a swing."""
 
     def __init__(self, poses: Poses) -> None:
         q = filled(poses)
@@ -44,5 +47,5 @@ class Memory:
         self._t, self._q = poses.t, q
 
     def at(self, t: Array) -> Array:
-        """Return the pose at some stamps, shape (k, 3)."""
+        """Return the smoothed pose at k stamps in s, shape (k, 3)."""
         return np.stack([np.interp(t, self._t, column) for column in self._q.T], axis=1)

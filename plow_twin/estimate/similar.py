@@ -1,7 +1,8 @@
-"""Machines of other sizes, estimated in units in which they have the size of the paper's machine.
+"""Conversion of a machine of any size to units in which it has about the size of the paper's machine.
 
-The thresholds were chosen for this size. The equations of motion keep their form in other units of length, mass and
-time (mechanical similarity). The units are powers of two, so that the conversion does not round.
+The thresholds of the estimate were chosen for the size of the paper's machine. The equations of motion have the same
+form in any units of length, mass and time (mechanical similarity). The units are powers of two, so that the conversion
+causes no rounding errors.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from plow_twin.model.scene import Clearance, Contact, Friction, Initial, Provena
 if TYPE_CHECKING:
     from plow_twin.estimate.contact_forces import ContactForces
 
-#: Definition: half of the frame's diagonal [m], mass [kg] and load period [s] of the paper's machine.
+#: Half of the frame's diagonal [m], mass [kg] and load period [s] of the paper's machine, by definition.
 PAPER_LENGTH, _MASS, _PERIOD = 0.213, 2430.0, 3.14
 
 
@@ -37,7 +38,9 @@ class Units:
 
     @staticmethod
     def of(scene: Scene, load: Load) -> Units:
-        """Return units in which a machine has the paper's size; SI units if it nearly has this size."""
+        """Return units in which a machine has about the size of the paper's machine; SI units if the sizes are
+        similar.
+        """
         period = load.oscillation() or _PERIOD
         sizes = geometry.half_diagonal(scene) / PAPER_LENGTH, scene.head.mass_kg / _MASS, period / _PERIOD
         if scene.support is not None or all(
@@ -48,12 +51,12 @@ class Units:
 
     @property
     def only_time(self) -> bool:
-        """Whether only the load's period differs from the paper's."""
+        """Whether only the unit of time differs from SI."""
         return self.length == self.mass == 1.0
 
     @property
     def force(self) -> float:
-        """The unit of force in N."""
+        """Unit of force in N."""
         return self.mass * self.length / self.time**2
 
     def scene(self, scene: Scene) -> Scene:
@@ -105,7 +108,7 @@ class Units:
         return Poses(poses.t / self.time, poses.q / length, deviation)
 
     def gaps(self, gaps: Gaps | None) -> Gaps | None:
-        """Return gaps in these units; a sensor's error in m is the same for a machine of any size."""
+        """Return gaps in these units; an error that is not stated is assumed to be the same in m for any machine."""
         if gaps is None:
             return None
         return Gaps(gaps.t / self.time, gaps.gap / self.length, (gaps.deviation or tuning.CONSTANT_ERROR) / self.length)
@@ -117,7 +120,7 @@ class Units:
         return replace(forces, t=forces.t / self.time, force=forces.force / self.force)
 
     def in_si(self, found: Estimate, scene: Scene) -> Estimate:
-        """Return an estimate converted from these units to SI, for the `scene` in SI units."""
+        """Return an estimate converted from these units to SI; `scene` is the scene in SI units."""
         contact = scene.contact
         length, time = self.length, self.time
         unit = {
@@ -162,7 +165,9 @@ class Units:
         )
 
     def _damping(self, contact: Contact) -> float:
-        """Return the SI value of the unit of the law's damping: in N s/m, or in s/m if damping multiplies the force."""
+        """Return the unit of the damping in SI: N s/m for an additive damping, s/m for a damping that multiplies the
+        force.
+        """
         return self.mass / self.time if LAWS[contact.law].additive else self.time / self.length
 
     def _contact(self, contact: Contact) -> Contact:
@@ -189,13 +194,13 @@ class Units:
 
 
 def _converted(scene: Scene, its: Scene) -> dict[str, Provenance]:
-    """Return the marks with deviations converted to the units of `its`."""
+    """Return the marks of a scene, with standard deviations converted to the units of the converted scene `its`."""
     marks, length = dict(scene.marks), its.frame.width_m / scene.frame.width_m
     for path, kind in KINDS.items():
         mark, (part, name) = marks.get(path), path.split(".")
         value = getattr(getattr(scene, part), name, None)
-        # if a number is zero, the ratio of the units cannot be computed from it, so its deviation is left out; a
-        # clearance has the ratio of the lengths
+        # The ratio of the units is computed from the converted number. It is unknown if the number is zero, except for
+        # a clearance, which is a length.
         if mark is not None and mark.deviation is not None and (value or kind == "clearance"):
             ratio = length if kind == "clearance" else getattr(getattr(its, part), name) / value
             marks[path] = replace(mark, deviation=mark.deviation * ratio)

@@ -1,4 +1,4 @@
-"""Starting points of a fit: swings cut in flight, clearances from the range of motion, and several stiffnesses."""
+"""Starting points of a fit: division into swings, clearances from the range of motion, and several stiffnesses."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from plow_twin.model.scene import Scene
 
 Array = NDArray[np.float64]
 
-#: Definition: masks of the pairs of the right, left, top and bottom wall, shape (8,) each.
+#: Masks of the pairs at the right, left, top and bottom wall, shape (8,) each, by definition.
 WALLS: Final = (NORMAL_X > 0.0, NORMAL_X < 0.0, NORMAL_Y > 0.0, NORMAL_Y < 0.0)
-#: Derived: the two pairs of each of these walls.
+#: Indices of the two pairs at each wall, in the order of `WALLS`.
 _PADS: Final = [np.flatnonzero(wall).tolist() for wall in WALLS]
-#: Bound: number of moments that are tried for the start of a swing.
+#: Upper bound of the number of trial times for the start of a swing.
 _CANDIDATES = 12
 
 
 def smoothed(q: Array, width: int) -> Array:
-    """Return running medians over `width` rows."""
+    """Return running medians of poses over `width` rows."""
     if width < 2 or len(q) < width:
         return q
     padded = np.pad(q, ((width // 2, width - 1 - width // 2), (0, 0)), mode="edge")
@@ -35,9 +35,10 @@ def smoothed(q: Array, width: int) -> Array:
 
 
 def reaches(scene: Scene, q: Array) -> Array:
-    """Return the reach of the corners toward the right, left, top and bottom wall beyond the frame's half size.
+    """Return the reaches in m toward the right, left, top and bottom wall, shape (n, 4).
 
-    Shape (n, 4) in m; at contact it is half the clearance plus the penetration.
+    The reach is the distance of the corner nearest to the wall from the centre of the cavity, minus half the size of
+    the frame. In contact, it equals half the clearance plus the penetration.
     """
     rows = geometry.penetration_rows(scene)[:4]
     c, s = np.cos(q[:, 2]), np.sin(q[:, 2])
@@ -48,22 +49,22 @@ def reaches(scene: Scene, q: Array) -> Array:
 
 
 def smooth_width(poses: Poses, span: float = 0.06) -> int:
-    """Return how many rows lie in `span` seconds."""
+    """Return the number of rows in `span` s."""
     return max(1, int(span / float(np.median(np.diff(poses.t)))))
 
 
 def range_of_motion(scene: Scene, poses: Poses) -> tuple[Array, Array]:
-    """Return clearances (2,) and bias of x and y (2,) in m that follow from the range of motion alone."""
+    """Return clearances, shape (2,), and bias of x and y, shape (2,), in m from the range of motion."""
     reach = reaches(scene, smoothed(filled(poses), smooth_width(poses)))
     right, left, top, bottom = np.quantile(reach, 0.99, axis=0)
-    # when the head moves to the right, the frame moves to the left relative to the head
+    # the signs are reversed, because the frame moves to the left relative to a head that moves to the right
     return np.array([right + left, top + bottom]), 0.5 * np.array([left - right, bottom - top])
 
 
 def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
-    """Cut poses into swings that begin in flight, away from the walls and on a parabola.
+    """Return poses divided into swings of at least `shortest` s.
 
-    No swing is shorter than `shortest` in s.
+    A swing begins in flight, at a time at which the head is away from the walls and moves on a parabola.
     """
     interval = poses.interval()
     raw, t = filled(poses), poses.t
@@ -78,7 +79,7 @@ def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
     while t[-1] > starts[-1] + 2.0 * apart:
         near = np.flatnonzero((t > starts[-1] + apart) & (t < starts[-1] + 2.0 * apart) & (room > clear))
         if not len(near):
-            # if there is no clear start for a long time, the swing ends after a whole period
+            # without a suitable start for a long time, the swing ends after a whole period
             far = np.flatnonzero((t > starts[-1] + 2.0 * apart) & (room > clear))
             end = min(float(t[far[0]]) if len(far) else np.inf, starts[-1] + period)
             near = np.flatnonzero((t >= end) & (t < end + apart))
@@ -93,9 +94,9 @@ def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
 
 
 def _parabola(t: Array, q: Array, start: float, noise: Array) -> tuple[Array, float]:
-    """Return pose and rate at `start` by parabolas through the poses about it, shape (6,), and their misfit.
+    """Return pose and rate at the time `start`, shape (6,), from parabolas through nearby poses, and the misfit.
 
-    The longest span that fits up to noise is used, because an impact within the span would falsify the rates.
+    The longest span that fits up to noise is used. A longer span contains an impact, which would falsify the rates.
     """
     near, misfit = np.zeros(0, np.int64), np.inf
     state = np.zeros(6)
@@ -117,7 +118,7 @@ def _parabola(t: Array, q: Array, start: float, noise: Array) -> tuple[Array, fl
 
 
 def noise_level(q: Array) -> Array:
-    """Return the standard deviation of white noise from third differences, shape (3,)."""
+    """Return the standard deviation of the noise of poses, shape (3,), from their third differences."""
     if len(q) < 8:
         return np.zeros(3)
     level: Array = 1.4826 * np.median(np.abs(np.diff(q, n=3, axis=0)), axis=0) / np.sqrt(20.0)
@@ -125,10 +126,10 @@ def noise_level(q: Array) -> Array:
 
 
 def first_vectors(problem: Problem, most: int) -> list[Array]:
-    """Return the most promising starts of the shared unknowns, shape (SIZE,) each, best first.
+    """Return the best `most` starting points of the shared unknowns, shape (SIZE,) each, in order of the misfit.
 
-    For each of several stiffnesses and dampings, the clearances are adjusted until the simulated range of motion is the
-    measured one.
+    For each of several stiffnesses and dampings, the clearances are adjusted until the simulated range of motion equals
+    the measured range.
     """
     unknowns, window = problem.unknowns, problem.window
     measured, bias = range_of_motion(unknowns.scene, window.poses)
@@ -147,7 +148,10 @@ def first_vectors(problem: Problem, most: int) -> list[Array]:
 
 
 def _matched(problem: Problem, vector: Array, measured: Array) -> list[tuple[float, Array]]:
-    """Adjust a vector's clearances to the measured range of motion; return the best vector with its loss, if any."""
+    """Return the vector, with its loss, whose clearances are adjusted to the range of motion `measured` in m.
+
+    The result is a list of one item, or empty if the motion cannot be simulated.
+    """
     poses, unknowns = problem.window.poses, problem.unknowns
     found = []
     for _ in range(4):

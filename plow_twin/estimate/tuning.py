@@ -1,8 +1,8 @@
-"""All numbers of the estimator that were chosen and not derived, each with the data on which it was set.
+"""All numbers of the estimator that were chosen instead of derived, with the data on which each choice is based.
 
-They are read as `tuning.NAME` where they are used, so that `benchmark/tuning_sensitivity.py` can vary them;
-`benchmark/results/tuning.md` shows them with the sensitivity that it measured. Seeds: `benchmark/estimate.py`. All
-penetrations are penetrations under the reference force of 100 kN.
+Other modules read a number as `tuning.NAME`, so that `benchmark/tuning_sensitivity.py` can vary it. The measured
+sensitivities are in `benchmark/results/tuning.md`. Seeds are those of `benchmark/estimate.py`. Penetrations are
+penetrations under the reference force of 100 kN.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ JUDGED = "judgement"
 
 @dataclass(frozen=True)
 class Tuned:
-    """The meaning of a chosen number.
+    """Description of a chosen number.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class Tuned:
     meaning : str
         Effect of the number.
     basis : str
-        The data on which the number was set.
+        The data on which the choice is based.
     """
 
     unit: str
@@ -731,7 +731,7 @@ ALIKE: Annotated[
 
 @dataclass(frozen=True)
 class Entry:
-    """A chosen number: its name, value and meaning."""
+    """Name, value and description of a chosen number."""
 
     name: str
     value: Value

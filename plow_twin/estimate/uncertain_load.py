@@ -1,9 +1,9 @@
-"""Clearances if the believed load does not explain the motion, or if theta was not measured.
+"""Clearances if the measured load does not explain the motion, or if theta was not measured.
 
-Motions with randomly drawn clearances, contacts and load errors are simulated as the sensor would see them. A
-regression among the motions near the measured one corrects the result of `equation_error` and gives its deviation
-(approximate Bayesian computation with local-linear adjustment, as in `bouncing`). If theta was not measured, the head's
-range of motion replaces the result of `equation_error`.
+Motions with random clearances, contacts and load errors are simulated and observed as by the sensor. A regression over
+the simulated motions near the measured motion corrects the result of the module `equation_error`, and gives the
+deviation of the corrected result (approximate Bayesian computation with local-linear adjustment, as in the module
+`bouncing`). If theta was not measured, the range of motion replaces the result of `equation_error`.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ from plow_twin.model import geometry
 
 Array = NDArray[np.float64]
 
-#: Derived: interval between the knots of a load's error, as a share of the error's shortest correlation time.
+#: Interval between the knots of the load's error, as a share of the shortest correlation time from which it is derived.
 _KNOTS = 1.0 / 3.0
-#: Derived: interval [s] between the knots of the load between samples, half the period of a soft contact (20 Hz).
+#: Interval [s] between the knots of the load between samples, derived as half the period of a soft contact (20 Hz).
 _KNOT = 0.025
-#: Bound: number of rounds of draws; each later round is drawn about the result of the previous round.
+#: Upper bound of the number of sets of draws; each set after the first is drawn about the result of the previous set.
 _ROUNDS = 3
-#: Bound: smallest number of draws for a regression.
+#: Lower bound of the number of draws for a regression.
 _FEWEST = 40
 
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """Result of a comparison.
+    """Result of the comparison of a measured motion with motions under uncertain loads.
 
-    clearance, deviation : (2,) in m
-    touched : (2,) whether the head touched both walls of a direction
-    ln_depth, ln_damping : mean and deviation of the logarithms of the penetration in m under the reference force and
-        of the damping
+    clearance, deviation : (2,) clearances and standard deviations in m
+    touched : (2,) whether the head touched both walls, for the horizontal and for the vertical direction
+    ln_depth : mean and deviation of the logarithm of the penetration in m under the reference force
+    ln_damping : mean and deviation of the logarithm of the damping
     distance : distance of the measured motion from nearby drawn motions, relative to the distances among drawn motions
     load_error : error of the load relative to its amplitude
     """
@@ -59,7 +59,10 @@ class Compared:
 
 @dataclass
 class _Spread:
-    """Distribution of the draws: clearances (2,) with deviation in m; mean and deviation of each logarithm."""
+    """Distribution of the draws: mean `centre` (2,) and deviation `about` of the clearances in m, and logarithms.
+
+    Each logarithm (of penetration in m, damping and relative load error) has a mean and a standard deviation.
+    """
 
     centre: Array
     about: float
@@ -71,12 +74,12 @@ class _Spread:
 def compare_under_uncertain_load(
     felt: Load, unknowns: Unknowns, poses: Poses, period: float, seed: int = 0
 ) -> tuple[Compared | None, int]:
-    """Compare the measured motion with motions under randomly drawn errors of the load.
+    """Return the comparison of the measured motion with motions under random errors of the load, and the work.
 
     Parameters
     ----------
     felt : Load
-        The believed load, thinned to the samples that move the head.
+        The measured load, without samples that hardly move the head.
     unknowns : Unknowns
         The prior.
     poses : Poses
@@ -84,12 +87,14 @@ def compare_under_uncertain_load(
     period : float
         Period of the load in s.
     seed : int
-        Seed of the draws.
+        Seed of the random numbers.
 
     Returns
     -------
-    Compared, or None if too few motions could be run or the result is smaller than any clearance drawn; and the work
-    done.
+    compared : Compared or None
+        None if too few motions could be simulated, or if the result is smaller than all drawn clearances.
+    work : int
+        Number of solver steps.
     """
     rng = np.random.default_rng(seed)
     seen = MotionFeatures(unknowns, poses, period)
@@ -122,12 +127,11 @@ def compare_under_uncertain_load(
             (value[4], max(tuning.FIRM_SPREAD[2], tuning.FIRM_SPREAD[1] * deviation[4])),
         )
     assert found is not None
-    if (spread.centre < LEAST_CLEARANCE).any():  # the regression extrapolates, so no drawn motion is like the measured
+    if (spread.centre < LEAST_CLEARANCE).any():  # an extrapolation of the regression beyond all draws
         return None, work
     share, least = tuning.CORRECTED
     unexplained = np.hypot(share * value[:2], least) if angle else np.zeros(2)
-    # the change of a clearance in the last round is added to its deviation, because a clearance that still changes has
-    # not converged
+    # a clearance that still changes has not converged, so its last change is added to its deviation
     moved = spread.centre - before
     return Compared(
         spread.centre,
@@ -144,7 +148,7 @@ _Look = tuple[Callable[[Array], Array], _Spread, NDArray[np.bool_]]
 
 
 def _with_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Poses) -> _Look:
-    """Return the features, the distribution of the first draws, and which directions were touched on both sides."""
+    """Return the function that computes features, the distribution of the first draws, and `touched` of `Compared`."""
     about, softness, damping = tuning.UNCERTAIN_SPREAD
     equations = EquationError(unknowns, felt, poses.t)
     first = equations.search(seen.q, range_of_motion(unknowns.scene, poses)[0])
@@ -164,7 +168,7 @@ def _with_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Pos
 
 
 def _without_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Poses) -> _Look:
-    """Return the same as `_with_angle` if only x and y were measured: the range of motion replaces the walls."""
+    """Return the results of `_with_angle` for poses without theta, from the range of motion."""
     nominal, deviations = unknowns.nominal(), unknowns.deviations()
 
     def features(q: Array) -> Array:
@@ -179,7 +183,7 @@ def _without_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: 
 
 
 def _middle(bounds: tuple[float, ...]) -> tuple[float, float]:
-    """Return mean and deviation of a logarithm that is uniform between two bounds."""
+    """Return mean and standard deviation of a logarithm that is uniformly distributed between two bounds."""
     low, high = np.log(bounds)
     return 0.5 * (low + high), (high - low) / math.sqrt(12.0)
 
@@ -189,7 +193,10 @@ def _damping(unknowns: Unknowns) -> float:
 
 
 def _draw(spread: _Spread, rng: np.random.Generator) -> tuple[Array, Array, float]:
-    """Draw clearances (2,) in m; (5,) logarithms of penetration and damping, and gains; logarithm of the load error."""
+    """Return drawn clearances (2,) in m, drawn numbers (5,), and the drawn logarithm of the relative load error.
+
+    The numbers are the logarithms of penetration and damping, and three load gains.
+    """
     white = rng.standard_normal(8)
     clearance = np.maximum(spread.centre + spread.about * white[:2], LEAST_CLEARANCE)
     ln_depth = np.clip(spread.ln_depth[0] + spread.ln_depth[1] * white[2], *np.log(DEPTHS))
@@ -200,17 +207,20 @@ def _draw(spread: _Spread, rng: np.random.Generator) -> tuple[Array, Array, floa
 
 
 def _with_exponent(unknowns: Unknowns, rng: np.random.Generator) -> Unknowns:
-    """Return the prior, in half of the draws with a larger exponent, because no wall is stiffest at its surface."""
+    """Return the unknowns of a scene whose exponent is increased at random in half of the cases.
+
+    The exponent is never reduced, because no wall is stiffest at its surface.
+    """
     step = tuning.UNCERTAIN_EXPONENT * max(0.0, rng.standard_normal())
     contact = unknowns.scene.contact
     return replace(unknowns, scene=replace(unknowns.scene, contact=replace(contact, exponent=contact.exponent + step)))
 
 
 def _with_error(load: Load, share: float, rng: np.random.Generator) -> Load:
-    """Return a load with a random error, and with the part that the samples miss.
+    """Return a load plus a random error, and plus a random part between the samples.
 
-    The error is an Ornstein-Uhlenbeck process of `share` times the load's amplitude. The missed part is white noise of
-    the density `load.unknown`.
+    The error is an Ornstein-Uhlenbeck process with the standard deviation `share` times the load's amplitude. The part
+    between the samples is white noise with a spectral density of at most `load.unknown`.
     """
     least, most = tuning.LOAD_CORRELATION
     time = math.exp(rng.uniform(math.log(least), math.log(most)))
@@ -222,8 +232,7 @@ def _with_error(load: Load, share: float, rng: np.random.Generator) -> Load:
         error[index] += keep * error[index - 1]
     amplitude = 0.5 * share * np.ptp(load.wrench, axis=0)
     within = np.arange(load.t[0], load.t[-1], _KNOT)
-    # the spectral density is drawn up to an upper bound, because samples hardly show how short the correlation of the
-    # missed part is
+    # `load.unknown` is an upper limit of the spectral density, so the density is drawn below this limit
     missed = rng.standard_normal((len(within), 3)) * np.sqrt(rng.random() * np.array(load.unknown) / _KNOT)
     t = np.unique(np.concatenate([load.t, grid, within]))
     parts = ((load.t, load.wrench), (grid, amplitude * error), (within, missed))

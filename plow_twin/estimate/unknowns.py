@@ -1,9 +1,9 @@
-"""The vector of unknowns, its prior, and the scene of a vector.
+"""The vector of unknowns, its prior, and the conversion of a vector to a scene.
 
-The unknown for the stiffness K is a softness, psi = ln(u + u0). Here u = (F0 / K)^(1/n) is the penetration in m under
+The unknown for the stiffness K is the softness psi = ln(u + u0). Here u = (F0 / K)^(1/n) is the penetration in m under
 the reference force F0, and u0 is the penetration that a pose cannot distinguish from zero. For soft contacts psi is
-linear in ln K. For hard contacts psi is linear in the compliance and has a lower limit, because the motion then only
-shows that K is large.
+linear in ln K. For hard contacts psi is linear in the compliance and has a lower limit, because the motion shows only
+that K is large.
 """
 
 from __future__ import annotations
@@ -25,28 +25,26 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Quantity:
-    """One quantity that is estimated.
+    """Description of an estimated quantity.
 
     Attributes
     ----------
     name : str
         Name of the quantity in an estimate.
     label, factor, digits : str, float, str
-        How the quantity is printed: its name with unit, the factor to this unit, and the format.
+        Printed name with unit, factor for the conversion to this unit, and number format.
     deviation : float
-        Standard deviation of the prior about the nominal scene, in the unknown's own unit.
+        Prior standard deviation, in the unit of the unknown.
     dimension : tuple of 3 int
-        Powers of length, mass and time in the unit of the published value; the powers of stiffness and damping follow
-        from the contact law.
+        Powers of length, mass and time in the unit of the published value. For stiffness and damping, the powers follow
+        from the contact law instead.
     step : float, optional
-        Step of the difference quotient that gives the motion's derivative with respect to this quantity; None where the
-        derivative is known exactly.
+        Step of the difference quotient of the motion with respect to the quantity; None if the derivative is known
+        exactly.
     fine_step : float, optional
-        Step of the difference quotient of measured forces, which depend less linearly on the quantity than the motion
-        does.
+        Step of the difference quotient of contact forces, which are less linear in the quantity than the motion.
     probe : float
-        Standard deviation of the random displacement of this quantity that tests whether the motion is predictable
-        (`fit.unpredicted`).
+        Standard deviation of the random displacement that tests whether the motion is predictable (`fit.unpredicted`).
     """
 
     name: str
@@ -60,10 +58,9 @@ class Quantity:
     probe: float = 0.0
 
 
-#: Prior: the estimated quantities in the order of a vector of unknowns. They are the clearances in m, the softness psi
-#: (published as the stiffness), the logarithm of the damping (or the logit of a restitution), three gains of the load,
-#: and three biases and the delay of the sensor. The quantities with a `step` move the head and come first; the others
-#: change only the measurement of the motion.
+#: The estimated quantities with their prior deviations, in the order of a vector of unknowns. The unknown of the
+#: stiffness is the softness psi, the unknown of the damping is its logarithm (the logit for a restitution). Quantities
+#: with a `step` change the motion of the head and come first. The other quantities change only the measurement.
 QUANTITIES: Final = (
     Quantity("horizontal", "horizontal clearance [mm]", 1e3, ".3f", 8e-3, (1, 0, 0), 2e-4, 1e-5, 5e-5),
     Quantity("vertical", "vertical clearance [mm]", 1e3, ".3f", 8e-3, (1, 0, 0), 2e-4, 1e-5, 5e-5),
@@ -87,35 +84,34 @@ GX: Final = _place("horizontal")
 GY: Final = _place("vertical")
 SOFTNESS: Final = _place("stiffness")
 DAMPING: Final = _place("damping")
-#: Definition: slices of the gains and of the biases in a vector of unknowns.
+#: Slices of the gains and of the biases in a vector of unknowns, by definition.
 GAIN: Final = slice(_place("gain_fx"), _place("gain_m") + 1)
 BIAS: Final = slice(_place("bias_x"), _place("bias_theta") + 1)
 DELAY: Final = _place("delay")
-#: Definition: slice of the quantities that determine the scene (`Unknowns.scene_of`).
+#: Slice of the quantities that determine the scene (`Unknowns.scene_of`), by definition.
 OF_SCENE: Final = slice(0, GAIN.start)
 SIZE: Final = len(QUANTITIES)
-#: Indices of the quantities that move the head.
+#: Indices of the quantities that change the motion of the head.
 MOVING: Final = tuple(place for place, quantity in enumerate(QUANTITIES) if quantity.step is not None)
 #: Standard deviations of the random displacements that test whether the motion is predictable, shape (SIZE,).
 PROBES: Final = np.array([quantity.probe for quantity in QUANTITIES])
-#: Names of the quantities in the published correlation matrix; softness is the penetration under the reference force.
+#: Names of the quantities in the published correlation matrix, with the softness in place of the stiffness.
 CORRELATED: Final = tuple("softness" if place == SOFTNESS else QUANTITIES[place].name for place in MOVING)
 
-#: Guard: smallest and largest simulated penetration in m under the reference force. Contacts with a smaller penetration
-#: give the same motion; contacts with a larger penetration let the head through the wall.
+#: Bounds of the simulated penetration in m under the reference force. Contacts with a smaller penetration give
+#: practically the same motion. With a larger penetration, the head could pass through the wall.
 _HARDEST, _SOFTEST = 3e-5, 0.12
-#: Guard: smallest clearance in m that is simulated; no motion supports a smaller estimate.
+#: Lower bound of a simulated clearance in m.
 LEAST_CLEARANCE: Final = 5e-4
 
 
-#: For each contact law that has an alternative: the alternative law, which an estimate tries if the contact is linear
-#: (exponent 1).
+#: Alternative of a contact law, which is tested if the contact is linear (exponent 1).
 OTHER_LAW: Final = {"hunt_crossley": "kelvin_voigt"}
 
-#: Guard: smallest standard deviation of the prior; it is so small that a number stated as exact keeps its value in the
-#: estimate.
+#: Lower bound of a prior standard deviation. It is so small that a number with the stated deviation 0 does not change
+#: in the fit.
 _HELD = 1e-6
-#: Guard: largest prior deviation of a load's gain.
+#: Upper bound of the prior deviation of a load gain.
 _MOST_GAIN = 1.0
 
 
@@ -125,18 +121,18 @@ def _prior() -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """The prior about a nominal scene, and conversions between a vector of unknowns and a scene.
+    """The prior of the unknowns about a nominal scene, and conversions between a vector of unknowns and a scene.
 
     Attributes
     ----------
     scene : Scene
         The nominal scene.
     deviation : ndarray, shape (SIZE,)
-        Standard deviations of the prior about the nominal scene.
+        Prior standard deviations.
     noise : tuple of 3 float
-        Smallest noise that the sensor can have: x, y [m], theta [rad].
+        Lower limit of the sensor's noise in x, y [m] and theta [rad].
     force : float
-        Force F0 in N to which the softness refers.
+        Reference force F0 of the softness in N.
     """
 
     scene: Scene
@@ -146,13 +142,13 @@ class Unknowns:
 
     @staticmethod
     def stated(scene: Scene, load: Load, poses: Poses) -> Unknowns:
-        """Return the prior with the deviations stated for scene, load (for its gains) and poses."""
+        """Return the prior with the deviations that the scene, the load (for its gains) and the poses state."""
         unknowns, deviation, contact = Unknowns(scene), _prior(), scene.contact
         deviation[GX] = deviation_of(scene, "clearance.horizontal_m")
         deviation[GY] = deviation_of(scene, "clearance.vertical_m")
         deviation[SOFTNESS] = deviation_of(scene, "contact.stiffness")
         if is_stated(scene, "contact.stiffness"):
-            # the standard deviation of ln K is converted to the standard deviation of psi = ln(u + u0)
+            # conversion of the standard deviation of ln K to that of psi = ln(u + u0)
             u = math.exp(unknowns.softness_of(contact.stiffness)) - tuning.RESOLVED
             deviation[SOFTNESS] *= u / (u + tuning.RESOLVED) / contact.exponent
         damped = "contact.damping" if contact.restitution is None else "contact.restitution"
@@ -162,7 +158,7 @@ class Unknowns:
 
     @property
     def damped(self) -> bool:
-        """Whether the contact law has a damping or a restitution that can be estimated."""
+        """Whether the contact has a damping or a restitution that can be estimated."""
         contact = self.scene.contact
         return bool(contact.damping) or (contact.restitution is not None and 0.0 < contact.restitution < 1.0)
 
@@ -179,18 +175,20 @@ class Unknowns:
         return vector
 
     def deviations(self) -> Array:
-        """Return the prior's standard deviations (SIZE,); if the law has no damping, its entry is 1e-6."""
+        """Return the prior standard deviations, shape (SIZE,); without damping, its entry is 1e-6, which holds it
+        fixed.
+        """
         deviations = self.deviation.copy()
         if not self.damped:
             deviations[DAMPING] = 1e-6
         return deviations
 
     def is_hard(self, vector: Array) -> bool:
-        """Return whether the contact is so hard that its bounces can only be predicted for a short time."""
+        """Return whether the contact is so hard that its bounces can be predicted only for a short time."""
         return bool(vector[SOFTNESS] < math.log(tuning.CERTAINLY_HARD + tuning.RESOLVED))
 
     def softness_of(self, stiffness: float) -> float:
-        """Return the softness psi for a stiffness."""
+        """Return the softness psi for a stiffness in N/m^n."""
         return math.log((self.force / stiffness) ** (1.0 / self.scene.contact.exponent) + tuning.RESOLVED)
 
     def penetration_of(self, psi: float) -> float:
@@ -198,26 +196,26 @@ class Unknowns:
         return math.exp(psi) - tuning.RESOLVED
 
     def stiffness_of(self, psi: float) -> float:
-        """Return the stiffness for a softness psi, limited to that of the hardest simulated contact."""
+        """Return the stiffness in N/m^n for a softness psi, at most that of the hardest simulated contact."""
         u = max(math.exp(psi) - tuning.RESOLVED, _HARDEST)
         return float(self.force / u**self.scene.contact.exponent)
 
     def critical_damping(self, stiffness: float) -> float:
-        """Return the critical damping in N s/m of the head's mass on a spring of `stiffness` N/m."""
+        """Return the critical damping in N s/m of the head's mass on a spring with a stiffness in N/m."""
         return 2.0 * math.sqrt(stiffness * self.scene.head.mass_kg)
 
     @property
     def hardest_believed(self) -> float:
-        """Upper end of the published stiffness interval if the motion shows only a hard contact."""
+        """Upper end in N/m^n of the published stiffness interval if the motion shows only that the contact is hard."""
         return float(self.force / (1e-6) ** self.scene.contact.exponent)
 
     def damping_of(self, value: float) -> float:
-        """Return the law's restitution or damping from its unknown (logit or logarithm) `value`."""
+        """Return the damping from its logarithm `value`, or the restitution from its logit `value`."""
         number = math.exp(float(np.clip(value, -30.0, 30.0)))
         return min(number / (1.0 + number), 0.999) if self._restitution else number
 
     def within(self, vector: Array) -> Array:
-        """Return the nearest vector that can be simulated."""
+        """Return the vector with all numbers clipped to the range that can be simulated."""
         out = vector.copy()
         out[[GX, GY]] = np.maximum(out[[GX, GY]], LEAST_CLEARANCE)
         out[SOFTNESS] = np.clip(
@@ -233,7 +231,7 @@ class Unknowns:
         return self.scene.contact.restitution is not None
 
     def scene_of(self, vector: Array) -> Scene:
-        """Return the scene that a vector of unknowns describes, without loads and wear."""
+        """Return the scene for a vector of unknowns, without loads and wear."""
         damping = self.damping_of(float(vector[DAMPING])) if self.damped else None
         contact = contact_with(self.scene.contact, self.stiffness_of(float(vector[SOFTNESS])), damping)
         if self._restitution:
@@ -245,7 +243,7 @@ class Unknowns:
 
 
 def contact_with(contact: Contact, stiffness: float, damping: float | None) -> Contact:
-    """Return a contact with another stiffness and, unless it is None, another damping or restitution."""
+    """Return a contact with another stiffness and another damping or restitution; None leaves the damping unchanged."""
     contact = replace(contact, stiffness=stiffness)
     if damping is None:
         return contact
@@ -255,7 +253,7 @@ def contact_with(contact: Contact, stiffness: float, damping: float | None) -> C
 
 
 def with_other_law(unknowns: Unknowns) -> Unknowns | None:
-    """Return the prior for the alternative contact law in `OTHER_LAW`; None if there is no such law."""
+    """Return the prior for the alternative contact law in `OTHER_LAW`; None without an alternative."""
     contact = unknowns.scene.contact
     law = OTHER_LAW.get(contact.law)
     if law is None or contact.exponent != 1.0:

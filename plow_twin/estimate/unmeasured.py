@@ -1,10 +1,12 @@
-"""Fit of poses of which one or two components were never measured.
+"""Fit of poses in which one or two components were never measured.
 
-Without all components the range of motion is unknown, and with it the clearances from which a fit starts. In a soft
-contact, however, the believed load determines the motion after some periods, whatever its start. Vectors of unknowns
-are therefore drawn from the prior, and their motions are compared with the measured components. Levenberg-Marquardt
-steps improve the nearest of them. Their motions then take the place of the missing components where a fit cuts the
-poses into swings; the fit itself uses measured values only, and links the swings.
+Without all components the range of motion is unknown, and so are the clearances from which a fit starts. In a soft
+contact, however, the load determines the motion after some periods, independent of its start. The fit has these steps:
+
+1. Vectors of unknowns are drawn from the prior, and their motions are compared with the measured components.
+2. Levenberg-Marquardt steps improve the vectors with the nearest motions.
+3. These motions replace the missing components in the division of the poses into swings.
+4. A fit with linked swings uses the measured values only.
 """
 
 from __future__ import annotations
@@ -26,29 +28,32 @@ from plow_twin.model import geometry
 
 Array = NDArray[np.float64]
 
-#: Step: for the difference quotients with respect to bias and delay, whose residuals are linear, in m, m, rad, s.
+#: Steps of the difference quotients with respect to all unknowns; the steps for bias and delay are 1e-3 m, m, rad, s.
 _STEPS: Final = np.array([one.step or 1e-3 for one in QUANTITIES])
-#: Bound: number of tries to shorten a step.
+#: Upper bound of the number of times that a step is shortened.
 _SHORTER: Final = 5
 
 
 class _Whole:
-    """The motion over the first `rows` poses as one run, and its distance from the measured components."""
+    """Simulation of the whole motion from one start, and its distance from the measured components.
+
+    The argument `rows` of the methods is the number of poses from the first pose on.
+    """
 
     def __init__(self, forward: Forward, unknowns: Unknowns, poses: Poses, period: float) -> None:
         self.forward, self.unknowns, self.poses = forward, unknowns, poses
         self.measured = poses.measured
         self.size = np.where(self.measured, filled(poses).std(axis=0), 1.0)
         self.noise = np.where(self.measured, np.maximum(noise_level(filled(poses)), 1e-7), 1.0)
-        #: mask of the poses that hardly depend on the unknown start
+        #: mask of the poses after the first period, which hardly depend on the unknown start
         self._settled = poses.t - poses.t[0] >= period
         self._start = np.concatenate([filled(poses)[0], np.zeros(3)])[None]
-        #: indices of the unknowns that these components can show
+        #: indices of the unknowns that the measured components can determine
         self.free = np.flatnonzero(np.concatenate([np.ones(BIAS.start), self.measured, np.ones(SIZE - BIAS.stop)]))
         self.mean, self.deviation = unknowns.nominal(), unknowns.deviations()
 
     def motion(self, vector: Array, rows: int) -> Array | None:
-        """Return the poses that a vector of unknowns predicts, without the bias, (n, 3); None if it cannot be run."""
+        """Return the poses for a vector of unknowns, without bias, shape (n, 3); None if they cannot be simulated."""
         vector = self.unknowns.within(vector)
         t = self.poses.t[:rows] - vector[DELAY]
         scene = self.unknowns.scene_of(vector)
@@ -56,7 +61,7 @@ class _Whole:
         return None if run is None else run.q
 
     def residual(self, vector: Array, rows: int) -> Array | None:
-        """Return the measured minus the predicted components, shape (n, k); None if the vector cannot be run."""
+        """Return measured minus predicted values of the k measured components, shape (n, k); None as in `motion`."""
         q = self.motion(vector, rows)
         if q is None:
             return None
@@ -64,7 +69,7 @@ class _Whole:
         return np.asarray(np.nan_to_num(error[self._settled[:rows]][:, self.measured]))
 
     def centred(self, vector: Array, rows: int) -> tuple[float, Array] | None:
-        """Return the misfit of a vector with the bias that explains the mean residual, and this vector."""
+        """Return misfit and vector after the mean residual has been added to the bias of the vector."""
         error = self.residual(vector, rows)
         if error is None:
             return None
@@ -74,7 +79,7 @@ class _Whole:
         return float(np.minimum(left**2, 1.0).mean()), vector
 
     def descend(self, vector: Array, rows: int, scale: Array) -> tuple[Array, float]:
-        """Return an improved vector, and the cost of its residuals relative to `scale`, shape (3,)."""
+        """Return an improved vector and its cost; `scale`, shape (3,), is the unit of the residuals."""
         here, damping = self._normalised(vector, rows, scale), 1e-2
         if here is None:
             return vector, np.inf
@@ -91,7 +96,7 @@ class _Whole:
     def _better(
         self, vector: Array, here: Array, rows: int, scale: Array, damping: float
     ) -> tuple[tuple[Array, Array] | None, float]:
-        """Return a vector of less cost with its residuals, or None, and the damping for the next step."""
+        """Return a better vector with its residuals, or None, and the damping for the next step."""
         free, spread, normal, gradient = (
             self.free,
             self.deviation[self.free],
@@ -109,18 +114,18 @@ class _Whole:
         return None, damping
 
     def _normalised(self, vector: Array, rows: int, scale: Array) -> Array | None:
-        """Return the residuals relative to `scale`, and then those of the prior; None if the vector cannot be run."""
+        """Return the residuals in units of `scale`, followed by the residuals of the prior; None as in `motion`."""
         error = self.residual(vector, rows)
         prior = ((vector - self.mean) / self.deviation)[self.free]
         return None if error is None else np.concatenate([(error / scale[self.measured]).ravel(), prior])
 
     def _cost(self, normalised: Array) -> float:
-        """Return Huber's function of the residuals plus the squares of the prior's."""
+        """Return the sum of Huber's function of the residuals and the squared residuals of the prior."""
         error, prior = np.split(normalised, [-len(self.free)])
         return float(huber_loss(np.abs(error)).sum() + np.square(prior).sum())
 
     def _equations(self, vector: Array, here: Array, rows: int, scale: Array) -> tuple[Array, Array]:
-        """Return matrix and right-hand side of the normal equations for the free unknowns."""
+        """Return the matrix and the right-hand side of the normal equations for the free unknowns."""
         columns = np.zeros((len(here), len(self.free)))
         for place, index in enumerate(self.free):
             moved = vector.copy()
@@ -135,20 +140,20 @@ class _Whole:
 def fit_some_components(
     forward: Forward, unknowns: Unknowns, poses: Poses, period: float, drift: Array, seed: int = 0
 ) -> tuple[Problem, Fit] | None:
-    """Fit poses of which one or two components were never measured; None if no motion comes near them.
+    """Return a fit of poses in which one or two components were never measured; None if no motion is near the poses.
 
     Parameters
     ----------
     forward, unknowns : Forward, Unknowns
-        Model under the believed load; prior.
+        Forward model under the measured load, and prior.
     poses : Poses
-        The poses, without any value of a component that was not measured.
+        The measured poses, with NaN for the components that were never measured.
     period : float
         Period of the load in s.
     drift : ndarray, shape (3,)
         Spectral density of an unknown acceleration, in m2/s3 and rad2/s3, which links the swings.
     seed : int
-        Seed of the draws, and of the noise of the assumed values.
+        Seed of the random numbers.
     """
     rng = np.random.default_rng(seed)
     whole = _Whole(forward, unknowns, poses, period)
@@ -162,13 +167,13 @@ def fit_some_components(
         if before is not None:
             known = before.point.predicted
             q[: len(known)] = np.where(np.isfinite(known), known, q[: len(known)])
-        # the assumed values have noise, because the cut into swings compares poses with their noise
+        # noise is added to the assumed values, because the division into swings compares poses with their noise
         q = q + shared[BIAS] + np.where(whole.measured, 0.0, noise) * rng.standard_normal(q.shape)
         some = replace(poses, assumed=q).between(float(poses.t[0]), end)
         return refine(forward.renewed(), unknowns, some, period, shared, noise, drift, close=True)
 
     def finished(found: tuple[Problem, Fit], end: float) -> tuple[Problem, Fit]:
-        # each round begins with better values of the missing components
+        # each repetition begins with better values of the missing components
         for _ in range(tuning.UNMEASURED_ROUNDS):
             again = None if found[1].finished else refined(found[1].shared, end, found[1])
             if again is None or again[1].loss > found[1].loss:
@@ -185,7 +190,7 @@ def fit_some_components(
 
 
 def _starts(whole: _Whole, rows: int, rng: np.random.Generator) -> list[Array]:
-    """Return vectors of unknowns whose motions over the first `rows` poses are nearest to the measured one."""
+    """Return vectors of unknowns whose motions over the first `rows` poses are nearest to the measured motion."""
     drawn, (draws, improved, kept) = [], tuning.UNMEASURED_DRAWS
     for _ in range(draws):
         vector = whole.mean + whole.deviation * rng.standard_normal(SIZE)
@@ -205,7 +210,7 @@ def _starts(whole: _Whole, rows: int, rng: np.random.Generator) -> list[Array]:
 
 
 def _like_measured(whole: _Whole) -> Array:
-    """Return the noise of all components in m, m, rad if a sensor measured them as well as the measured ones."""
+    """Return the noise of all components in m, m, rad; missing components have the mean noise of the measured ones."""
     arm = geometry.half_diagonal(whole.unknowns.scene)
     level = float((whole.noise * [1.0, 1.0, arm])[whole.measured].mean())
     return level * np.array([1.0, 1.0, 1.0 / arm])

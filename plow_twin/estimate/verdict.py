@@ -1,7 +1,7 @@
-"""Tests whether the residuals are noise. If they are not, the model or the sensor is suspect.
+"""Tests whether the residuals of a fit are noise; if they are not, the model or the sensor is suspect.
 
-The thresholds were set on simulated machines with seeds below 1000; docs/estimate.md lists the faults that the tests
-miss.
+The thresholds were chosen with simulated machines whose seeds are below 1000. The page docs/estimate.md lists faults
+that the tests do not find.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 COMPONENTS = ("x", "y", "theta")
 
-#: Bound: approximate number of moments in a window at which a change of a bias or a clearance is tested.
+#: Approximate upper bound of the number of times in a window at which a change of a bias or a clearance is tested.
 MOMENTS = 60
 
 
@@ -35,11 +35,12 @@ MOMENTS = 60
 class Verdict:
     """Faults of the model and of the sensor that the tests have found.
 
+    model, sensor : messages about faults of the model and of the sensor
     figures : statistics of the tests
-    by_scale : whether the scales are the sensor's only fault
-    broken : whether the sensor fails or the data contradict themselves, so that no estimate is possible
-    lacking : the clearest harmonic that the measured load lacks and the fit includes
-    changed : (2,) small change of the clearances within the window in m, or of the bias along x and y
+    by_scale : whether wrong scale factors are the only fault of the sensor
+    broken : whether the sensor has failed or the measurements contradict each other, so that no estimate is possible
+    lacking : description of the most significant harmonic that the fit has added to the measured load
+    changed : (2,) change of the clearances within the window in m, or of the bias along x and y
     """
 
     model: list[str] = field(default_factory=list)
@@ -52,7 +53,7 @@ class Verdict:
 
 
 def judge(problem: Problem, fit: Fit, period: float) -> Verdict:
-    """Test the residuals of a fit; `period` is the load's period in s."""
+    """Return the faults that the residuals of a fit show; `period` is the period of the load in s."""
     verdict = Verdict()
     _stuck(problem, fit, verdict)
     _noise_change(fit, verdict)
@@ -68,14 +69,14 @@ def judge(problem: Problem, fit: Fit, period: float) -> Verdict:
     if not fit.converged:
         verdict.figures["not_converged"] = 1.0
     if verdict.sensor:
-        # measurements of a faulty sensor cannot show whether the model is right
+        # measurements of a faulty sensor do not show whether the model is correct
         verdict.model.clear()
     _scale(problem, fit, verdict)
     return verdict
 
 
 def judge_sensor(poses: Poses) -> list[str]:
-    """Return faults of the sensor that the poses alone show: a constant value, or changing noise."""
+    """Return messages about faults of the sensor that the poses alone show: a constant value, or changing noise."""
     found = []
     for i, name in enumerate(COMPONENTS):
         column = poses.q[np.isfinite(poses.q[:, i]), i]
@@ -93,7 +94,7 @@ def judge_sensor(poses: Poses) -> list[str]:
 
 
 def predicted(fit: Fit) -> NDArray[np.bool_]:
-    """Return which measurements the model predicts almost to within the noise, shape (n, 3)."""
+    """Return the mask of the measurements that the model predicts almost to within the noise, shape (n, 3)."""
     there: NDArray[np.bool_] = np.isfinite(fit.point.residual) & (fit.variance < 1.5 * fit.noise**2)
     return there
 
@@ -106,8 +107,7 @@ def _colour(fit: Fit, verdict: Verdict) -> None:
         if quick <= 0.0 or len(rows) < 50:
             continue
         ratio = float(np.mean(np.minimum(np.abs(rows), 5.0 * quick) ** 2) / quick**2)
-        # the last term allows for the sampling scatter of this ratio of a mean square to a squared median of
-        # differences
+        # the last term allows for the random scatter of `ratio`, a mean square divided by a squared median
         limit = 1.0 + (tuning.MOST_RATIO - 1.0) + 4.0 * 2.5 / np.sqrt(len(rows))
         verdict.figures[f"colour_{name}"] = ratio
         if ratio > limit and not verdict.sensor:
@@ -117,8 +117,7 @@ def _colour(fit: Fit, verdict: Verdict) -> None:
 def _repeated(problem: Problem, fit: Fit, period: float, verdict: Verdict) -> None:
     """Test whether the residuals repeat in each period of the load (analysis of variance).
 
-    Residuals caused by a wrong contact law or by a wrong shape of the load repeat in each period. Noise and
-    disturbances do not repeat, whatever their spectrum.
+    A wrong contact law or a wrong shape of the load causes residuals that repeat. Noise and disturbances do not repeat.
     """
     t, there = problem.window.poses.t, predicted(fit)
     turns = np.floor((t - t[0]) / period).astype(int)
@@ -148,10 +147,10 @@ def _repeated(problem: Problem, fit: Fit, period: float, verdict: Verdict) -> No
 
 
 def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
-    """Test whether another contact law explains the residuals (score test, linearised).
+    """Test whether another contact law explains the residuals (linearised score test).
 
-    The motion under the other law, computed from the same starting states, is mixed into the motion under the believed
-    law. The share of the other law is an additional unknown; all other unknowns are eliminated.
+    The motion under the other law is simulated from the same starting states and mixed into the predicted motion. The
+    share of the other law is an additional unknown. All other unknowns are eliminated.
     """
     unknowns = with_other_law(problem.unknowns)
     if unknowns is None or not fit.finished:
@@ -177,7 +176,7 @@ def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
 
 
 def _scale(problem: Problem, fit: Fit, verdict: Verdict) -> None:
-    """Test the sensor's scale factors; they are suspect only if no other test has found a fault."""
+    """Test the scale factors of the sensor; a wrong factor is reported only if no other test has found a fault."""
     if not fit.finished:
         return
     scales = scales_of(problem, fit)
@@ -192,7 +191,7 @@ def _scale(problem: Problem, fit: Fit, verdict: Verdict) -> None:
 
 
 def quick_noise(residual: Array, swing: NDArray[np.int64]) -> float:
-    """Return the standard deviation of a residual, from changes between neighbouring rows of a swing."""
+    """Return the standard deviation of a residual, estimated from differences of successive rows within swings."""
     there = np.isfinite(residual)
     value, part = residual[there], swing[there]
     if len(value) < 10:
@@ -224,7 +223,7 @@ def _stuck(problem: Problem, fit: Fit, verdict: Verdict) -> None:
 
 
 def _noise_change(fit: Fit, verdict: Verdict) -> None:
-    if not fit.finished:  # the residuals of an unfinished fit still contain motion, more in one part than in another
+    if not fit.finished:  # the residuals contain motion, which can differ between parts of the window
         return
     for i, name in enumerate(COMPONENTS):
         residual, swing = fit.point.residual[:, i], fit.point.swing
@@ -240,7 +239,7 @@ def _noise_change(fit: Fit, verdict: Verdict) -> None:
 
 
 def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
-    """Search for a moment at which a bias or a clearance changes (score test, linearised)."""
+    """Search for a time at which a bias or a clearance changes (linearised score test)."""
     if problem.window.swings < 6:
         return
     best: dict[str, tuple[float, Array]] = {}
@@ -267,22 +266,25 @@ def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
     elif clearance > bias and np.abs(growth).max() > 0.5 * tuning.OBSERVED:
         verdict.model.append(f"machine changed within the window: clearances by {growth[0]:.2g} m, {growth[1]:.2g} m")
         changed = np.abs(growth)
-    # residuals of a wrong load or law also resemble a change, but only a real change explains a large share of them
+    # a wrong load or law can resemble a change, but only a real change explains a large share of the residuals
     if changed.any() and share > tuning.CHANGE_SHARE and _felt(problem, fit):
-        # an interval can allow for a change that is smaller than the deviation of a rough clearance
+        # a change up to the deviation of a rough clearance is included in the interval instead
         verdict.broken |= bool(changed.max() > 2.0 * tuning.OBSERVED)
         verdict.changed = changed
 
 
 def _felt(problem: Problem, fit: Fit) -> bool:
-    """Return whether the load's unknown part moves the head in a swing less than noise, or links allow for it."""
+    """Return whether the unknown part of the load has no effect on the residuals.
+
+    The effect is smaller than the noise in short swings. The links between linked swings allow for the effect.
+    """
     drift = np.array(problem.forward.load.unknown) / np.asarray(inertias(problem.unknowns.scene)) ** 2
     span = float(np.median(np.diff(problem.window.starts)))
     return len(problem.link) > 0 or bool((drift * span**3 / 3.0 < fit.noise**2).all())
 
 
 def _excess(fit: Fit) -> float:
-    """Return the sum of squared residuals minus squared `quick_noise`, relative to the fit's variances."""
+    """Return the sum of squared residuals minus squared `quick_noise`, in units of the variances of the fit."""
     total = 0.0
     for i in range(3):
         quick = quick_noise(fit.point.residual[:, i], fit.point.swing)
@@ -292,7 +294,10 @@ def _excess(fit: Fit) -> float:
 
 
 def _changes(problem: Problem, fit: Fit, columns: NDArray[np.intp]) -> Iterator[tuple[Array, Array]]:
-    """Yield information and score for a change of the unknowns `columns` at a swing, others eliminated."""
+    """Yield information and score for a change of the unknowns `columns` at each of several swings.
+
+    All other unknowns are eliminated.
+    """
     count = len(columns)
     size = SIZE + OWN * problem.window.swings
     cross, own, score = np.zeros((size, count)), np.zeros((count, count)), np.zeros(count)
@@ -312,14 +317,18 @@ def _changes(problem: Problem, fit: Fit, columns: NDArray[np.intp]) -> Iterator[
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Information (SIZE, SIZE) and score (SIZE,) of the shared unknowns in a swing, without its starting state."""
+    """Normal equations of one swing for the shared unknowns, from which its starting state has been eliminated.
+
+    normal : (SIZE, SIZE) matrix, the information of the swing
+    score : (SIZE,) right-hand side
+    """
 
     normal: Array
     score: Array
 
 
 def swing_blocks(problem: Problem, fit: Fit) -> list[Block]:
-    """Return a block for each swing with at least four poses, as if it had no link to other swings."""
+    """Return the normal equations of each swing with at least four poses, without links between swings."""
     out = []
     for measured, *_ in pieces(problem, fit.point, fit.linear, fit.variance):
         if len(measured.residual) < 12:  # fewer than four poses
@@ -332,9 +341,11 @@ def swing_blocks(problem: Problem, fit: Fit) -> list[Block]:
 
 
 def sandwich(problem: Problem, fit: Fit, precision: Array) -> Array:
-    """Return the covariance of the shared unknowns from the scatter of the swings' scores, shape (SIZE, SIZE).
+    """Return the sandwich covariance of the shared unknowns, from the scatter of the scores of the swings.
 
-    Reference: White, Econometrica 50 (1982) 1: maximum likelihood of misspecified models.
+    `precision`, shape (SIZE,), contains the inverse variances of the prior. The result has the shape (SIZE, SIZE).
+
+    Reference: White, Econometrica 50 (1982) 1 (maximum likelihood of misspecified models).
     """
     blocks = swing_blocks(problem, fit)
     normal = sum((block.normal for block in blocks), np.diag(precision))

@@ -1,8 +1,8 @@
 """Windows of the sliding estimate, formed from arriving samples and poses.
 
-The stamps alone determine the windows. Each window ends at a multiple of the interval between windows. It is formed as
-soon as a load sample is newer than this end by the waiting time for late data. The order of arrival within the waiting
-time has no effect, so the journal gives the same windows as the live node.
+Each window ends at a multiple of the interval between windows. A window is formed as soon as a load sample is newer
+than its end by the waiting time for late data. The order of arrival within the waiting time has no effect, so a replay
+of the journal gives the same windows as the live node.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ Array = NDArray[np.float64]
 #: A stamp in ns and the measured values.
 Row = tuple[int, tuple[float, ...]]
 
-#: Bound: largest number of poses that are kept, and of rows of measured gaps. More arrive only if the load has stopped
+#: Upper bound of the number of stored poses, and of stored rows of gaps. More rows arrive only if the load has stopped
 #: or a clock is ahead by hours.
 MOST_KEPT = 600_000
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Measurements in [start_ns, end_ns), with times in s from `start_ns` on.
+    """Measurements in the window [start_ns, end_ns), with times in s after `start_ns`.
 
-    samples, poses : numbers of rows received; `poses` includes rows of gaps
-    lost : rows left out
-    gaps : measured gaps; None if there are none
+    samples, poses : numbers of received load samples, and of received poses and rows of gaps
+    lost : number of rows that are left out
+    gaps : measured gaps; None without gaps
     """
 
     start_ns: int
@@ -55,20 +55,21 @@ class Window:
 
 
 class Windows:
-    """Collect samples and poses, and form a window whenever one is due.
+    """Collect samples and poses, and form windows.
 
     Parameters
     ----------
     length_s, interval_s, wait_s : float
         Full length of a window, interval between the ends of successive windows, and waiting time for late data, in s.
-    poses, load : tuple of 3 float
-        Smallest standard deviation stated for the poses, and standard deviation stated for the load, which applies
-        until `set_load_deviation` is called.
+    poses : tuple of 3 float
+        Lower limit of the standard deviation of the poses.
+    load : tuple of 3 float
+        Standard deviation of the load until `set_load_deviation` is called.
     gaps : float
-        Stated deviation of a gap sensor in m.
+        Standard deviation of a gap sensor in m.
     early : bool
         Whether shorter windows are formed at first, from the share `tuning.WINDOW_SHARES[1]` of the full length on. A
-        short window is left out if less than the share `tuning.NEW_MOTION` of its motion is new.
+        short window is left out if the share of new motion in it is less than `tuning.NEW_MOTION`.
     """
 
     def __init__(
@@ -88,33 +89,34 @@ class Windows:
         self.restart()
 
     def restart(self) -> None:
-        """Drop all data, because the stamps or the machine change."""
+        """Drop all data, for example because the stamps have jumped or the machine has changed."""
         self._loads: list[Row] = []
         self._poses: deque[tuple[int, tuple[float, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
         self._gaps: deque[tuple[int, tuple[int, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
-        #: length [s] of the newest window that was checked, and its number of poses or of rows of gaps, whichever is
-        #: larger
+        #: length [s] of the newest window that was checked, and the larger of its numbers of poses and of rows of gaps
         self._left = (0.0, 0)
         self._newest_ns: int | None = None
         self._end_ns: int | None = None
         self._first_ns: int | None = None
-        #: end of the newest window that was formed
+        #: end of the newest window that was formed [ns]
         self._formed_ns: int | None = None
 
     def set_load_deviation(self, deviation: Deviation) -> None:
-        """Set the deviation of the load from here on: Fx, Fy [N], M [N m]."""
+        """Set the standard deviation of the load (Fx, Fy [N], M [N m]) from now on."""
         self._load_deviation = deviation
 
     def add_pose(self, stamp_ns: int, q: tuple[float, ...], deviation: tuple[float, ...] = ()) -> None:
-        """Add a measured pose x, y [m], theta [rad], NaN where not measured, with its deviations if known."""
+        """Add a measured pose (x, y [m], theta [rad]), with NaN for missing components, and its standard deviations, if
+        known.
+        """
         self._poses.append((stamp_ns, q, deviation))
 
     def add_gaps(self, stamp_ns: int, pairs: tuple[int, ...], gaps: tuple[float, ...]) -> None:
-        """Add measured gaps in m; `pairs` are the numbers of their pairs of corner and wall."""
+        """Add measured gaps in m of the pairs with the indices `pairs`."""
         self._gaps.append((stamp_ns, pairs, gaps))
 
     def add_load(self, stamp_ns: int, wrench: tuple[float, ...]) -> Window | None:
-        """Add a sample of the load Fx, Fy [N], M [N m]; return a window if it is due."""
+        """Add a sample of the load (Fx, Fy [N], M [N m]); return a window if one has become due."""
         self._loads.append((stamp_ns, wrench))
         if self._newest_ns is not None and stamp_ns <= self._newest_ns:
             return None
@@ -132,7 +134,9 @@ class Windows:
         return window
 
     def last(self) -> Window | str:
-        """At the input's end, return the window up to the newest sample, or why no window can be formed."""
+        """Return the window up to the newest sample at the end of the input, or a message why no window can be
+        formed.
+        """
         if self._newest_ns is None:
             return "got no load"
         window = self._form(self._newest_ns + 1)
@@ -146,7 +150,7 @@ class Windows:
         )
 
     def _early_end(self, stamp_ns: int) -> int:
-        """Return the end of the longest early window that is due; early windows begin at the first sample."""
+        """Return the end [ns] of the longest early window that is due; early windows begin at the first sample."""
         self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
         least, early, growth = tuning.WINDOW_SHARES
         span, end_ns = early * self._length_ns, self._first_ns
@@ -156,7 +160,7 @@ class Windows:
         return end_ns
 
     def _is_hardly_new(self, end_ns: int) -> bool:
-        """Return whether a window is short and has little motion that the previous window did not have."""
+        """Return whether a window is short and contains little motion that is not in the previous window."""
         if not self._early or self._formed_ns is None or self._first_ns is None:
             return False
         span = end_ns - self._first_ns
@@ -165,7 +169,7 @@ class Windows:
 
     def _form(self, end_ns: int) -> Window | None:
         start_ns = end_ns - self._length_ns
-        # later windows need no older rows
+        # rows older than `start_ns` are not needed in later windows
         self._loads = [row for row in self._loads if row[0] >= start_ns]
         self._poses = deque((row for row in self._poses if row[0] >= start_ns), MOST_KEPT)
         self._gaps = deque((row for row in self._gaps if row[0] >= start_ns), MOST_KEPT)
@@ -205,7 +209,7 @@ class Windows:
 
 
 def _table(rows: list[Row], start_ns: int) -> tuple[Array, Array]:
-    """Return the times of rows in s from `start_ns` on, shape (n,), and their values, shape (n, 3)."""
+    """Return the times of rows in s after `start_ns`, shape (n,), and the values, shape (n, 3)."""
     stamps = np.array([row[0] for row in rows], dtype=np.int64)
     values = np.array([row[1] for row in rows], dtype=np.float64).reshape(-1, 3)
     return np.multiply(stamps - start_ns, 1e-9, dtype=np.float64), values

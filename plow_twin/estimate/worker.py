@@ -1,9 +1,9 @@
-"""The sliding estimate in its own process, so that the twin's samples do not wait for it.
+"""The sliding estimate in a process of its own, so that it does not delay the samples of the twin.
 
-`Worker` is the near side, in the twin's process: it queues data, and a thread sends them. The far side is the process
-`python -m plow_twin.estimate.worker`. It compiles its kernels, reports that it is ready, estimates each window that is
-due and sends the result back. If several windows become due during an estimate, only the newest of them is estimated
-next.
+The class `Worker` runs in the process of the twin, which is called the *near side*. It queues data, which a thread
+sends to the *far side*. The far side is the process `python -m plow_twin.estimate.worker`. It compiles its kernels,
+reports that it is ready, computes the estimate of each window that is due, and sends the results back. If several
+windows become due during an estimate, only the newest of these windows is estimated next.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from plow_twin.estimate.window import Window, Windows
 from plow_twin.model.law_modules import load_laws, loaded_laws
 from plow_twin.model.scene import Scene
 
-#: Bound: interval at which queued data are sent [s].
+#: Upper bound of the interval at which queued data are sent [s].
 _SEND_S: Final = 0.05
-#: Bound: largest number of queued items; this many items wait only if the far side has stopped reading.
+#: Upper bound of the number of queued items, which is reached only if the far side has stopped reading.
 _MOST_WAITING: Final = 1_000_000
-#: Bound: `nice` value of the far side.
+#: `nice` value of the far side, which bounds its effect on the twin.
 _NICE: Final = 10
-#: Definition: shortest time slice in ns that Linux gives, and number of the system call that requests it.
+#: Shortest time slice of Linux in ns, and number of the system call `sched_setattr`, both by definition of Linux.
 _SLICE_NS, _SCHED_SETATTR = 100_000, 314
-#: Bound: the far side must end within this time in s.
+#: Upper bound of the time in s until the far side has ended.
 _STOP_S: Final = 5.0
 _ESTIMATE_ALONE: Final = Asked()
 
@@ -50,18 +50,22 @@ def _view(contents: dict[Any, Any]) -> MappingProxyType[Any, Any]:
     return MappingProxyType(contents)
 
 
-# a scene contains a mapping proxy (its marks), which pickle does not support
+# `pickle` does not support mapping proxies, which a scene contains
 ForkingPickler.register(MappingProxyType, lambda view: (_view, (dict(view),)))
 
 
 @dataclass(frozen=True)
 class Found:
-    """The estimate of one window: its bounds [ns] and numbers of rows, the first guess, and the result.
+    """Result of the estimate of one window.
 
-    wall_s : duration of the computation
+    start_ns, end_ns : beginning and end of the window [ns]
+    samples, poses : numbers of load samples and of poses in the window
+    guess : first guess of the fit
+    estimate : the estimate
+    wall_s : duration of the computation in s
     skipped, restarts : numbers of skipped windows and of restarts before this window
     text : the whole answer as JSON, with `forces` and `forecast` if requested
-    also : `forces` and `forecast` alone
+    also : the answers `forces` and `forecast` without the estimate
     """
 
     start_ns: int
@@ -78,22 +82,22 @@ class Found:
 
 
 class Worker:
-    """A process that estimates. `add_load`, `add_pose` and `restart` return at once; `poll` returns a result.
+    """A process that computes estimates; all methods except `close` return at once.
 
     Parameters
     ----------
     scene : Scene
         The nominal scene.
     windows : Windows
-        The object that forms the windows. It must be empty, and is copied to the process.
+        The empty object that forms the windows, which is copied to the process.
     asked : Asked
-        The answers to give beside the estimate.
+        The answers that are requested in addition to the estimate.
     """
 
     def __init__(self, scene: Scene, windows: Windows, asked: Asked = _ESTIMATE_ALONE) -> None:
         near, far = Pipe()
         command = [sys.executable, "-m", "plow_twin.estimate.worker", str(far.fileno()), *loaded_laws()]
-        # linear algebra gets a single thread, so that it takes at most one core
+        # a single thread for linear algebra, so that the far side uses at most one core
         environment = os.environ | dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
         self._process = subprocess.Popen(
             command, pass_fds=[far.fileno()], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment
@@ -106,10 +110,9 @@ class Worker:
         #: whether the far side has compiled its kernels
         self.ready = False
         self._closed = threading.Event()
-        #: reason why estimating has ended; empty until it ends
+        #: reason why the process has ended; empty while it runs
         self.error = ""
-        #: None until all data queued before `finish` have been processed; then an empty text, or the reason why the
-        #: last window could not be estimated
+        #: None until the estimate that `finish` requests is done; then an empty text, or the reason why there is none
         self.ended: str | None = None
         self._thread = threading.Thread(target=self._send_queue, name="estimate", daemon=True)
         self._thread.start()
@@ -119,15 +122,15 @@ class Worker:
         self._waiting.append(("load", stamp_ns, wrench))
 
     def add_pose(self, stamp_ns: int, q: tuple[float, ...], deviation: tuple[float, ...] = ()) -> None:
-        """Queue a measured pose, with its deviations if known."""
+        """Queue a measured pose and its standard deviations, if known."""
         self._waiting.append(("pose", stamp_ns, q, deviation))
 
     def add_gaps(self, stamp_ns: int, pairs: tuple[int, ...], gaps: tuple[float, ...]) -> None:
-        """Queue measured gaps in m; `pairs` are the numbers of their pairs of corner and wall."""
+        """Queue measured gaps in m of the pairs with the indices `pairs`."""
         self._waiting.append(("gaps", stamp_ns, pairs, gaps))
 
     def set_load_deviation(self, deviation: Deviation) -> None:
-        """Queue the deviation of the load from here on."""
+        """Queue the standard deviation of the load that applies from now on."""
         self._waiting.append(("spread", deviation))
 
     def restart(self) -> None:
@@ -136,23 +139,20 @@ class Worker:
         self._waiting.append(("restart",))
 
     def finish(self) -> None:
-        """Request the estimate of the last window, at the end of the input.
-
-        `ended` is None until this estimate is done.
-        """
+        """Request the estimate of the last window at the end of the input; `ended` is None until it is done."""
         self._waiting.append(("end",))
 
     @property
     def behind(self) -> bool:
-        """Whether the queue of data to be sent is more than a tenth full."""
+        """Whether the queue of unsent data is more than a tenth full."""
         return len(self._waiting) > _MOST_WAITING // 10
 
     def poll(self) -> Found | None:
-        """Return the next result that has arrived, or None; results from before a restart are dropped."""
+        """Return the next result that has arrived, or None; results of windows before a restart are dropped."""
         if self.error or self.ended is not None:
             return None
         if len(self._waiting) > _MOST_WAITING:
-            # the sending thread may be blocked, because the far side does not read; the far side is therefore killed
+            # the far side does not read, which may block the sending thread, so the far side is killed
             self._process.kill()
             self._fail(f"the estimator did not read for {_MOST_WAITING} samples")
             return None
@@ -168,12 +168,12 @@ class Worker:
                 return found if found.restarts == self._restarts else None
         except (EOFError, OSError):
             code = self._process.poll()
-            if code is not None:  # None means that the process is still ending; the next call gets the code
+            if code is not None:  # None while the process is still ending; a later call receives the code
                 self._fail(f"the estimator ended with code {code}")
         return None
 
     def _fail(self, error: str) -> None:
-        """Stop estimating and drop queued and later data."""
+        """Record why the process has ended, and drop queued and later data."""
         self.error, self._waiting = error, deque(maxlen=0)
 
     def close(self) -> None:
@@ -195,15 +195,15 @@ class Worker:
             if waiting:
                 try:
                     self._connection.send(waiting)
-                except OSError:  # `poll` finds the cause and reports it
+                except OSError:  # `poll` reports the cause
                     return
 
 
 def serve(connection: Connection) -> None:
-    """Receive data and estimate windows until the near side closes the connection."""
+    """Receive data and send estimates until the near side closes the connection."""
     scene, windows, asked = connection.recv()
     warm_up(scene)
-    connection.send(None)  # the far side has compiled its kernels
+    connection.send(None)  # the message that the kernels are compiled
     guess: Guess = ()
     ended: str | None = None
     skipped = restarts = 0
@@ -223,7 +223,7 @@ def serve(connection: Connection) -> None:
                     due = formed
         if due is None:
             connection.send(ended)
-            connection.recv()  # wait until the other side closes the connection
+            connection.recv()  # wait until the near side closes the connection, which raises `EOFError`
         assert due is not None
         begin = time.perf_counter()
         found = answer(scene, due, guess, asked)
@@ -234,7 +234,7 @@ def serve(connection: Connection) -> None:
 
 
 def add(windows: Windows, item: tuple[Any, ...]) -> Window | None:
-    """Add a queued item of `Worker` to the windows; return a window if it is due."""
+    """Add a queued item of `Worker` to the windows; return a window if one has become due."""
     kind, *values = item
     if kind == "load":
         return windows.add_load(*values)
@@ -248,7 +248,7 @@ def add(windows: Windows, item: tuple[Any, ...]) -> Window | None:
 
 
 def _request_short_slices() -> None:
-    """Request time slices of 0.1 ms, after which a waiting process gets the core (from Linux 6.12 on, x86-64 only)."""
+    """Request time slices of 0.1 ms, so that other processes wait less for the core (x86-64, Linux 6.12 or newer)."""
     if platform.machine() == "x86_64" and sys.platform == "linux":
         # struct sched_attr: size, policy, flags, nice, priority, runtime [ns], deadline, period
         attributes = struct.pack("IIQiIQQQ", 48, os.SCHED_OTHER, 0, _NICE, 0, _SLICE_NS, 0, 0)
@@ -256,8 +256,9 @@ def _request_short_slices() -> None:
 
 
 def main() -> None:
-    """Run the far side; the arguments are the descriptor of its end of the pipe, and modules of contact laws."""
-    # Ctrl-C reaches the whole process group; this process ignores it, because the near side ends this process
+    """Run the far side; the command-line arguments are a descriptor of the pipe, and modules with contact laws."""
+    # Ctrl-C sends SIGINT to the whole process group; the far side ignores SIGINT, because the near side ends the far
+    # side
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
     _request_short_slices()
