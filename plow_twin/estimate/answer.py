@@ -56,7 +56,7 @@ class Answer:
 
 
 def answer(scene: Scene, window: Window, guess: Guess, asked: Asked) -> Answer:
-    """Estimate from a window, starting at `guess`, and compute the other requested answers."""
+    """Return the estimate from a window and the other requested answers; the fit starts at `guess`."""
     result, following = estimate_window(scene, window.load, window.pose, window.lost, guess, window.gaps)
     also: dict[str, Any] = {}
     if asked.members:
@@ -91,8 +91,8 @@ def followed(load: Load, period: float) -> Load:
 def forecast_from(scene: Scene, result: Estimate, load: Load, plan: Plan) -> dict[str, Any]:
     """Return the forecast that starts from an estimate, as JSON values.
 
-    The forecast repeats the load of the window with the estimated gains. If the window is too short to contain a
-    period, the forecast uses the load of the scene.
+    The forecast repeats the load of the window with the estimated gains. If the window contains too few load periods,
+    the forecast uses the load of the scene.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def forecast_from(scene: Scene, result: Estimate, load: Load, plan: Plan) -> dic
 def under_load(scene: Scene, result: Estimate, load: Load) -> Scene:
     """Return the scene with its loads replaced by the load of a window times the estimated gains.
 
-    If the window is too short to contain a period, the scene is returned unchanged.
+    If the window contains too few load periods, the scene is returned unchanged.
     """
     gains = [1.0 if gain is None else gain.mean for gain in (result.gain_fx, result.gain_fy, result.gain_m)]
     felt = load.thinned() if result.load_harmonics is None else result.load_harmonics.added(load.thinned())

@@ -17,7 +17,7 @@ from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_bande
 
 Array = NDArray[np.float64]
 
-#: Number of unknowns of one swing; by definition they are the pose and its rate at the start, three numbers each.
+#: Number of unknowns of a swing: by definition, pose and rate at its start, with three numbers each.
 OWN = 6
 
 

@@ -32,22 +32,22 @@ from plow_twin.solve.compiled_scene import inertias
 
 Array = NDArray[np.float64]
 
-#: Axis that each wall bounds, and outward normal of the wall, by definition.
+#: Definition of the walls: axis that a wall bounds, and outward normal of the wall.
 WALLS: Final = {
     "right": (GX, np.array([1.0, 0.0])),
     "left": (GX, np.array([-1.0, 0.0])),
     "top": (GY, np.array([0.0, 1.0])),
     "bottom": (GY, np.array([0.0, -1.0])),
 }
-#: Smallest number of rows of a flight, derived from the three coefficients of a parabola, and upper bound of the number
+#: Smallest number of rows of a flight, derived from the three coefficients of a parabola, and upper bound on the number
 #: of rows that are fitted.
 _FLIGHT_ROWS: Final = (4, 9)
-#: Degrees of freedom of the Student-t likelihood, derived by Lange et al.
+#: Degrees of freedom of the Student-t likelihood, derived from the recommendation of Lange et al.
 _FREEDOM: Final = 4.0
-#: Upper bounds: number of scales on the grid of the likelihood, and number of reweighting iterations for each scale.
+#: Upper bounds on the number of scales on the grid of the likelihood, and on the reweighting iterations for each scale.
 _SCALES, _ROUNDS = 40, 30
-#: Layout of the unknowns of the linear problem, by definition: clearances, bias of x, y and theta, lever arm, and
-#: relative change of the penetration from its value with the scene's stiffness.
+#: Definition of the unknowns of the linear problem: clearances, bias of x, y and theta, lever arm, and relative change
+#: of the penetration from its value with the scene's stiffness.
 _CLEARANCES, _BIAS, _LEVER, _DEPTH, _SIZE = slice(0, 2), slice(2, 5), slice(5, 7), 7, 8
 
 
@@ -89,15 +89,16 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> E
     """Return the estimate of the clearances around a block from the positions of its impacts.
 
     If only one wall of an axis has impacts, the sensor's bias along the axis cannot be estimated. The bias is then
-    assumed to be zero, and the result contains None for it. A clearance is not observable if its standard deviation
-    exceeds half of the prior deviation. An observable clearance is rough if its standard deviation exceeds 1 mm.
+    assumed to be zero, and the result contains None for the bias. A clearance is not observable if its standard
+    deviation exceeds half of the prior deviation. An observable clearance is rough if its standard deviation exceeds 1
+    mm.
 
     Parameters
     ----------
     scene : Scene
         A scene with `carries: corners`.
     load : Load
-        The believed load.
+        The measured load.
     poses : Poses
         The poses, measured in the axes of the guide.
     known : Estimate
@@ -258,7 +259,7 @@ def impacts(scene: Scene, load: Load, poses: Poses, level: Array) -> tuple[list[
     Parameters
     ----------
     scene, load : Scene, Load
-        The block, and the believed load.
+        The block, and the measured load.
     poses : Poses
         Poses in which all components are measured.
     level : ndarray, shape (3,)

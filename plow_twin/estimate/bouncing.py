@@ -51,10 +51,10 @@ Array = NDArray[np.float64]
 _TURNS: Final = np.linspace(-0.16, 0.16, 81)
 _FINEST_TURN: Final = 3e-3
 _NEAR_TURNS: Final = np.linspace(-_FINEST_TURN, _FINEST_TURN, 5)
-#: Upper bounds of the number of rows in the search for a bias, and in the refinement of the bias.
+#: Upper bounds on the number of rows in the search for a bias, and in the refinement of the bias.
 _MOST_ROWS, _MOST_NEAR_ROWS = 2000, 1200
-#: Smallest number of rows in a part of a load period, derived from the scatter of a mean, which is a third of the
-#: scatter of nine values.
+#: Smallest number of rows in a part of a load period, derived from the mean of nine values, whose scatter is a third of
+#: the scatter of the values.
 _FEWEST_OF_PHASE = 9
 #: Grids of trial values for the delay in s, derived from its prior. The grid for the measured path extends over two
 #: prior deviations to both sides; the grid for simulated motions extends over a tenth of this range. `_NO_LAG` is the
@@ -70,11 +70,11 @@ _CHANGES_BY_PHASE: Final = (1, 4)
 _SIDES: Final = ("frame.width_m", "frame.height_m")
 #: Guard against logarithms of zero and divisions by zero: squared scatter in m2 or rad2.
 _NO_SCATTER = 1e-14
-#: Upper bound of the factor by which the work for simulated motions may grow in windows longer than ten load periods.
+#: Upper bound on the factor by which the work for simulated motions may grow in windows longer than ten load periods.
 _LONGER = 2.0
-#: Bounds of the drawn penetration in m for a hard contact, and for a firm contact.
+#: Bounds on the drawn penetration in m for a hard contact, and for a firm contact.
 _HARD_BOUNDS, _FIRM_BOUNDS = (8e-7, 6e-4), (2e-6, 2e-2)
-#: Upper bound of the number of iterations in which the noise of a simulated motion is adjusted.
+#: Upper bound on the number of iterations in which the noise of a simulated motion is adjusted.
 _NOISE_ROUNDS = 3
 #: Smallest number of draws, derived from the twenty features of the regression, and smallest number of poses, derived
 #: from the 99 % quantile that is computed from them.
@@ -497,8 +497,8 @@ def class_deviate(believed: Array, other: Array, measured: Array) -> float:
 def path_deviate(seen: Array, features: Array, drawn: list[Array], measured: Array) -> float:
     """Return the distance of the measured path from the drawn motions as a normal deviate; 0 with too few measurements.
 
-    The reference for the deviate are the distances of nearby drawn motions from the other drawn motions, because these
-    distances occur with a correct model.
+    The deviate refers to the distances of nearby drawn motions from the other drawn motions, which are the distances
+    for a correct model.
     """
     # shape (n, lags, parts); the paths are compared at several lags, because the delay is not known exactly
     paths = np.array(drawn)
@@ -673,7 +673,7 @@ class MotionFeatures:
         vector[[GX, GY]], vector[DAMPING] = clearance, numbers[1]
         vector[GAIN] = np.clip(numbers[2:5], 0.7, 1.3)
         scene = unknowns.scene_of(vector)
-        # the stiffness is set directly, because `scene_of` limits it, but the decay of bounces depends on larger values
+        # the stiffness is set again, because `scene_of` limits it, but the decay of bounces depends on larger values
         # too
         contact = replace(scene.contact, stiffness=unknowns.force / math.exp(numbers[0]) ** scene.contact.exponent)
         start = np.concatenate([self.q[0], np.zeros(3)])

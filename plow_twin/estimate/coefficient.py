@@ -22,10 +22,10 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Upper bound of the number of grid points, and half width of the grid in prior deviations, derived from a probability
+#: Upper bound on the number of grid points, and half width of the grid in prior deviations, derived from a probability
 #: of 6e-5 outside the grid.
 _POINTS, _REACH = 801, 4.0
-#: Bounds of the simulated wear path: it ends when a clearance has grown by `_FURTHER` times the growth in the history
+#: Bounds on the simulated wear path: it ends when a clearance has grown by `_FURTHER` times the growth in the history
 #: plus `_FURTHER_M` in m.
 _FURTHER, _FURTHER_M = 2.0, 5e-4
 

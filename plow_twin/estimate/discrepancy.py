@@ -3,9 +3,9 @@
 No machine matches the model exactly. Three kinds of discrepancy are considered:
 
 - Further unknowns, each with a prior: inertia, size of the frame, friction, exponent, differences between the walls,
-  and errors of the sensor. They are estimated in one linearised step from the fit. Bayesian variable selection samples
-  which of these quantities differ from the scene. A quantity without evidence keeps its value in the scene. A quantity
-  that the motion does not determine widens the interval.
+  and errors of the sensor. The further unknowns are estimated in one linearised step from the fit. Bayesian variable
+  selection samples which of the further unknowns differ from the scene. A quantity without evidence keeps its value in
+  the scene. A quantity that the motion does not determine widens the interval.
 - A constant error of the load in each swing. The size of these errors is estimated from all swings (empirical Bayes).
 - Remaining residuals, which are treated as noise. Large residuals, and residuals that stay correlated for long,
   increase the variance of the measurements (tempered likelihood).
@@ -54,11 +54,11 @@ STATED: Final = {
 _WALL_STEP, _PUSH_STEP = 0.02, 5e-3
 #: Guard against division by zero: smallest error of the load in units of half the load's range.
 _LEAST_PUSH = 1e-5
-#: Upper bounds of the iterations of expectation-maximisation in three series; the noise is tempered after each series.
+#: Upper bounds on the iterations of expectation-maximisation in three series; the noise is tempered after each series.
 _ROUNDS = (8, 5, 3)
-#: Upper bound of the number of sweeps of the sampler, and number of initial sweeps that are discarded.
+#: Upper bound on the number of sweeps of the sampler, and number of initial sweeps that are discarded.
 _SWEEPS, _BURNT = 50, 10
-#: Upper bound of the lag in rows at which the correlation of residuals is computed.
+#: Upper bound on the lag in rows at which the correlation of residuals is computed.
 _LONGEST_LAG = 60
 
 
@@ -69,8 +69,8 @@ class Graded:
     Attributes
     ----------
     shared, covariance : ndarray, shape (SIZE,), (SIZE, SIZE)
-        The shared unknowns and their covariance. If the fit passes all checks, they hold for a machine that differs
-        from the scene only in the quantities of the fit.
+        The shared unknowns and their covariance. If the fit passes all checks, these values hold for a machine that
+        differs from the scene only in the quantities of the fit.
     clearance, clearance_deviation : ndarray, shape (2,)
         Clearances in m and their standard deviations, for a machine that may differ from the scene in any quantity.
     differs : dict of str to (float, float, float)

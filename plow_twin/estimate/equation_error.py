@@ -33,11 +33,12 @@ from plow_twin.solve.compiled_scene import inertias
 
 Array = NDArray[np.float64]
 
-#: Index of the wall of each pair in the order right, left, top, bottom, by definition.
+#: Definition of the walls: index of the wall of each pair in the order right, left, top, bottom.
 _WALL: Final = np.argmax(np.stack(WALLS), axis=0)
-#: Gauss-Newton steps: upper bound of their number, size in m below which they end, and largest size in m.
+#: Upper bound on the number of Gauss-Newton steps, size of a step in m below which the iteration ends, and largest size
+#: of a step in m.
 _STEPS, _SMALL, _LONGEST = 8, 2e-5, 3e-3
-#: Lower bounds of the interval between rows in s, and of the number of rows in half of a test function.
+#: Lower bounds on the interval between rows in s, and on the number of rows in half of a test function.
 _SHORTEST, _FEWEST = 5e-3, 3
 #: Unit of the stiffness in N/m, derived so that the column of the stiffness is about as large as the other columns.
 _UNIT = 1e7
@@ -47,7 +48,7 @@ _HUBER, _MAD = 2.0, 1.4826
 #: Starting values of a search within the bounds of the unknowns: clearances as shares of the range of motion, and
 #: penetrations in m.
 _SHARES, _DEPTHS = (0.25, 0.5, 0.75, 0.95), (3e-3, 6e-3, 12e-3, 20e-3)
-#: Lower and upper bound of the penetration in m under the reference force.
+#: Lower and upper bound on the penetration in m under the reference force.
 DEPTHS: Final = (2e-4, 3e-2)
 #: Guard against division by zero for columns without information.
 _SINGULAR = 1e-9

@@ -54,19 +54,19 @@ Array = NDArray[np.float64]
 #: the differences. An empty tuple means that there is no guess.
 Guess = tuple[float, ...]
 
-#: Upper bounds of the length of a window in load periods and in s, of which the longer one applies. Only the newest
+#: Upper bounds on the length of a window in load periods and in s, of which the longer one applies. Only the newest
 #: part of longer data is used.
 MOST_PERIODS, MOST_SPAN_S = 20.0, 60.0
-#: Upper bound in s of the length of data in which the period of the load is searched; it is the longest window of a
+#: Upper bound in s on the length of data in which the period of the load is searched; it is the longest window of a
 #: node.
 _LONGEST_S = 600.0
 #: Normal deviate that a correct model exceeds in one of a hundred cases, derived from the normal distribution.
 MOST_OTHER_LAW = round(float(ndtri(0.99)), 2)
 #: 95 % quantile of a half-normal distribution, derived from the normal distribution with unit variance.
 _HALF_NORMAL_P95 = float(ndtri(0.975))
-#: Bounds of the logarithm of a contact's penetration in m.
+#: Bounds on the logarithm of a contact's penetration in m.
 _LN_PENETRATIONS = (math.log(1e-9), math.log(0.12))
-#: Indices of the two pairs at each wall of the cavity, by definition.
+#: Definition of the walls of the cavity: indices of the two pairs at each wall.
 _SIDES = {"left": (1, 7), "right": (3, 5), "top": (0, 2), "bottom": (4, 6)}
 
 
@@ -880,7 +880,7 @@ def _groups(
     shared: Array,
     added: Array,
 ) -> dict[str, tuple[Interval, State]]:
-    """Return the clearance between each two opposite pads, and its state, for a frame of exactly the scene's size.
+    """Return clearance and state of each group of facing pads, for a frame of exactly the scene's size.
 
     Parameters
     ----------
@@ -924,8 +924,9 @@ def _unobserved(unknowns: Unknowns, deviation: Array, index: int, reach: float, 
 
 
 def _stiffness(unknowns: Unknowns, psi: Interval) -> Interval:
-    """Return the stiffness from the softness `psi`; an interval that includes unresolved contacts extends to the
-    hardest.
+    """Return the stiffness from the softness `psi`.
+
+    If the interval includes contacts that are too hard to be resolved, it extends to `Unknowns.hardest_believed`.
     """
     soft, hard = unknowns.stiffness_of(psi.p95), unknowns.stiffness_of(psi.p05)
     if unknowns.within(np.full(SIZE, psi.p05))[SOFTNESS] > psi.p05:

@@ -42,13 +42,13 @@ Array = NDArray[np.float64]
 NO_PRIOR = 1e-6
 #: Steps of the difference quotients with respect to a starting state, in m, m, rad, m/s, m/s, rad/s.
 _DISPLACED = np.array([2e-4, 2e-4, 1e-3, 5e-3, 5e-3, 3e-2])
-#: Lower bound of the spectral density of an unknown acceleration in m2/s3 and rad2/s3. After a second it causes a rate
+#: Lower bound on the spectral density of an unknown acceleration in m2/s3 and rad2/s3. After a second it causes a rate
 #: of 0.1 mm/s or 0.1 mrad/s, which neither solver nor sensor can resolve.
 _LEAST_DRIFT = 1e-8
-#: The two pads of each wall, by definition: left and right with the top pad first, top and bottom with the left pad
+#: Definition of the walls by their two pads: left and right with the top pad first, top and bottom with the left pad
 #: first.
 WALLS: Final = ((1, 7), (3, 5), (0, 2), (6, 4))
-#: Layout of the *differences*, by definition. These are unknowns by which machine and sensor differ from the model:
+#: Definition of the *differences*, which are unknowns by which machine and sensor differ from the model:
 #:
 #: - `turn_<wall>`: rotation of a wall, the distance in m by which the first pad in `WALLS` lies farther out than the
 #: second pad

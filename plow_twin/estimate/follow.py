@@ -49,24 +49,24 @@ Rows = NDArray[np.void]
 
 #: Default number of members, by definition.
 MEMBERS: Final = 128
-#: Lower bound of the time in s between two poses that are used. A pose that follows sooner contributes little but costs
+#: Lower bound on the time in s between two poses that are used. A pose that follows sooner contributes little but costs
 #: as much as any pose.
 APART_S: Final = 4e-3
-#: Lower and upper bound of the number of poses from which the noise is computed.
+#: Lower and upper bound on the number of poses from which the noise is computed.
 _NOISE_ROWS: Final = (20, 400)
-#: Upper bound of the number of samples in one call, so that the rows of all members stay in the processor's cache.
+#: Upper bound on the number of samples in one call, so that the rows of all members stay in the processor's cache.
 _CALL: Final = 20
-#: Rate in 1/s at which the clearances are computed for publication, by definition.
+#: Rate in 1/s at which the clearances are computed, by definition the rate at which they are published.
 _KNOWN_HZ: Final = 10.0
-#: Upper bound of the number of poses that wait until the model reaches their stamps; a session stores as many.
+#: Upper bound on the number of poses that wait until the model reaches their stamps; a session stores as many.
 _MOST_DUE: Final = MOST_MEASURED
-#: By definition: masks of a single row with intervals (`_YES`) or without intervals (`_NO`), an empty array of digests,
-#: and the change of clearances that do not change.
+#: Definition of constant arrays: masks of a single row with intervals (`_YES`) and without intervals (`_NO`), no
+#: digests, and a change of zero of the clearances.
 _YES: Final = np.ones(1, bool)
 _NO: Final = np.zeros(1, bool)
 _NO_DIGESTS: Final = np.zeros(0, np.int64)
 _UNMOVED: Final = np.zeros(6)
-#: A load of zero and a set without poses, by definition.
+#: A zero load and an empty set of poses, by definition.
 _NO_LOAD: Final = Load(np.array([0.0, 1.0]), np.zeros((2, 3)))
 _NO_POSES: Final = Poses(np.zeros(0), np.zeros((0, 3)))
 _LENGTH: Final = struct.Struct("<q")

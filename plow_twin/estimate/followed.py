@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 WINDOW_S, INTERVAL_S = 32.0, 10.0
 #: Nanoseconds per second, by definition.
 _NS: Final = 1e9
-#: Upper bound in s of the duration of the parts in which the load is processed, so that the rows of all members fit
+#: Upper bound in s on the duration of the parts in which the load is processed, so that the rows of all members fit
 #: into the processor's cache.
 _PART_S: Final = 0.02
 

@@ -22,10 +22,14 @@ from plow_twin.model.pairs import PAIR_NAMES
 
 Array = NDArray[np.float64]
 
-#: Upper bound of the number of rows, which is about 200 per second in a window of ten load periods.
+#: Upper bound on the number of rows, which is about 200 per second in a window of ten load periods.
 _MOST_ROWS = 6000
-#: Upper bound of the number of steps; number of initial steps in which the predictability is probed; number of random
-#: probes in each of these steps; reduction of the cost, within noise, below which the steps end.
+#: Parameters of the Gauss-Newton iteration:
+#:
+#: - upper bound on the number of steps
+#: - number of initial steps in which the predictability is probed
+#: - number of random probes in each of these steps
+#: - reduction of the cost, within noise, below which the iteration ends
 _ROUNDS, _DRAWN_ROUNDS, _PROBES, _ENOUGH = 8, 3, 3, 0.5
 #: Steps of the two-sided difference quotients with respect to the delay in s and to a starting state. The larger
 #: one-sided steps of the fit of the poses made clearances wrong by 4 standard deviations.

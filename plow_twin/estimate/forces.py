@@ -27,15 +27,15 @@ Array = NDArray[np.float64]
 
 #: Default number of members, derived from a standard error of 1.4 % of the probability below the 5 % quantile.
 MEMBERS: Final = 256
-#: Probabilities of the lower end, the middle and the upper end of an interval, by definition.
+#: Definition of an interval: probabilities of its lower end, its middle and its upper end.
 POINTS: Final = (0.05, 0.5, 0.95)
 #: Smallest number of members, derived from the 5 % quantile, below which at least one member must lie.
 FEWEST: Final = 20
-#: Lower bound of the clearance of a member, as a share of the estimated clearance.
+#: Lower bound on the clearance of a member, as a share of the estimated clearance.
 _LEAST_SHARE = 0.02
 #: Tolerance of the solver for the members, equal to the tolerance in a fit.
 TOLERANCE: Final = tuning.TOLERANCE
-#: Upper bound of the number of samples in one call, so that the rows of all members stay in the processor's cache.
+#: Upper bound on the number of samples in one call, so that the rows of all members stay in the processor's cache.
 _CALL = 10
 
 

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 #: Seconds per hour, by definition.
 HOUR_S = 3600.0
-#: Upper bound of the share by which a drawn clearance may be smaller than the estimated clearance.
+#: Upper bound on the share by which a drawn clearance may be smaller than the estimated clearance.
 _LEAST_SHARE = 0.9
 
 
@@ -64,7 +64,7 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Plan:
-    """Limits of the clearances [m], horizon and planned stop [h], and how the machine is driven."""
+    """Limits of the clearances [m], horizon and planned stop [h], operation of the machine, and number of draws."""
 
     limit_horizontal_m: float
     limit_vertical_m: float

@@ -20,7 +20,7 @@ from plow_twin.solve.state import EVENT, SEGMENT, TOTALS, Parts, Status, new_rec
 
 Array = NDArray[np.float64]
 
-#: Upper bounds of one simulation: number of steps per second of motion, number of steps in addition, and number of rows
+#: Upper bounds on one simulation: number of steps per second of motion, number of steps in addition, and number of rows
 #: in the event log.
 _STEPS_PER_SECOND, _STEPS = 20_000, 2_000
 _LOG_SIZE = 4096

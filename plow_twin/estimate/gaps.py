@@ -26,11 +26,11 @@ Array = NDArray[np.float64]
 
 #: Guard against faulty readings: largest distance [m] that is accepted as a gap.
 _LARGEST = 1e3
-#: Upper bound of the iterations, in which the residual of the nonlinear equations corrects the pose.
+#: Upper bound on the iterations, in which the residual of the nonlinear equations corrects the pose.
 _ROUNDS = 4
-#: Lower bound of a singular value of the equations; below this value the sensors do not determine an unknown.
+#: Lower bound on a singular value of the equations; below this value the sensors do not determine an unknown.
 _SINGULAR = 1e-6
-#: Indices of the two opposite pairs of each clearance between facing pads, by definition.
+#: Definition of the groups of facing pads: indices of two opposite pairs, whose gaps determine a clearance.
 GROUPS: Final = {
     "horizontal_top": (1, 3),
     "horizontal_bottom": (7, 5),

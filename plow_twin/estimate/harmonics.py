@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 #: Names of the components of a load.
 COMPONENTS: Final = ("fx", "fy", "m")
-#: Upper bound of the number of corrections of a load's frequency, which converge quadratically.
+#: Upper bound on the number of corrections of a load's frequency, which converge quadratically.
 _CORRECTIONS = 6
 #: Number of knots in the shortest period of a harmonic, derived from an error of 0.9 % of the linear interpolation.
 _KNOTS = 24

@@ -20,10 +20,10 @@ from plow_twin.estimate.verdict import Verdict, judge
 
 Array = NDArray[np.float64]
 
-#: Upper bounds of the number of fits with harmonics, of the iterations in each fit, and of the number of consecutive
+#: Upper bounds on the number of fits with harmonics, on the iterations in each fit, and on the number of consecutive
 #: fits without improvement.
 _ROUNDS, _ITERATIONS, _IN_VAIN = 12, 6, 4
-#: Horizon, the upper bound of the fitted part of each swing, in the second stage relative to the first stage. The third
+#: Horizon, the upper bound on the fitted part of each swing, in the second stage relative to the first stage. The third
 #: stage fits whole swings.
 _LONGER = 2.0
 

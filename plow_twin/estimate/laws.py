@@ -20,11 +20,15 @@ Array = NDArray[np.float64]
 
 #: Guard against division by zero: smallest variance of a feature.
 _LEAST = 1e-9
-#: Indices of the parameters with terms up to the third degree (penetration, damping), and of the clearances, which have
-#: products with these parameters, by definition.
+#: Definition of the polynomial: indices of the parameters with terms up to the third degree (penetration, damping), and
+#: of the clearances, which are multiplied by these parameters.
 _CURVED, _CHANGING = (0, 1), (5, 6)
-#: Levenberg-Marquardt steps to the most likely parameters: upper bound of their number, damping of the first step, gain
-#: below which they end, and step of the difference quotients.
+#: Parameters of the search for the most likely parameters with Levenberg-Marquardt steps:
+#:
+#: - upper bound on the number of steps
+#: - damping of the first step
+#: - gain of the likelihood below which the search ends
+#: - step of the difference quotients
 _STEPS, _DAMPED, _ENOUGH, _SMALL = 30, 1e-2, 1e-2, 1e-4
 
 

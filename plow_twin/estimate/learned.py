@@ -27,9 +27,9 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Lower bound of the number of members, as a multiple of the number of learned parameters plus one.
+#: Lower bound on the number of members, as a multiple of the number of learned parameters plus one.
 _MEMBERS: Final = 4
-#: Upper bound of a restitution.
+#: Upper bound on a restitution.
 _MOST_RESTITUTION = 0.999
 
 

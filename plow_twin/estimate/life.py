@@ -28,14 +28,14 @@ from plow_twin.run.simulate import simulate
 
 Array = NDArray[np.float64]
 
-#: Wear depth in m of a trial simulation that measures the sliding distance; its lower bound is the rounding error, its
-#: upper bound an influence on the motion.
+#: Wear depth in m of a trial simulation that measures the sliding distance. The depth is above the rounding errors, and
+#: below the bound from which it would change the motion.
 _TRACE_M = 1e-12
-#: Upper bound of the number of interpolated rows between two rows of a path with running-in.
+#: Upper bound on the number of interpolated rows between two rows of a path with running-in.
 _FINER = 16
-#: Upper bound of the number of steps of a path.
+#: Upper bound on the number of steps of a path.
 _MOST_STEPS = 400
-#: Lower bound of the clearance in m that limits a step, because steps from a clearance of zero would not grow.
+#: Lower bound on the clearance in m that limits a step, because steps from a clearance of zero would not grow.
 _LEAST_CLEARANCE = 1e-3
 
 

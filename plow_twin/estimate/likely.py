@@ -22,11 +22,11 @@ Array = NDArray[np.float64]
 
 #: Guards against division by zero: smallest variance of a feature, and smallest deviation of a drawn parameter.
 _LEAST, _SAME = 1e-14, 1e-12
-#: Pairs of parameters with a quadratic term (clearances, softness and damping), by definition.
+#: Definition of the quadratic terms: pairs of parameters among clearances, softness and damping.
 _CURVED = tuple(combinations_with_replacement(range(4), 2))
-#: Number of folds of the cross-validation, by definition.
+#: Number of folds of the cross-validation, which bounds its cost.
 _PARTS = 10
-#: Upper bounds of the number of Gauss-Newton steps, and of the size of a step in deviations of the draws.
+#: Upper bounds on the number of Gauss-Newton steps, and on the size of a step in deviations of the draws.
 _STEPS, _LONGEST = 5, 1.5
 #: Prior deviation in deviations of the draws that is so large that the parameter has practically no prior.
 _FREE = 100.0

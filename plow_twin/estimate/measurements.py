@@ -23,10 +23,10 @@ UNSTATED: Deviation = (0.0, 0.0, 0.0)
 #: Smallest numbers of values for a standard deviation, derived from its relative error 1 / sqrt(2 n): 22 % for a load
 #: cell in contact, 16 % for poses and gaps, 10 % for the scatter in a comparison.
 FEWEST_IN_CONTACT, FEWEST_POSES, FEWEST_FOR_SCATTER = 10, 20, 50
-#: Upper bound of the interval in s between poses or samples that resolve the motion. Over this interval, the motion in
+#: Upper bound on the interval in s between poses or samples that resolve the motion. Over this interval, the motion in
 #: a soft contact is nearly a cubic polynomial.
 RESOLVING: Final = 0.02
-#: Lower bound of the number of points between two knots when a load is averaged.
+#: Lower bound on the number of points between two knots when a load is averaged.
 _FINER = 8
 #: Guard against faulty data: largest component of a pose in m or rad, and of a load in N or N m.
 _LARGEST_POSE, _LARGEST_LOAD = 1e6, 1e15

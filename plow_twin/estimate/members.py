@@ -37,15 +37,15 @@ from plow_twin.stream.outputs import clearances
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 
-#: Upper bound of the age in s of a late pose that is used, including the sensor's delay. The motion is stored for this
+#: Upper bound on the age in s of a late pose that is used, including the sensor's delay. The motion is stored for this
 #: time.
 LATEST_S: Final = 0.25
-#: Lower bound of the interval in s between stored states of the motion.
+#: Lower bound on the interval in s between stored states of the motion.
 _PATH_S: Final = 2e-3
-#: Upper bound of the number of consecutive outliers that are ignored. More consecutive outliers show that the head has
+#: Upper bound on the number of consecutive outliers that are ignored. More consecutive outliers show that the head has
 #: really moved.
 _MOST_OUTLYING: Final = 5
-#: Lower bound of the number of members whose parameters are changed together, because a call costs as much as the
+#: Lower bound on the number of members whose parameters are changed together, because a call costs as much as the
 #: change of three members.
 _AT_ONCE: Final = 8
 #: Slice that selects all members.

@@ -23,15 +23,15 @@ from plow_twin.estimate.unknowns import GX, GY, SIZE
 
 Array = NDArray[np.float64]
 
-#: Clearance of each group of two facing pads, by definition: index of the clearance of the axis, and factors on the
-#: rotations of the left, right, top and bottom wall, which are added to this clearance.
+#: Definition of the clearance of each group of facing pads. It is the clearance of the axis with the given index, plus
+#: the rotations of the left, right, top and bottom wall times the given factors.
 _MADE_OF: Final = {
     "horizontal_top": (GX, np.array([0.5, 0.5, 0.0, 0.0])),
     "horizontal_bottom": (GX, np.array([-0.5, -0.5, 0.0, 0.0])),
     "vertical_left": (GY, np.array([0.0, 0.0, 0.5, 0.5])),
     "vertical_right": (GY, np.array([0.0, 0.0, -0.5, -0.5])),
 }
-#: Upper bounds of the number of fits with differences, and of the iterations in each fit.
+#: Upper bounds on the number of fits with differences, and on the iterations in each fit.
 _ROUNDS, _ITERATIONS = 6, 15
 assert list(_MADE_OF) == list(GROUPS)
 

@@ -19,7 +19,7 @@ from plow_twin.estimate.unknowns import CORRELATED, QUANTITIES
 
 Array = NDArray[np.float64]
 
-#: 95 % quantile of the standard normal distribution, derived with `scipy.special.ndtri`.
+#: 95 % quantile of the standard normal distribution, from which the ends of a 90 % interval are derived.
 NORMAL_P95: Final = float(ndtri(0.95))
 #: Bound in standard deviations beyond which the tail of the normal distribution is treated as exponential.
 _FAR = 30.0
@@ -33,7 +33,7 @@ class State(Enum):
     ROUGH = "rough"  #: the machine differs from the model, or the interval is wide
     NOT_OBSERVABLE = "not_observable"  #: the prior's value, because the motion does not determine the quantity
     PRIOR = "prior"  #: the prior's value, because the quantity was not measured
-    WITHDRAWN = "withdrawn"  #: the sensor is broken, or the data contradict each other or every motion of the model
+    WITHDRAWN = "withdrawn"  #: the sensor is faulty, the data are contradictory, or no motion of the model fits
 
     @property
     def known(self) -> bool:
@@ -78,7 +78,7 @@ def _tail(least: float) -> tuple[float, float, float]:
 
     `scipy.stats.truncnorm` is not used, because its import takes half a second.
     """
-    if least > _FAR:  # the tail is treated as exponential, because `erfc` underflows
+    if least > _FAR:  # the tail is nearly exponential
         return least + 1.0 / least, least - math.log(0.95) / least, least - math.log(0.05) / least
     share = 0.5 * math.erfc(least / math.sqrt(2.0))
     mean = math.exp(-0.5 * least * least) / (math.sqrt(2.0 * math.pi) * share)

@@ -39,11 +39,11 @@ class Stage:
 
 #: Smallest numbers of rows within a horizon and within a swing, derived from the six unknowns of the start of a swing.
 _FEWEST_ROWS = (8, 12)
-#: Differences of a machine with a low pass of the sensor as the only difference, from its prior standard deviation.
+#: Values of the differences if a low pass of the sensor is the only difference, with its time constant from the prior.
 LOW_PASS: Final = np.array([0.0] * LAG + [UNSTATED["filter"]])
-#: Stages of the search, with bounds of the horizon, of the iterations and of the number of candidates.
+#: Stages of the search, with bounds on the horizon, on the iterations and on the number of candidates.
 STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
-#: Upper bound of the number of swings, which determines the cost of a fit.
+#: Upper bound on the number of swings, which determines the cost of a fit.
 _MOST_SWINGS = 350
 
 

@@ -24,7 +24,7 @@ from plow_twin.model.scene import Clearance, Contact, Friction, Initial, Provena
 if TYPE_CHECKING:
     from plow_twin.estimate.contact_forces import ContactForces
 
-#: Half of the frame's diagonal [m], mass [kg] and load period [s] of the paper's machine, by definition.
+#: Definition of the size of the paper's machine: half of the frame's diagonal [m], mass [kg] and load period [s].
 PAPER_LENGTH, _MASS, _PERIOD = 0.213, 2430.0, 3.14
 
 

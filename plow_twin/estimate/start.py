@@ -17,11 +17,11 @@ from plow_twin.model.scene import Scene
 
 Array = NDArray[np.float64]
 
-#: Masks of the pairs at the right, left, top and bottom wall, shape (8,) each, by definition.
+#: Definition of the walls: masks of the pairs at the right, left, top and bottom wall, shape (8,) each.
 WALLS: Final = (NORMAL_X > 0.0, NORMAL_X < 0.0, NORMAL_Y > 0.0, NORMAL_Y < 0.0)
 #: Indices of the two pairs at each wall, in the order of `WALLS`.
 _PADS: Final = [np.flatnonzero(wall).tolist() for wall in WALLS]
-#: Upper bound of the number of trial times for the start of a swing.
+#: Upper bound on the number of trial times for the start of a swing.
 _CANDIDATES = 12
 
 

@@ -30,9 +30,9 @@ Array = NDArray[np.float64]
 _KNOTS = 1.0 / 3.0
 #: Interval [s] between the knots of the load between samples, derived as half the period of a soft contact (20 Hz).
 _KNOT = 0.025
-#: Upper bound of the number of sets of draws; each set after the first is drawn about the result of the previous set.
+#: Upper bound on the number of sets of draws; each set after the first is drawn about the result of the previous set.
 _ROUNDS = 3
-#: Lower bound of the number of draws for a regression.
+#: Lower bound on the number of draws for a regression.
 _FEWEST = 40
 
 

@@ -84,11 +84,11 @@ GX: Final = _place("horizontal")
 GY: Final = _place("vertical")
 SOFTNESS: Final = _place("stiffness")
 DAMPING: Final = _place("damping")
-#: Slices of the gains and of the biases in a vector of unknowns, by definition.
+#: Definition of the slices of the gains and of the biases in a vector of unknowns.
 GAIN: Final = slice(_place("gain_fx"), _place("gain_m") + 1)
 BIAS: Final = slice(_place("bias_x"), _place("bias_theta") + 1)
 DELAY: Final = _place("delay")
-#: Slice of the quantities that determine the scene (`Unknowns.scene_of`), by definition.
+#: Definition of the slice of the quantities that determine the scene (`Unknowns.scene_of`).
 OF_SCENE: Final = slice(0, GAIN.start)
 SIZE: Final = len(QUANTITIES)
 #: Indices of the quantities that change the motion of the head.
@@ -98,20 +98,20 @@ PROBES: Final = np.array([quantity.probe for quantity in QUANTITIES])
 #: Names of the quantities in the published correlation matrix, with the softness in place of the stiffness.
 CORRELATED: Final = tuple("softness" if place == SOFTNESS else QUANTITIES[place].name for place in MOVING)
 
-#: Bounds of the simulated penetration in m under the reference force. Contacts with a smaller penetration give
+#: Bounds on the simulated penetration in m under the reference force. Contacts with a smaller penetration give
 #: practically the same motion. With a larger penetration, the head could pass through the wall.
 _HARDEST, _SOFTEST = 3e-5, 0.12
-#: Lower bound of a simulated clearance in m.
+#: Lower bound on a simulated clearance in m.
 LEAST_CLEARANCE: Final = 5e-4
 
 
 #: Alternative of a contact law, which is tested if the contact is linear (exponent 1).
 OTHER_LAW: Final = {"hunt_crossley": "kelvin_voigt"}
 
-#: Lower bound of a prior standard deviation. It is so small that a number with the stated deviation 0 does not change
+#: Lower bound on a prior standard deviation. It is so small that a number with the stated deviation 0 does not change
 #: in the fit.
 _HELD = 1e-6
-#: Upper bound of the prior deviation of a load gain.
+#: Upper bound on the prior deviation of a load gain.
 _MOST_GAIN = 1.0
 
 

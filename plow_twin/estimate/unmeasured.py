@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 #: Steps of the difference quotients with respect to all unknowns; the steps for bias and delay are 1e-3 m, m, rad, s.
 _STEPS: Final = np.array([one.step or 1e-3 for one in QUANTITIES])
-#: Upper bound of the number of times that a step is shortened.
+#: Upper bound on the number of times that a step is shortened.
 _SHORTER: Final = 5
 
 

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 COMPONENTS = ("x", "y", "theta")
 
-#: Approximate upper bound of the number of times in a window at which a change of a bias or a clearance is tested.
+#: Approximate upper bound on the number of times in a window at which a change of a bias or a clearance is tested.
 MOMENTS = 60
 
 

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 #: A stamp in ns and the measured values.
 Row = tuple[int, tuple[float, ...]]
 
-#: Upper bound of the number of stored poses, and of stored rows of gaps. More rows arrive only if the load has stopped
+#: Upper bound on the number of stored poses, and on stored rows of gaps. More rows arrive only if the load has stopped
 #: or a clock is ahead by hours.
 MOST_KEPT = 600_000
 

@@ -33,15 +33,15 @@ from plow_twin.estimate.window import Window, Windows
 from plow_twin.model.law_modules import load_laws, loaded_laws
 from plow_twin.model.scene import Scene
 
-#: Upper bound of the interval at which queued data are sent [s].
+#: Upper bound on the interval at which queued data are sent [s].
 _SEND_S: Final = 0.05
-#: Upper bound of the number of queued items, which is reached only if the far side has stopped reading.
+#: Upper bound on the number of queued items, which is reached only if the far side has stopped reading.
 _MOST_WAITING: Final = 1_000_000
 #: `nice` value of the far side, which bounds its effect on the twin.
 _NICE: Final = 10
-#: Shortest time slice of Linux in ns, and number of the system call `sched_setattr`, both by definition of Linux.
+#: Shortest time slice in ns, and number of the system call `sched_setattr`, by definition of Linux.
 _SLICE_NS, _SCHED_SETATTR = 100_000, 314
-#: Upper bound of the time in s until the far side has ended.
+#: Upper bound on the time in s until the far side has ended.
 _STOP_S: Final = 5.0
 _ESTIMATE_ALONE: Final = Asked()
 

@@ -44,13 +44,13 @@ class Level(IntEnum):
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Values from which an alarm has the level WARN or ERROR; a threshold of 0 disables its level."""
+    """Smallest values with which an alarm has the level WARN or ERROR; a threshold of 0 disables its level."""
 
     warn: float = 0.0
     error: float = 0.0
 
     def level(self, value: float, before: Level) -> Level:
-        """Return the level for `value`, with hysteresis if the present level is `before`."""
+        """Return the level of an alarm with the new `value` and the previous level `before`, with hysteresis."""
         found = Level.NONE
         for level, threshold in ((Level.WARN, self.warn), (Level.ERROR, self.error)):
             bound = threshold * HYSTERESIS if before >= level else threshold
@@ -61,7 +61,7 @@ class Thresholds:
 
 @dataclass(frozen=True)
 class Raised:
-    """Cause of a latched level; `place` is the pair or axis of the value, or empty."""
+    """Cause of a latched level; `place` is the name of the pair or axis, or empty for other quantities."""
 
     value: float
     threshold: float
@@ -142,7 +142,7 @@ class _Model:
     def add(self, stamp_ns: int, x: float, y: float) -> list[tuple[int, float]]:
         """Add a pose of the model; return stamp [ns] and residual [m] of each measured pose that had to wait."""
         place = bisect_left(self._stamps_ns, stamp_ns)
-        # a stamp that is not newer belongs to a motion computed again, so the poses of the old motion are dropped
+        # a stamp that is not the newest belongs to a motion that is computed again; the old motion is dropped
         del self._stamps_ns[place:], self._q[place:]
         self._stamps_ns.append(stamp_ns)
         self._q.append((x, y))

@@ -149,7 +149,7 @@ class Driver:
         """
         run: list[Sample] = []
         for stamp_ns, wrench in arrived:
-            if self.every_sample and not run and self._may_go_on(stamp_ns, wrench):  # the usual case
+            if self.every_sample and not run and self._may_go_on(stamp_ns, wrench):  # fast path for most samples
                 self.intake.accept(stamp_ns, wrench)
                 self._newest_ns, self._received_ns, self._zeroed = stamp_ns, now_ns, False
                 self.silences.add_one(stamp_ns)
@@ -321,7 +321,7 @@ class Driver:
         self.session.apply(Spread(stamp_ns, tuple(deviation)))
 
     def mark(self, stamp_ns: int, text: str) -> None:
-        """Journal a mark."""
+        """Journal a mark, which is a remark of the operator at a time."""
         self.session.apply(Mark(stamp_ns, text))
 
     def snapshot(self) -> Snapshot:

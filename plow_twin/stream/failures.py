@@ -11,7 +11,7 @@ class Failures:
     """Failed advances of a run.
 
     A *stretch* consists of consecutive failures. `emit` receives a `Failed` entry at the first failure of a stretch. If
-    more failures follow, it receives a second entry, which counts these failures, at the end of the stretch.
+    more failures follow, `emit` receives a second entry at the end of the stretch, which counts the further failures.
     """
 
     def __init__(self, emit: Callable[[Failed], object]) -> None:

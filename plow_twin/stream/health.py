@@ -15,7 +15,7 @@ _BINS: Final = _BINS_PER_DECADE * _DECADES
 
 
 class DurationHistogram:
-    """Histogram of durations from 1 us to 100 s, with 50 bins per decade, so that a quantile is accurate to 2.4 %."""
+    """Histogram of durations from 1 us to 100 s; the width of the bins limits the error of a quantile to 2.4 %."""
 
     def __init__(self) -> None:
         # a list, because incrementing an item of a NumPy array takes ten times as long

@@ -87,7 +87,7 @@ class History:
         self._later.append((stamps_ns, wrench))
         last_ns = self._kept_ns[-1] if self._kept_ns else None
         if last_ns is not None and stamps_ns.item(-1) // self._cell_ns == last_ns // self._cell_ns:
-            return  # the usual case
+            return  # fast path for most samples
         cells = stamps_ns // self._cell_ns
         begins = np.ones(len(cells), bool)
         begins[1:] = cells[1:] != cells[:-1]
@@ -173,7 +173,7 @@ class History:
 
 
 class RecentStamps:
-    """Stamps of measurements that may arrive out of order, up to `span_s` [s] late, and need no computation again."""
+    """Stamps of measurements that may arrive up to `span_s` [s] late, and for which no motion is computed again."""
 
     def __init__(self, span_s: float) -> None:
         self._span_ns = round(span_s * 1e9)

@@ -171,7 +171,7 @@ class Intake:
             return verdict
         if self._newest_ns is None or verdict.resets:
             self._missing_before, self._first_ns, self._since_first = self.missing, stamp_ns, 0
-            # after such a return the newest stamp is known to be wrong, so no later sample may continue from it
+            # after a return, the newest stamp is known to be wrong, so no later sample may continue from it
             self._before_jump_ns = None if self.returned else self._newest_ns
         self._since_first += 1
         if self._newest_ns is None or verdict.resets or stamp_ns > self._newest_ns:

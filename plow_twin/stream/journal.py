@@ -26,8 +26,9 @@ class Sample:
 
 @dataclass(frozen=True)
 class Hold:
-    """Advance to `stamp_ns` under a constant load, the last load, or under the scene's own loads if they excite the
-    head.
+    """Advance to `stamp_ns` with the load held at its last value.
+
+    If the loads of the scene are the excitation, these loads act instead.
     """
 
     stamp_ns: int
@@ -118,7 +119,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Parameter:
-    """Change of a parameter that affects the model, to `value`."""
+    """Change of the parameter `name`, which affects the model, to `value`."""
 
     name: str
     value: ParameterValue
@@ -189,8 +190,8 @@ class Estimated:
     guess : tuple of float
         Starting point of the fit; empty if the fit began with a search.
     shift : tuple of float, length 6
-        Shifts [m] that are added to the model's clearances from this entry on. Three shifts are for the horizontal
-        clearance (with wear), its 5 % and its 95 % quantile; three are for the vertical clearance.
+        Shifts [m] that are added to the model's clearances from this entry on. The first three are for the horizontal
+        clearance with wear, its 5 % quantile and its 95 % quantile. The last three are for the vertical clearance.
     result : str
         The whole estimate (JSON).
     """

@@ -15,7 +15,7 @@ from plow_twin.model.geometry import half_diagonal
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.scene import Scene
 
-#: The largest plausible force is this multiple of the sum of the scene's largest loads and the head's weight.
+#: Ratio of the largest plausible force to the sum of the scene's largest loads and the head's weight.
 _MARGIN: Final = 10.0
 #: Shortest time [s] in which a value may change by its largest magnitude; an impact lasts about a millisecond.
 _SHORTEST_S: Final = 1e-3

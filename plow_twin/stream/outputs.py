@@ -1,8 +1,8 @@
 """Publications of the motion; each row summarises the motion since the previous row.
 
-The *window* is the motion since the previous publication. A *slow part* contains clearances and wear rates. These
-change slowly, so at most one publication in 0.1 s has a slow part. Publications depend on the journal alone, so a
-replay gives bit-identical publications.
+The *window* is the motion since the previous publication. A *slow part* contains clearances and wear rates. Clearances
+and wear rates change slowly, so at most one publication in 0.1 s has a slow part. Publications depend on the journal
+alone, so a replay gives bit-identical publications.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _STATE_SIZE: Final = 4 * PAIR_COUNT
 SLOW: Final = np.dtype(
     [
         ("stamp_ns", "i8"),
-        ("row", "i8"),  # index of its row in the publication
+        ("row", "i8"),  # index in the publication of the row with this slow part
         ("clearance", "f8", (len(CLEARANCE_NAMES),)),
         ("wear_rate", "f8", (PAIR_COUNT,)),
     ]
@@ -59,9 +59,9 @@ FOLLOWED_FIELDS: Final = (
 _MOTION: Final = ("t", "stamp_ns", "held", "q", "v", "penetration", "rate", "force", "wear_depth", *FOLLOWED_FIELDS)
 #: Fields that are checked for numbers that are not finite.
 _SUMMED: Final = ("q", "v", "penetration", "rate", "force", "impulse", "peak")
-#: Indices in `clearance` of the six numbers in `known_clearance`, which are also those that an estimate shifts.
+#: Indices in `clearance` of the six numbers in `known_clearance`; an estimate shifts the same numbers.
 _KNOWN: Final = np.array([0, len(_CLEARANCES), len(_CLEARANCES) + 1, 1, len(_CLEARANCES) + 2, len(_CLEARANCES) + 3])
-#: Number of rows allocated at once; NumPy allocates them in about the time of a single row.
+#: Number of rows allocated at once, which takes about as long as the allocation of a single row.
 _STOCK: Final = 256
 
 
@@ -306,7 +306,7 @@ class Outputs:
         if before_ns is not None:
             before = before_ns // SLOW_PERIOD_NS
             if before == stamps.item(0) // SLOW_PERIOD_NS == stamps.item(-1) // SLOW_PERIOD_NS:
-                return _NO_SLOW  # the usual case
+                return _NO_SLOW  # fast path for most publications
         good = np.flatnonzero(stamps)
         spans = stamps[good] // SLOW_PERIOD_NS
         changed = np.ones(len(good), bool)

@@ -254,7 +254,7 @@ class Session:
             case SetWear(_, depth):
                 self._on_entry(entry)
                 self._restart(np.array(depth))
-                # the estimate was made with the wear of before
+                # the estimate refers to the wear before this change
                 self.outputs.clear_shift()
             case Estimated(shift=shift):
                 self._on_entry(entry)
@@ -508,7 +508,7 @@ class Session:
         resumed: bool = False,
         undo: bytes | None = None,
     ) -> Applied:
-        """Advance to samples that no other entry separates.
+        """Advance to samples without other entries between them.
 
         `resumed` is True for the first sample after a held load.
 
