@@ -1,11 +1,11 @@
 """Clearances around a block (a scene with `carries: corners`), estimated from the positions of its impacts.
 
-Between impacts, only load and gravity move the block, apart from drag and errors of the load. The flight before an
-impact and the flight after it are extrapolated to the time at which the two flights are nearest to each other. At that
-time the deepest corner touches the wall, or has penetrated the wall if the contact is compliant. The positions of all
-impacts are linear in the clearances, in the bias and the lever arm of the sensor, and in the compliance of the contact.
-These quantities are estimated together. The errors of the positions have a Student-t distribution of unknown scale, so
-that the widths of the intervals follow from the impacts themselves.
+Between impacts, only load and gravity move the block, apart from drag and errors of the load. The two flights before
+and after an impact are extrapolated to the time at which they are nearest to each other. At that time the deepest
+corner touches the wall, or has penetrated the wall if the contact is compliant. The positions of all impacts are linear
+in the clearances, in bias and lever arm of the sensor, and in the compliance of the contact. These quantities are
+estimated together. The errors of the positions have a Student-t distribution of unknown scale, so that the widths of
+the intervals follow from the scatter of the impacts.
 
 Reference: Lange, Little and Taylor, J. Am. Stat. Assoc. 84 (1989) 881 (Student-t errors by reweighting).
 """
@@ -39,8 +39,8 @@ WALLS: Final = {
     "top": (GY, np.array([0.0, 1.0])),
     "bottom": (GY, np.array([0.0, -1.0])),
 }
-#: Smallest number of rows of a flight, derived from the three coefficients of a parabola, and upper bound on the number
-#: of rows that are fitted.
+#: Bounds on the number of rows of a flight in a fit. The lower bound is derived from the three coefficients of a
+#: parabola.
 _FLIGHT_ROWS: Final = (4, 9)
 #: Degrees of freedom of the Student-t likelihood, derived from the recommendation of Lange et al.
 _FREEDOM: Final = 4.0
@@ -157,7 +157,6 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> E
 
 
 def _unfit(found: list[Impact], contacts: int) -> str:
-    """Return the reason why the impacts do not determine the walls; empty if they do."""
     gained = sum(one.gained >= tuning.GAINED for one in found)
     if gained > tuning.IMPACT_SHARE * len(found):
         return f"{gained} of {len(found)} impacts add energy: the poses are too far apart in time"
@@ -170,7 +169,6 @@ def _unfit(found: list[Impact], contacts: int) -> str:
 
 
 def _on_walls(scene: Scene, every: list[Impact], known: Estimate) -> tuple[list[Impact], list[str]]:
-    """Return the impacts at plausible positions, and a reason for each wall with implausible impacts."""
     met: list[Impact] = []
     reasons = []
     for wall, (axis, _) in WALLS.items():
@@ -190,7 +188,6 @@ def _on_walls(scene: Scene, every: list[Impact], known: Estimate) -> tuple[list[
 
 
 def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tuple[Array, Array]:
-    """Return means and standard deviations of the unknowns of the linear problem, shape (8,) each."""
     mean = np.zeros(_SIZE)
     mean[_CLEARANCES] = known.horizontal.mean, known.vertical.mean
     prior = np.zeros(_SIZE)
@@ -290,7 +287,6 @@ def impacts(scene: Scene, load: Load, poses: Poses, level: Array) -> tuple[list[
 
 
 def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return the first and the last index of each run of True values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]])))
     return [(int(first), int(last) - 1) for first, last in edges.reshape(-1, 2)]
 

@@ -53,8 +53,8 @@ _FINEST_TURN: Final = 3e-3
 _NEAR_TURNS: Final = np.linspace(-_FINEST_TURN, _FINEST_TURN, 5)
 #: Upper bounds on the number of rows in the search for a bias, and in the refinement of the bias.
 _MOST_ROWS, _MOST_NEAR_ROWS = 2000, 1200
-#: Smallest number of rows in a part of a load period, derived from the mean of nine values, whose scatter is a third of
-#: the scatter of the values.
+#: Smallest number of rows in a part of a load period. It is derived from the scatter of a mean, which for nine values
+#: is a third of the scatter of the values.
 _FEWEST_OF_PHASE = 9
 #: Grids of trial values for the delay in s, derived from its prior. The grid for the measured path extends over two
 #: prior deviations to both sides; the grid for simulated motions extends over a tenth of this range. `_NO_LAG` is the
@@ -76,8 +76,8 @@ _LONGER = 2.0
 _HARD_BOUNDS, _FIRM_BOUNDS = (8e-7, 6e-4), (2e-6, 2e-2)
 #: Upper bound on the number of iterations in which the noise of a simulated motion is adjusted.
 _NOISE_ROUNDS = 3
-#: Smallest number of draws, derived from the twenty features of the regression, and smallest number of poses, derived
-#: from the 99 % quantile that is computed from them.
+#: Smallest number of draws, and smallest number of complete poses. They are derived from the twenty features of a
+#: regression, and from the 99 % quantile of the poses.
 _FEWEST, _FEWEST_WHOLE = 30, 100
 
 
@@ -291,8 +291,8 @@ def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: A
 
     `reach`, shape (2,), contains the sums of opposite reaches in m. A resting head touches the frame at three corners,
     always at the same angle. Errors of the sides, scales and corners therefore change the reach in the same way as a
-    different clearance. At a rotated wall the head always touches the same pad, which is displaced by half the rotation
-    (the difference of the wall's two pads). The rotations of opposite walls are independent.
+    different clearance. At a rotated wall the head always touches the same pad, which is displaced by half the
+    rotation. The rotations of opposite walls are independent.
     """
     scene = unknowns.scene
     width, height = (deviation_of(scene, path) for path in _SIDES)
@@ -311,8 +311,7 @@ def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: A
     unseen = np.sqrt(
         np.square([moved(width), moved(0.0, height), *scaled]).sum(axis=0) + (0.25 * turned**2).sum(axis=1)
     )
-    # the prior of rounded corners is not used if the scene states the radius, or the deviation of a side, which
-    # includes the effect of the corners
+    # a stated radius, or a stated deviation of a side, already includes the effect of rounded corners
     known = scene.frame.corner_radius_m is not None or any(is_stated(scene, path) for path in _SIDES)
     across = 0.0 if known else -2.0 * priors.ROUNDING
     return unseen, moved(across, across) if across else np.zeros(2)
@@ -341,7 +340,6 @@ class _Spread:
         return _Spread(mean, tuning.FIRM_SPREAD[0] * np.array([1.0, float(unknowns.damped)]), _FIRM_BOUNDS)
 
     def narrowed(self, found: _Regressed) -> _Spread:
-        """Return a narrower distribution, whose mean is the result of a regression."""
         _, over, least = tuning.FIRM_SPREAD
         deviation = np.minimum(np.maximum(over * found.deviation[5:7], least), self.deviation)
         return _Spread(found.value[5:7], deviation, _FIRM_BOUNDS)
@@ -383,7 +381,6 @@ class _Drawn:
                 self.q.append(q)
 
     def _numbers(self) -> Array:
-        """Return drawn logarithms of penetration and damping, and three drawn load gains, shape (5,)."""
         mean = np.concatenate([self.spread.mean, np.ones(3)])
         drawn = self.rng.standard_normal(5)
         numbers: Array = mean + np.concatenate([self.spread.deviation, np.full(3, tuning.HARD_DRAWN[3])]) * drawn
@@ -395,7 +392,6 @@ class _Drawn:
         return numbers
 
     def of_other_law(self) -> _Drawn | None:
-        """Return an empty set of draws under the alternative contact law; None if there is no alternative."""
         other = with_other_law(self.unknowns)
         return None if other is None else _Drawn(self.forward.of(other.scene), other, self.eye, self.spread, self.rng)
 
@@ -403,7 +399,6 @@ class _Drawn:
         return np.concatenate([np.array(self.features)[:, 5:], np.array(self.changes)], axis=1)
 
     def draws(self) -> Draws:
-        """Return all features of the motions, including the features by phase of the load, and the drawn unknowns."""
         of_draw = np.array(self.targets)[:, [5, 6, 7, 8, 9, 0, 1]]
         return Draws(np.concatenate([self.like(), np.array(self.by_phase)], axis=1), of_draw)
 
@@ -705,7 +700,6 @@ class MotionFeatures:
         return out.ravel()
 
     def _phases_at(self, lag_s: float) -> list[_Phases]:
-        """Return the division of the period for each component and for a lag, cached because few lags occur."""
         if lag_s not in self._phases:
             if len(self._phases) > 2 * len(_OF_DRAWN_S):
                 self._phases.clear()
@@ -731,7 +725,6 @@ class MotionFeatures:
         return self._bridged(q + noise * white)
 
     def _bridged(self, q: Array) -> Array:
-        """Return a motion in which the components that were not measured are interpolated, as in the measurement."""
         return q if self._there.all() else filled(Poses(self._t, np.where(self._there, q, np.nan)))
 
     def features(self, q: Array) -> Array:
@@ -776,7 +769,6 @@ class MotionFeatures:
         return 0.5 * np.log(np.concatenate(parts) + _NO_SCATTER)
 
     def _averaged(self, q: Array) -> Array:
-        """Return `_reach` of poses that are averaged over a few rows to reduce the noise."""
         even = np.full(self._smooth, 1.0 / self._smooth)
         if self._smooth > 1:
             q = np.stack([np.convolve(column, even, "valid") for column in q.T], axis=1)

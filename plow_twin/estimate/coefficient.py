@@ -1,7 +1,7 @@
 """Posterior of the wear coefficient, from clearances that were estimated over weeks.
 
-For any coefficient k_s, the clearance is the same function h(E) of the exposure E = k_s s / A, where s is the travel
-and A the area of a pad. A history of clearances against travel therefore determines k_s. The posterior is computed on a
+For any coefficient k_s, the clearance is the same function h(E) of the exposure E = k_s s / A. Here s is the travel and
+A the area of a pad. A history of clearances against travel therefore determines k_s. The posterior is computed on a
 grid of ln k_s with the log-normal prior of the scene's wear. The initial clearance is integrated out.
 """
 
@@ -22,8 +22,8 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Upper bound on the number of grid points, and half width of the grid in prior deviations, derived from a probability
-#: of 6e-5 outside the grid.
+#: Upper bound on the number of grid points, and half width of the grid in prior deviations. The width is derived from a
+#: probability of 6e-5 outside the grid.
 _POINTS, _REACH = 801, 4.0
 #: Bounds on the simulated wear path: it ends when a clearance has grown by `_FURTHER` times the growth in the history
 #: plus `_FURTHER_M` in m.
@@ -161,7 +161,6 @@ def _check_fit(history: History, grown: Array) -> None:
 
 
 def _growth(path: Path, exposure: Array) -> Array:
-    """Return the growth of the clearances in m at each exposure, shape (n, 2), extrapolated with the last slope."""
     grown = path.clearance_growth()
     out = np.stack([np.interp(exposure, path.exposure, column) for column in grown.T], axis=1)
     if len(path.exposure) > 1:

@@ -1,7 +1,7 @@
 """Contact forces measured by load cells at the guides, which narrow the intervals of contact and clearances.
 
 The fit of the poses gives the motion, and the contact law gives the force of each pair. If the force of a load cell
-contradicts the force of its pair, the measured forces are not used, and the reasons of the estimate name the cell. If
+contradicts the force of its pair, the measured forces are not used. The reasons of the estimate then name the cell. If
 the forces of all cells together contradict the motion, the reasons name the contact law. Otherwise poses and forces are
 fitted together (module `force_fit`).
 """
@@ -28,8 +28,8 @@ Array = NDArray[np.float64]
 
 #: Guard against faulty readings: largest force [N] that is accepted.
 _LARGEST = 1e12
-#: Largest trial value of the delay of the load cells in s, derived as three prior deviations of a sensor's delay, and
-#: step between trial values.
+#: Largest trial value of the delay of the load cells in s, and step between trial values. The largest value is derived
+#: as three prior deviations of a sensor's delay.
 _LARGEST_DELAY, _DELAY_STEP = 0.15, 2e-3
 #: The contact law as a Python function, because the compiled function cannot be called from Python.
 _LAW = getattr(free_force, "py_func", free_force)
@@ -54,8 +54,8 @@ class ContactForces:
     def of(t: ArrayLike, force: ArrayLike) -> tuple[ContactForces, int]:
         """Return the usable rows in order of time, and the number of rows that are left out.
 
-        A row is left out if its stamp is not finite or occurs twice, if it contains no force, or if a force exceeds
-        1e12 N.
+        A row is left out if its stamp is not finite or occurs twice. It is also left out if it contains no force, or a
+        force above 1e12 N.
 
         Raises
         ------
@@ -231,7 +231,6 @@ def _contradiction(measured: Array, felt: Array, pair: int, largest: float, nois
 
 
 def _delay(forces: ContactForces, felt: Felt) -> float:
-    """Return the delay in s with the largest correlation between measured forces and forces of the fitted motion."""
     t, measured, given = forces.t, np.nan_to_num(forces.force), np.nan_to_num(felt.force)
     pairs = np.flatnonzero(given.any(axis=0) & measured.any(axis=0))
     lags = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 0.5 * _DELAY_STEP, _DELAY_STEP)

@@ -49,8 +49,8 @@ STATED: Final = {
     "contact.exponent": 0.02,
     "friction.coefficient": 0.01,
 }
-#: Steps of the difference quotients with respect to the relative stiffness of a wall, and with respect to a constant
-#: load in units of half the load's range.
+#: Steps of the difference quotients with respect to the relative stiffness of a wall, and to a constant load in units
+#: of half the load's range.
 _WALL_STEP, _PUSH_STEP = 0.02, 5e-3
 #: Guard against division by zero: smallest error of the load in units of half the load's range.
 _LEAST_PUSH = 1e-5
@@ -207,7 +207,6 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
 
 
 def _of_sensor(problem: Problem, point: Point) -> Iterator[tuple[str, Array]]:
-    """Yield name and derivative of the prediction, (n, 3), for each scale factor and for the drift of the clock."""
     t = problem.window.poses.t
     for index, axis in enumerate(("x", "y", "theta")):
         column = np.zeros_like(point.predicted)
@@ -283,7 +282,6 @@ class _Linearised:
         self.inflation, self.load = np.ones(3), np.full(3, tuning.PUSH)
 
     def eliminate(self) -> None:
-        """Eliminate the unknowns of each swing from the normal equations."""
         held = np.diag(np.concatenate([self._start_spread**-2.0, self.load**-2.0]))
         self._blocks, self._swings = [], []
         for rows, border, own, residual, there, left in zip(
@@ -334,7 +332,6 @@ class _Linearised:
             self.inflation[index] = max(1.0, square / usual) * _lasting(column, self._swing, square)
 
     def exact(self) -> tuple[Array, Array]:
-        """Return mean and covariance of the border's unknowns if only quantities that the fit includes may differ."""
         return self._of(self._held)
 
     def _of(self, differs: NDArray[np.bool_]) -> tuple[Array, Array]:
@@ -385,9 +382,6 @@ class _Linearised:
         return mean, second / counted - np.outer(mean, mean), often / counted
 
     def scatter(self) -> float:
-        """Return the ratio of the variance from the scatter of the swings to the variance from noise, averaged over
-        `MOVING`.
-        """
         scores = np.stack([score[:SIZE] for _, score in self._blocks])
         scores = scores - scores.mean(axis=0)
         count, moving = len(scores), list(MOVING)
@@ -408,9 +402,6 @@ class _Linearised:
         return max(1.0, float((z**2 / np.maximum(often, 0.1)).sum() / max(often.sum(), 1.0)))
 
     def named(self, mean: Array, often: Array) -> dict[str, tuple[float, float, float]]:
-        """Return for each quantity the probability of a difference, and mean and standard deviation of the
-        difference.
-        """
         deviation = np.sqrt(1.0 / np.diag(self._normal)[SIZE:])
         return {
             name: (float(share), float(value / max(share, 1e-9)), float(spread))

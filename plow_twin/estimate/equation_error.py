@@ -35,8 +35,11 @@ Array = NDArray[np.float64]
 
 #: Definition of the walls: index of the wall of each pair in the order right, left, top, bottom.
 _WALL: Final = np.argmax(np.stack(WALLS), axis=0)
-#: Upper bound on the number of Gauss-Newton steps, size of a step in m below which the iteration ends, and largest size
-#: of a step in m.
+#: Parameters of the Gauss-Newton iteration:
+#:
+#: - upper bound on the number of steps
+#: - size of a step in m below which the iteration ends
+#: - largest size of a step in m
 _STEPS, _SMALL, _LONGEST = 8, 2e-5, 3e-3
 #: Lower bounds on the interval between rows in s, and on the number of rows in half of a test function.
 _SHORTEST, _FEWEST = 5e-3, 3

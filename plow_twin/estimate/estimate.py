@@ -125,7 +125,8 @@ def estimate_window(
     found = units.in_si(found, scene)
     if units.only_time and found.sensor == "ok":
         # The estimate scales time with the load's period. A machine of the paper's size has impacts of the same
-        # duration under any load, so the comparison under an uncertain load is repeated without the scaling of time.
+        # duration under any load. The comparison under an uncertain load is therefore repeated without the scaling of
+        # time.
         period = _period(load, poses)
         unknowns = Unknowns.stated(scene, load, poses)
         found = under_uncertain_load(found, unknowns, thinned(load, period)[0], poses, period)
@@ -183,14 +184,12 @@ def _known(result: Estimate) -> bool:
 
 
 def _unexplained(result: Estimate) -> bool:
-    """Return whether the load fails to explain the motion."""
     return result.model == "suspect" and not _known(result)
 
 
 def _from_motion(
     scene: Scene, load: Load, poses: Poses, lost: int, guess: Guess, forces: ContactForces | None
 ) -> tuple[Estimate, Guess]:
-    """Return the estimate from load and poses, without measured gaps."""
     span = float(load.t[0]), float(load.t[-1])
     unknowns = Unknowns.stated(scene, load, poses)
     if len(poses.t) < FEWEST_POSES:
@@ -311,12 +310,10 @@ def _searched(
 
 
 def _period(load: Load, poses: Poses) -> float:
-    """Return the period of the load in s, limited to the span of the poses."""
     return min(load.period(), float(poses.t[-1] - poses.t[0]))
 
 
 def _fails(found: Fit, verdict: Verdict) -> bool:
-    """Return whether a fit fails a check or has not reached an optimum."""
     return bool(verdict.model or verdict.sensor) or not found.finished
 
 
@@ -371,7 +368,6 @@ def under_uncertain_load(
 
 
 def _from_bounced(unknowns: Unknowns, shared: Array, bounced: Bounced) -> Array:
-    """Return a vector of unknowns in which clearances, softness and damping are replaced by those of a comparison."""
     start = shared.copy()
     start[[GX, GY]], start[DAMPING] = bounced.clearance, bounced.ln_damping[0]
     penetration = math.exp(bounced.ln_penetration[0])
@@ -441,7 +437,6 @@ def _with_differences(
 
 
 def _moved_back(result: Estimate, bias: Array) -> Estimate:
-    """Return an estimate for the original poses, to which the removed bias is added again."""
     x, y, theta = (
         None if known is None else Interval(known.mean + by, known.p05 + by, known.p95 + by)
         for known, by in zip((result.bias_x, result.bias_y, result.bias_theta), bias.tolist(), strict=True)
@@ -568,7 +563,6 @@ def _both(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, 
 
 
 def _apart(one: tuple[float, float], other: tuple[float, float]) -> float:
-    """Return the difference of two means in units of its standard deviation."""
     return abs(one[0] - other[0]) / math.hypot(one[1], other[1])
 
 
@@ -701,8 +695,8 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     if beside is not None:
         published = np.maximum(beside.clearance, LEAST_CLEARANCE)
         spread = np.hypot(beside.clearance_deviation, _between_optima(problem, shared))
-    # A change of a clearance at an unknown time within the window shifts the mean over the window by a uniformly
-    # distributed share of the change.
+    # A change at an unknown time within the window shifts the mean clearance by a uniformly distributed share of the
+    # change.
     moved = verdict.changed / math.sqrt(3.0)
     deviation[[GX, GY]] = np.hypot(deviation[[GX, GY]], moved)
     spread = np.hypot(np.hypot(spread, moved), _unseen(fit))
@@ -777,7 +771,6 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
 
 
 def _with_forces(result: Estimate, problem: Problem, fit: Fit, forces: ContactForces, widened: float) -> Estimate:
-    """Return an estimate that combines a fit with measured contact forces; a contradiction withdraws the clearances."""
     from plow_twin.estimate.force_fit import fit_jointly
 
     if "suspect" in (result.model, result.sensor) or not fit.finished:
@@ -812,7 +805,6 @@ def _with_forces(result: Estimate, problem: Problem, fit: Fit, forces: ContactFo
 
 
 def _numbers(unknowns: Unknowns, normal: list[Interval]) -> dict[str, Any]:
-    """Return the intervals of all quantities except the clearances, by name."""
     values = {quantity.name: value for quantity, value in zip(QUANTITIES, normal, strict=True)}
     del values["horizontal"], values["vertical"]
     contact = {
@@ -865,7 +857,6 @@ def _between_optima(problem: Problem, shared: Array) -> float:
 
 
 def _scatter(problem: Problem, fit: Fit, variance: Array) -> float:
-    """Return the ratio of the variance from the swings' scatter to the variance from noise, averaged over `MOVING`."""
     scattered = np.diag(sandwich(problem, fit, 1.0 / problem.deviation**2))
     swings, moving = problem.window.swings, list(MOVING)
     return freed(swings, len(moving)) * float((scattered / variance)[moving].mean())
@@ -908,7 +899,6 @@ def _groups(
 
 
 def _correlation(covariance: Array) -> tuple[tuple[float, ...], ...]:
-    """Return the correlation matrix of the unknowns that change the motion."""
     moving = covariance[np.ix_(MOVING, MOVING)]
     deviation = np.sqrt(np.diag(moving))
     matrix = moving / np.outer(deviation, deviation)
@@ -1007,20 +997,17 @@ def _is_dead(load: Load, poses: Poses) -> bool:
 
 
 def _is_idle(scene: Scene, load: Load, poses: Poses) -> bool:
-    """Return whether the machine is idle, with a pose that is constant up to noise and a load that hardly changes."""
     weight = scene.head.mass_kg * Gravity().acceleration_m_s2
     most = tuning.IDLE_LOAD * weight * np.array([1.0, 1.0, geometry.half_diagonal(scene)])
     return bool((load.wrench.std(axis=0) < most).all()) and _rests(poses)
 
 
 def _rests(poses: Poses) -> bool:
-    """Return whether the last three quarters of the poses are constant up to noise."""
     q = filled(poses)[len(poses.t) // 4 :, poses.measured]
     return bool((q.std(axis=0) < tuning.RESTS * noise_level(q)).all())
 
 
 def _not_observable(unknowns: Unknowns, poses: Poses, lost: int, reasons: tuple[str, ...]) -> Estimate:
-    """Return the prior as an estimate from data that do not determine the clearances."""
     nothing, unseen = prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost), State.NOT_OBSERVABLE
     return replace(nothing, horizontal_state=unseen, vertical_state=unseen, reasons=reasons)
 
@@ -1028,7 +1015,6 @@ def _not_observable(unknowns: Unknowns, poses: Poses, lost: int, reasons: tuple[
 def _without_fit(
     unknowns: Unknowns, poses: Poses, lost: int, why: str = "no motion of the model comes near the measured one"
 ) -> Estimate:
-    """Return the prior as an estimate with withdrawn clearances, and the reason."""
     return replace(
         prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost),
         horizontal_state=State.WITHDRAWN,

@@ -2,8 +2,8 @@
 
 The window is divided into *swings*, which are parts of the motion that begin in flight between the walls. In flight the
 state is known best, and its errors have the smallest effect. Each swing is simulated from its own starting state
-(multiple shooting), so that errors of the load and of the bounces at a hard contact do not accumulate from swing to
-swing. Levenberg-Marquardt steps minimise Huber's function of the residuals plus the terms of the prior.
+(multiple shooting). Errors of the load, and errors due to bounces, therefore do not accumulate from swing to swing.
+Levenberg-Marquardt steps minimise Huber's function of the residuals plus the terms of the prior.
 
 If the load is unknown between its samples, the swings are short, and each swing is *linked* to the next swing: the
 start of the next swing may differ from the end of the swing, with the covariance of the unknown load (weak
@@ -62,7 +62,7 @@ DIFFERENCE_STEPS: Final = np.array([2e-4, 2e-4, 2e-4, 2e-4, 1e-3, 1e-3, 4e-6])
 _HARMONIC_STEP = 5e-3
 #: Factor on the steps of all difference quotients for derivatives that must be accurate. A search needs large steps,
 #: which average over the kinks of the motion. With large steps, however, the curvature would seem to determine changes
-#: that have no effect on the motion, such as a common factor on mass, inertia, stiffness and load.
+#: without effect on the motion. An example is a common factor on mass, inertia, stiffness and load.
 _FINE = 1.0 / 300.0
 #: Smallest number of poses of a swing, derived from its six unknowns, which two poses of three numbers would just
 #: determine.
@@ -339,7 +339,6 @@ class Problem:
         return [self._point(shared, several[k], rows, q[k], v[k], contact[k], differences) for k in range(count)]
 
     def _rows_at(self, shift: float) -> _Rows:
-        """Return the assignment of poses to swings for stamps that are `shift` s late, cached for successive calls."""
         if self._at is None or self._at.shift != shift:
             window = self.window
             times = window.poses.t - shift
@@ -416,9 +415,6 @@ class Problem:
         return Linear(rows, ends)
 
     def _scene_of(self, shared: Array) -> Scene:
-        """Return the scene of a vector of shared unknowns, cached because successive vectors often have the same
-        scene.
-        """
         key = shared[OF_SCENE].tobytes()
         if self._scene[0] != key:
             self._scene = key, self.unknowns.scene_of(shared)
@@ -486,10 +482,6 @@ class Problem:
 
 
 def _by_state(point: Point, other: Point, index: int, moved: float) -> tuple[Array, Array]:
-    """Return the derivatives of predictions and ends with respect to the component `index` of the starting states.
-
-    In the point `other`, the component is larger by `moved`.
-    """
     ends = point.defect - other.defect
     ends[:, index] += moved  # removes the change of the next swing's start, which is also displaced in `other`
     return np.nan_to_num((point.residual - other.residual) / moved), ends / moved
@@ -702,7 +694,6 @@ def unpredicted(problem: Problem, point: Point, jacobian: Array, seed: int, prob
 
 
 def _spread(variance: Array, reach: int = 2) -> Array:
-    """Return running means of a variance, to reduce its scatter."""
     padded = np.pad(variance, ((reach, reach), (0, 0)), mode="edge")
     total = np.zeros_like(variance)
     for shift in range(2 * reach + 1):

@@ -179,9 +179,6 @@ class Follower:
         return np.zeros(PAIR_COUNT) if wear is None else np.array(wear.initial_depth_m, dtype=np.float64)
 
     def _draw(self, text: str, time: float, worn: Array) -> None:
-        """Draw members from an estimate (JSON), or from the prior if `text` is empty, in the initial state of the
-        scene.
-        """
         self._text = text
         #: the followed estimate; None while the prior is followed
         self.estimate = Estimate.from_dict(json.loads(text)) if text else None
@@ -347,7 +344,6 @@ class Follower:
             self._use(when, measured)
 
     def _stop(self, t: Array, begin: int, digest_after: Container[int]) -> int:
-        """Return the end of a part of the samples, after which a digest, a measurement or the clearances are due."""
         end = min(begin + _CALL, len(t))
         due = self._due[0][0] if self._due else math.inf
         for place in range(begin, end):
@@ -365,7 +361,6 @@ class Follower:
         return np.repeat(widening(self.scene, worn), 3, axis=-1)
 
     def _note_clearance(self) -> None:
-        """Store the present clearances without wear, from the prior, the estimate or the members."""
         self._cell = math.floor(self.time * _KNOWN_HZ)
         known = self._known
         if self.estimate is None and self._ensemble.moved:
@@ -499,7 +494,6 @@ class Follower:
             self._begin_anew(measured)
 
     def _is_better(self, found: Estimate) -> bool:
-        """Return whether the followed estimate has fewer rough clearances than `found`, from nearly the same motion."""
         before, window_s = self.estimate, found.t_end - found.t_start
         if before is None or self.time - self._since >= tuning.NEW_MOTION * window_s:
             return False
@@ -523,7 +517,6 @@ class Follower:
             self._begin_anew(known)
 
     def _begin_anew(self, text: str) -> None:
-        """Draw members as in `_draw`, and start these members at the poses of the previous members."""
         before = self._ensemble
         self.drawn += 1
         self._since = self.time
@@ -639,7 +632,6 @@ def _load_share(text: str) -> Array:
 
 
 def _facts(data: bytes) -> tuple[dict[str, Any], int]:
-    """Return the JSON header of a snapshot, and the index of the first byte after the header."""
     (length,) = _LENGTH.unpack_from(data)
     begin = _LENGTH.size + length
     return json.loads(data[_LENGTH.size : begin]), begin
@@ -660,7 +652,6 @@ def prior(scene: Scene) -> Estimate:
 
 
 def _whole(found: Estimate, known: Estimate) -> Estimate:
-    """Return an estimate in which the prior `known` replaces missing damping and missing gains."""
     return replace(
         found,
         damping=found.damping or known.damping,

@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 WINDOW_S, INTERVAL_S = 32.0, 10.0
 #: Nanoseconds per second, by definition.
 _NS: Final = 1e9
-#: Upper bound in s on the duration of the parts in which the load is processed, so that the rows of all members fit
-#: into the processor's cache.
+#: Upper bound in s on the duration of the parts in which the load is processed. With this bound, the rows of all
+#: members fit into the processor's cache.
 _PART_S: Final = 0.02
 
 
@@ -152,7 +152,6 @@ class _Steps:
                     self._estimate(window)
 
     def _add_poses(self, until_ns: int) -> None:
-        """Add the poses up to a stamp; the twin uses a pose when it reaches the time of the pose."""
         last = int(np.searchsorted(self._pose_stamps, until_ns, side="right"))
         for index in range(self._poses_added, last):
             stamp, q = int(self._pose_stamps[index]), tuple(self._poses.q[index].tolist())
@@ -195,7 +194,6 @@ class _Steps:
 
 
 def _stamps(t: Array, start: float) -> NDArray[np.int64]:
-    """Return times in s as stamps in ns after `start`."""
     return np.round((t - start) * _NS).astype(np.int64)
 
 

@@ -179,7 +179,6 @@ class _Joint:
         return self._summary(at, covariance)
 
     def _weigh(self, force: Array) -> None:
-        """Set the variance of each entry from the predicted force."""
         noise = self._cells.noise[self._pair]
         self._spread = (
             noise**2 + (tuning.LAW_ERROR * np.nan_to_num(force)) ** 2 + tuning.JITTER_WEIGHT[2] * self._jitter
@@ -239,7 +238,6 @@ class _Joint:
         return out
 
     def _blocks(self, at: _At, linear: Linear, jacobian: Array) -> list[_Block]:
-        """Return the normal equations of each swing."""
         border, out = self._border, []
         places = np.r_[0:SIZE, border : border + 6]
         residual = np.nan_to_num(self._measured - at.force)
@@ -268,7 +266,6 @@ class _Joint:
         return covariance @ score, covariance
 
     def _descended(self, at: _At, blocks: list[_Block]) -> _At | None:
-        """Return the values after a step, or None if no step reduces the cost."""
         before, place = self._cost(at), at.place
         step, _ = self._step(at, blocks)
         states = np.stack([block.state + block.answer @ step for block in blocks])
@@ -302,9 +299,6 @@ class _Joint:
         return total / _PROBES
 
     def _scatter(self, blocks: list[_Block], covariance: Array) -> float:
-        """Return the ratio of the variance from the scatter of the swings to the variance from noise, averaged over
-        `MOVING`.
-        """
         scores = np.stack([block.score for block in blocks])
         scores = scores - scores.mean(axis=0)
         count, unknown, moving = len(blocks), self._border - (SIZE - len(MOVING)), list(MOVING)
@@ -350,7 +344,6 @@ class _Joint:
         return int((total > tuning.MOST_MISFIT * np.maximum(count, 1)).sum())
 
     def _left_over(self, at: _At) -> list[list[float]]:
-        """Return for each cell, and for each swing, the share of the force that remains unexplained beyond noise."""
         out: list[list[float]] = []
         residual, there = self._measured - at.force, np.isfinite(at.force)
         for k, pair in enumerate(self._cells.pairs.tolist()):

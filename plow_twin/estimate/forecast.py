@@ -211,7 +211,6 @@ def forecast(
 def _forecast(
     scene: Scene, plan: Plan, deviation_m: tuple[float, float], known: Coefficient | None, multiple: float = 1.0
 ) -> Forecast:
-    """Return the forecast with the wear coefficient times `multiple`, without scenarios."""
     wear = wear_in_travel(scene)
     if not all(0.0 <= value < math.inf for value in deviation_m):
         raise LifeError(f"deviations: got {deviation_m} m, expected two finite numbers >= 0")
@@ -284,8 +283,8 @@ def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth:
     """Return the scene with estimated clearances, which include all wear so far.
 
     `depth`, shape (8,), contains the wear depths of the pads in m, which are subtracted to obtain the clearances of new
-    pads. If the depths are not given and the scene has running-in, they are computed from the growth of the clearances,
-    because worn pads wear more slowly than new pads.
+    pads. If the depths are not given, but the scene has running-in, the depths are computed from the growth of the
+    clearances. With running-in, worn pads wear more slowly than new pads.
     """
     wear, new = scene.wear, scene.clearance
     if wear is None:
@@ -323,7 +322,6 @@ def with_estimate(scene: Scene, facts: Mapping[str, Any]) -> tuple[Scene, tuple[
 
 
 def _mean(name: str, facts: Any) -> float:
-    """Return the mean of a contact parameter from its part of an estimate (JSON)."""
     try:
         mean = float(facts["mean"])
     except (KeyError, TypeError, ValueError):
@@ -334,7 +332,6 @@ def _mean(name: str, facts: Any) -> float:
 
 
 def _estimated(name: str, facts: Any) -> tuple[float, float]:
-    """Return mean and standard deviation of a clearance in m from its part of an estimate (JSON)."""
     try:
         state = State(facts["state"])
         mean, low, high = (float(facts[key]) for key in ("mean_m", "p05_m", "p95_m"))

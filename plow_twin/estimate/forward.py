@@ -135,7 +135,6 @@ class Forward:
     def _compiled(
         self, scene: Scene, gain: Array, depth: Array | None, push: Array | None, share: Array | None
     ) -> tuple[Any, Any]:
-        """Return the parameters of the kernel, which are cached, and the segments of the load."""
         walls = tuple(None if part is None else part.tobytes() for part in (depth, share))
         if self._params is None or self._params[:2] != (scene, walls):
             params = compile_scene(scene, tuning.TOLERANCE, sampled=True).params

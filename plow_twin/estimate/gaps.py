@@ -60,7 +60,8 @@ class Gaps:
     def of(t: ArrayLike, gap: ArrayLike, deviation: float = 0.0) -> tuple[Gaps, int]:
         """Return the usable rows in order of time, and the number of rows that are left out.
 
-        A row is left out if its stamp is not finite or occurs twice, if it contains no gap, or if a gap exceeds 1e3 m.
+        A row is left out if its stamp is not finite or occurs twice. It is also left out if it contains no gap, or a
+        gap above 1e3 m.
 
         Raises
         ------

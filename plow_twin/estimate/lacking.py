@@ -93,7 +93,6 @@ def _alternated(
 
 
 def _named(harmonics: Harmonics) -> str:
-    """Return a description of the most significant harmonic, as a reason of the estimate."""
     clear = harmonics.amplitude**2 / harmonics.variance
     clear[1::2] += clear[2::2]
     clear[2::2] = 0.0

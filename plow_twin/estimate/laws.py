@@ -115,7 +115,6 @@ class _Surface:
 
 
 def _terms(points: Array) -> Array:
-    """Return the terms of the polynomial at n points, shape (n, 7)."""
     products = [
         np.prod(points[:, list(index)], axis=1)
         for degree in (2, 3)

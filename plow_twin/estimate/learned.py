@@ -108,7 +108,6 @@ class Learner:
         return cls(drawn, learned, time) if len(learned) and enough else None
 
     def _begin(self) -> None:
-        """Drop the information from poses since the last update of the distribution."""
         self._precision, self._score = np.zeros((len(self.open), len(self.open))), np.zeros(len(self.open))
 
     def take_over(self, before: Learner) -> None:

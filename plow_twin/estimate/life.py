@@ -1,10 +1,10 @@
 """Wear over months, computed in seconds: a few load periods give the mean force on each pad, then many are skipped.
 
-The wear rate of a pad is k_s <F> v / A (Archard), where k_s is the wear coefficient, <F> the mean force, v the travel
-speed and A the area of a pad. The wear depths h therefore depend on time, travel speed and coefficient only through the
-exposure E = k_s s / A in 1/N, where s is the travel in m. They satisfy dh/dE = <F>(h), so one path h(E) holds for every
-coefficient. The path is computed with Heun's method. The step is limited by the difference from Euler's method, and by
-the change of the clearance.
+The wear rate of a pad is k_s <F> v / A (Archard). Here k_s is the wear coefficient, <F> the mean force, v the travel
+speed and A the area of a pad. With the travel s in m, the exposure is defined as E = k_s s / A in 1/N. The wear depths
+h satisfy dh/dE = <F>(h), so they depend on time, travel speed and coefficient only through E. One path h(E) therefore
+holds for every coefficient. The path is computed with Heun's method. The step is limited by the difference from Euler's
+method, and by the change of the clearance.
 
 References: Archard, J. Appl. Phys. 24 (1953) 981; Lemaitre and Doghri, Comput. Methods Appl. Mech. Eng. 115 (1994) 197
 (jump in cycles); ISO 13381-1 (prognosis).
@@ -204,7 +204,6 @@ def _beyond(scene: Scene, depth: Array, limit: tuple[float, float]) -> bool:
 
 
 def _clearances(scene: Scene, depth: Array) -> tuple[float, float]:
-    """Return the horizontal and the vertical clearance in m with the given wear depths."""
     return (
         scene.clearance.horizontal_m + 0.5 * float(depth @ np.abs(NORMAL_X)),
         scene.clearance.vertical_m + 0.5 * float(depth @ np.abs(NORMAL_Y)),

@@ -102,7 +102,6 @@ def _likeliest(drawn: Array, gain: float, motions: Seen, asked: Seen) -> Array:
 
 
 def _terms(points: Array) -> Array:
-    """Return the terms of the polynomial at n points, shape (n, 7)."""
     products = [points[:, one] * points[:, other] for one, other in _CURVED]
     return np.column_stack([np.ones(len(points)), points, *products])
 

@@ -66,8 +66,8 @@ class Poses:
     def of(t: ArrayLike, q: ArrayLike, deviation: Deviation = UNSTATED) -> tuple[Poses, int]:
         """Return the usable rows in order of time, and the number of rows that are left out.
 
-        A row is left out if its stamp is not finite or occurs twice, if it contains no finite component, or if a
-        component exceeds 1e6.
+        A row is left out if its stamp is not finite or occurs twice. It is also left out if it contains no finite
+        component, or a component above 1e6.
 
         Raises
         ------

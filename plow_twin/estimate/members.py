@@ -153,7 +153,6 @@ class Ensemble:
             self.others.set_travel_speed(speeds[1:])
 
     def _loads(self, t: Array, wrench: Array, which: slice) -> Array:
-        """Return the loads of some members, shape (m, n, 3), from samples at n times."""
         loads = loads_of(t, wrench, self._gain[which], self._harmonics, self._amplitude[which])
         found: Array = loads + self._load_off[which, None, :]
         return found
@@ -206,7 +205,6 @@ class Ensemble:
             path.popleft()
 
     def _add_intervals(self, row: Rows) -> None:
-        """Write the intervals of forces, peaks and impulses to a row."""
         _, low, high = self._points(self._sums)
         for index, name in enumerate(("force", "peak", "impulse")):
             row[f"{name}_low"], row[f"{name}_high"] = low[index], high[index]
@@ -242,9 +240,6 @@ class Ensemble:
         return values[0].copy(), np.minimum(low, values[0]), np.maximum(high, values[0])
 
     def _used(self) -> NDArray[np.bool_]:
-        """Return the mask of the members that determine intervals: members in the model's range, or all if none is in
-        range.
-        """
         return self.good if self.good.any() else np.ones(len(self.good), dtype=bool)
 
     def clearance(self) -> Array:
@@ -422,7 +417,6 @@ class Ensemble:
             self._take_numbers(which)
 
     def _take_numbers(self, which: NDArray[np.int64]) -> None:
-        """Set the parameters of the members with the ascending indices `which` to the learned values."""
         assert self._learner is not None
         self._set_numbers(which, self._learner.numbers(which))
 
@@ -458,7 +452,6 @@ class Ensemble:
         self._stand(self.pose, self._v, force, which)
 
     def _recover(self) -> None:
-        """Move members outside the model's range to the poses of members in range, if any."""
         lost, left = np.flatnonzero(~self.good), np.flatnonzero(self.good)
         self.good[:] = True
         if not len(lost) or not len(left):
@@ -560,9 +553,6 @@ def _off(q: Array, then: Array, there: NDArray[np.int64]) -> Array:
 
 
 def _worn(one: Scene, scene: Scene, worn: Array, moved: Array) -> Scene:
-    """Return the scene of a member with worn pads; `moved`, shape (2,), is the part of its clearances due to wear in
-    m.
-    """
     assert scene.wear is not None
     depths = tuple(worn.tolist())
     horizontal, vertical = one.clearance.horizontal_m - moved[0], one.clearance.vertical_m - moved[1]

@@ -3,8 +3,8 @@
 The two pads of a wall may be worn differently, which rotates the wall. The rotations of the walls, the lever arm and
 the low pass are called *differences* from the model. They are estimated in one linearised step from a fit. If the
 differences are so large that the fit fails a check, the fit is repeated with the differences as unknowns. Poses do not
-determine how a clearance is divided between the two sides of the head, because a bias of the sensor has the same
-effect.
+determine how a clearance is divided between the two sides of the head. A bias of the sensor has the same effect as a
+different division.
 """
 
 from __future__ import annotations
@@ -102,6 +102,5 @@ def of_differences(problem: Problem, found: Fit) -> Array:
 
 
 def _joint_step(problem: Problem, found: Fit) -> tuple[Array, Array]:
-    """Return the linearised step of shared unknowns and differences, shape (18,), and its covariance."""
     precision = deviations() ** -2.0
     return joint_step(problem, found, problem.by_differences(found.point), precision, -problem.differences * precision)

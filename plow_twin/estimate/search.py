@@ -88,9 +88,9 @@ def _have_met(fits: list[Fit], newest: Fit) -> bool:
 def behind_low_pass(problem: Problem, found: Fit) -> Fit | None:
     """Return a fit of the same swings with the time constant of the sensor's low pass fixed at its prior deviation.
 
-    The result is None if the new fit is not clearly better, or if the poses are too rare to show a low pass. The
-    separate fit is needed because steps from a fit without a low pass do not lead to a slow low pass, whose time
-    constant exceeds the duration of an impact.
+    The result is None if the new fit is not clearly better, or if the poses are too rare to show a low pass. Steps from
+    a fit without a low pass do not lead to a slow low pass, whose time constant exceeds the duration of an impact. A
+    separate fit is therefore needed.
     """
     if problem.window.poses.interval() > RESOLVING:
         return None

@@ -1,8 +1,8 @@
 """Models of a sensor with a lever arm, and of a sensor with a low pass.
 
-A sensor with a lever arm measures a point that is not at the centre of the head, and which therefore moves when the
-head rotates. A first-order low pass y of the pose u obeys tau dy/dt = u - y. The mean delay tau of the low pass is part
-of the delay of the stamps. For a small tau, the remaining difference is tau^2 / 2 times the acceleration.
+A sensor with a lever arm measures a point away from the centre of the head. This point also moves when the head
+rotates. A first-order low pass y of the pose u obeys tau dy/dt = u - y. The mean delay tau of the low pass is part of
+the delay of the stamps. For a small tau, the remaining difference is tau^2 / 2 times the acceleration.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from plow_twin.estimate.measurements import Poses, filled
 
 Array = NDArray[np.float64]
 
-#: Number of rows to which a parabola is fitted for the measured pose at the start of a swing, derived from the number
-#: of rows over which a slow sensor smooths a kink.
+#: Number of rows of the parabola that gives the measured pose at the start of a swing. It is derived from the number of
+#: rows over which a slow sensor smooths a kink.
 _ROWS: Final = 7
 
 

@@ -194,7 +194,6 @@ class Units:
 
 
 def _converted(scene: Scene, its: Scene) -> dict[str, Provenance]:
-    """Return the marks of a scene, with standard deviations converted to the units of the converted scene `its`."""
     marks, length = dict(scene.marks), its.frame.width_m / scene.frame.width_m
     for path, kind in KINDS.items():
         mark, (part, name) = marks.get(path), path.split(".")

@@ -2,8 +2,8 @@
 
 Motions with random clearances, contacts and load errors are simulated and observed as by the sensor. A regression over
 the simulated motions near the measured motion corrects the result of the module `equation_error`, and gives the
-deviation of the corrected result (approximate Bayesian computation with local-linear adjustment, as in the module
-`bouncing`). If theta was not measured, the range of motion replaces the result of `equation_error`.
+deviation of the corrected result. The method is approximate Bayesian computation with local-linear adjustment, as in
+the module `bouncing`. If theta was not measured, the range of motion replaces the result of `equation_error`.
 """
 
 from __future__ import annotations
@@ -168,7 +168,6 @@ def _with_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Pos
 
 
 def _without_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Poses) -> _Look:
-    """Return the results of `_with_angle` for poses without theta, from the range of motion."""
     nominal, deviations = unknowns.nominal(), unknowns.deviations()
 
     def features(q: Array) -> Array:
@@ -183,7 +182,6 @@ def _without_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: 
 
 
 def _middle(bounds: tuple[float, ...]) -> tuple[float, float]:
-    """Return mean and standard deviation of a logarithm that is uniformly distributed between two bounds."""
     low, high = np.log(bounds)
     return 0.5 * (low + high), (high - low) / math.sqrt(12.0)
 

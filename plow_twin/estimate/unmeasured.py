@@ -96,7 +96,6 @@ class _Whole:
     def _better(
         self, vector: Array, here: Array, rows: int, scale: Array, damping: float
     ) -> tuple[tuple[Array, Array] | None, float]:
-        """Return a better vector with its residuals, or None, and the damping for the next step."""
         free, spread, normal, gradient = (
             self.free,
             self.deviation[self.free],
@@ -120,12 +119,10 @@ class _Whole:
         return None if error is None else np.concatenate([(error / scale[self.measured]).ravel(), prior])
 
     def _cost(self, normalised: Array) -> float:
-        """Return the sum of Huber's function of the residuals and the squared residuals of the prior."""
         error, prior = np.split(normalised, [-len(self.free)])
         return float(huber_loss(np.abs(error)).sum() + np.square(prior).sum())
 
     def _equations(self, vector: Array, here: Array, rows: int, scale: Array) -> tuple[Array, Array]:
-        """Return the matrix and the right-hand side of the normal equations for the free unknowns."""
         columns = np.zeros((len(here), len(self.free)))
         for place, index in enumerate(self.free):
             moved = vector.copy()
@@ -190,7 +187,6 @@ def fit_some_components(
 
 
 def _starts(whole: _Whole, rows: int, rng: np.random.Generator) -> list[Array]:
-    """Return vectors of unknowns whose motions over the first `rows` poses are nearest to the measured motion."""
     drawn, (draws, improved, kept) = [], tuning.UNMEASURED_DRAWS
     for _ in range(draws):
         vector = whole.mean + whole.deviation * rng.standard_normal(SIZE)

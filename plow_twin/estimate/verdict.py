@@ -176,7 +176,6 @@ def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
 
 
 def _scale(problem: Problem, fit: Fit, verdict: Verdict) -> None:
-    """Test the scale factors of the sensor; a wrong factor is reported only if no other test has found a fault."""
     if not fit.finished:
         return
     scales = scales_of(problem, fit)
@@ -239,7 +238,6 @@ def _noise_change(fit: Fit, verdict: Verdict) -> None:
 
 
 def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
-    """Search for a time at which a bias or a clearance changes (linearised score test)."""
     if problem.window.swings < 6:
         return
     best: dict[str, tuple[float, Array]] = {}

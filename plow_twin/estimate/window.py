@@ -160,7 +160,6 @@ class Windows:
         return end_ns
 
     def _is_hardly_new(self, end_ns: int) -> bool:
-        """Return whether a window is short and contains little motion that is not in the previous window."""
         if not self._early or self._formed_ns is None or self._first_ns is None:
             return False
         span = end_ns - self._first_ns
@@ -209,7 +208,6 @@ class Windows:
 
 
 def _table(rows: list[Row], start_ns: int) -> tuple[Array, Array]:
-    """Return the times of rows in s after `start_ns`, shape (n,), and the values, shape (n, 3)."""
     stamps = np.array([row[0] for row in rows], dtype=np.int64)
     values = np.array([row[1] for row in rows], dtype=np.float64).reshape(-1, 3)
     return np.multiply(stamps - start_ns, 1e-9, dtype=np.float64), values

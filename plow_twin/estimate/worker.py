@@ -173,7 +173,6 @@ class Worker:
         return None
 
     def _fail(self, error: str) -> None:
-        """Record why the process has ended, and drop queued and later data."""
         self.error, self._waiting = error, deque(maxlen=0)
 
     def close(self) -> None:

@@ -158,8 +158,8 @@ class _Model:
     def residual(self, stamp_ns: int, x: float, y: float) -> tuple[int, float] | None:
         """Return the stamp [ns] of a measured pose and its distance [m] from the model.
 
-        The result is None for a pose that is newer than the model, which then waits, or older than all stored poses of
-        the model.
+        The result is None for a pose that is older than all stored poses of the model. It is also None for a pose that
+        is newer than the model and therefore waits.
         """
         if not self._stamps_ns or stamp_ns > self._stamps_ns[-1]:
             if len(self._waiting) < _MOST_WAITING:
@@ -231,7 +231,6 @@ class Alarms:
         return changed
 
     def _place(self, row: np.void, slow: np.void | None) -> None:
-        """Store in each raised alarm the pair or the axis with the largest value."""
         where = {"force": PAIR_NAMES[int(row["measured_peak"].argmax())]}
         if slow is not None:
             axis = CLEARANCE_NAMES[int(slow["clearance"][:2].argmax())]

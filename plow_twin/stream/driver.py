@@ -203,7 +203,6 @@ class Driver:
             yield from self._use(run, now_ns)
 
     def _may_go_on(self, stamp_ns: int, wrench: tuple[float, float, float]) -> bool:
-        """Return whether a sample is clearly plausible and no other sample waits."""
         reached_ns = self.session.stamp_ns
         return not (reached_ns is None or self._steps.waits) and self.intake.goes_on(stamp_ns, wrench, reached_ns)
 
@@ -465,7 +464,6 @@ class Driver:
         self._counted_ns = reached_ns
 
     def _judge_rows(self, rows: Rows) -> None:
-        """Update state and failures after several advances, of which at least one has failed."""
         stamps = (self.session.origin_ns or 0) + np.rint(rows["t"] * NS_PER_S).astype(np.int64)
         for status, stamp_ns in zip(rows["status"].tolist(), stamps.tolist(), strict=True):
             self._judge_advance(status, stamp_ns, StreamState.RUNNING)

@@ -56,8 +56,15 @@ from plow_twin.stream.outputs import NONE, NOTHING, THE_ONE, Outputs, Published,
 
 #: Number of advances from one digest to the next.
 DIGEST_INTERVAL: Final = 100
-#: Header of a snapshot. The fields are: whether a stamp has been reached, stamp of model time 0, stamp reached, number
-#: of advances, whether the load is held, travel speed, number of travel speeds that wait for their stamps.
+#: Header of a snapshot, with these fields:
+#:
+#: - whether a stamp has been reached
+#: - stamp of model time 0 [ns]
+#: - stamp reached [ns]
+#: - number of advances
+#: - whether the load is held
+#: - travel speed [m/s]
+#: - number of travel speeds that wait for their stamps
 _HEADER: Final = struct.Struct("<?qqq?dq")
 _TRAVEL: Final = struct.Struct("<qd")
 #: Largest time [ns] by which a pose may be ahead of the model. If a bag is played fast, poses arrive long before the
@@ -540,7 +547,6 @@ class Session:
         return Applied(rows, self.outputs.add(rows, stamps, taken), digests, failed)
 
     def _follow(self, stamp_ns: int, entry: Pose | PartOfPose | Estimated, known: float = -math.inf) -> None:
-        """Pass a pose or an estimate to the twin, if it follows measurements, and store it for repeated computation."""
         if self.following is None or self.origin_ns is None:
             return
         time = (stamp_ns - self.origin_ns) * 1e-9
@@ -558,7 +564,6 @@ class Session:
             self.poses_dropped += 1
 
     def _travel_on_the_way(self, travel: Travel, stamp_ns: int, wrench: NDArray[np.float64]) -> None:
-        """Advance to the stamp of a travel speed before the next sample, and apply the speed."""
         self._travels.pop(0)
         if self.stamp_ns is not None and travel.stamp_ns > self.stamp_ns:
             share = (travel.stamp_ns - self.stamp_ns) / (stamp_ns - self.stamp_ns)
@@ -641,7 +646,6 @@ class Session:
         return rows
 
     def _move(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], *, held: bool) -> Rows:
-        """Advance to one stamp, shape (1,), without adding a sample to the history."""
         assert self.origin_ns is not None
         rows = self._stock.new(1)
         if self.following is not None:
@@ -668,7 +672,6 @@ class Session:
         return held
 
     def _apply_travel(self, travel: Travel) -> None:
-        """Apply a travel speed at its stamp, which may require waiting for the stamp or going back to the stamp."""
         newest_ns, oldest_ns = self.history.newest_sample_ns, self.history.oldest_ns
         if not self._wears:
             self._speed = travel.speed_m_s
@@ -729,11 +732,9 @@ class Session:
         self.origin_ns = self.stamp_ns = None
 
     def _begin(self, stamp_ns: int) -> int:
-        """Return the origin for which the present model time has the stamp `stamp_ns`."""
         return stamp_ns - round(self.twin.time * 1e9)
 
     def _change_model(self, changes: dict[str, float]) -> None:
-        """Change numbers of the scene and drop the stored states; contacts start without history."""
         before, speed = self.twin, 0.0 if self.held else self._speed
         self._use(self._changed_twin(changes))
         self._carry(before)
@@ -758,7 +759,6 @@ class Session:
         return found
 
     def _carry(self, before: Driven) -> None:
-        """Copy pose, rates, load and time, but not the wear, from the twin `before` to the present twin."""
         now = before.advance(before.time)
         self.twin.reset(before.time, wear_depth=self.wear_depth, pose=(now.q, now.v))
         if self._sampled:
