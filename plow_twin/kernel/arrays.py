@@ -35,7 +35,7 @@ class _SetArrayItem(SetItemBuffer):
 
 
 def _unowned(typingctx: Any, array: Any) -> Any:
-    """Return a view of an array without a reference count, or None for None. The caller must keep the memory alive.
+    """Return a view of an array without a reference count. The caller must keep the memory alive. None stays None.
 
     With a reference count, each call that receives the array would increment and decrement the count atomically. These
     operations would take a seventh of a run's time.

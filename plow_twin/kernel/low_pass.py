@@ -17,9 +17,9 @@ def lagged(tau, edges, starts, places, rates, memory, t, q, v):
     """Return the filter's output and its rates, shape (n, 3) each. The time constant `tau` is in s.
 
     The rows are divided into swings, which are parts of the motion with their own initial state. Swing m consists of
-    the rows edges[m]:edges[m + 1] of the times `t`, poses `q` and rates `v`. Its initial state at time starts[m] is the
-    pose places[m], the rates rates[m] and the filter output memory[m]. Between rows, the pose is interpolated by a
-    cubic, for which the filter is integrated exactly.
+    the rows edges[m]:edges[m + 1] of the times `t`, poses `q` and rates `v`. The initial state of the swing at time
+    starts[m] is the pose places[m], the rates rates[m] and the filter output memory[m]. Between rows, the pose is
+    interpolated by a cubic, for which the filter is integrated exactly.
     """
     out, rate = np.empty_like(q), np.empty_like(q)
     for swing in range(len(starts)):

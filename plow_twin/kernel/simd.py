@@ -304,7 +304,7 @@ def _called(builder: Any, name: str, arguments: Any) -> Any:
 
 @_operation
 def fused(typingctx: Any, factor: Any, other: Any, term: Any) -> Any:
-    """Return factor * other + term for each lane. It is rounded once if the processor has fused operations."""
+    """Return factor * other + term for each lane. The result is rounded once if the processor has fused operations."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return _called(builder, "fmuladd", arguments)

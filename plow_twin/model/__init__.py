@@ -1,1 +1,4 @@
-"""The machine: its parameters, geometry, contact laws and loads. Nothing here depends on the method of solution."""
+"""The machine: its parameters, geometry, contact laws and loads, independent of the method of solution.
+
+Docstrings call the publication Mao, Zhang et al. (2015) "the paper" (docs/study.md).
+"""

@@ -3,8 +3,8 @@
     additive laws     F = K d^n + C psi(d) d',  psi = 1 (Kelvin-Voigt) or u^2 (3 - 2 u), u = min(d / ramp, 1)
     all other laws    F = K d^n (1 + lambda d')
 
-These laws replace eq. 6 of the paper, which is lost. `contact_laws` computes lambda from the restitution. The solver
-determines whether a pair is in contact. It sets the force to zero where the law would pull.
+Equation 6 of the paper, the original contact law, is lost. These laws replace it. `contact_laws` computes lambda from
+the restitution. The solver determines whether a pair is in contact. It sets the force to zero where the law would pull.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def normal_force(
     viscous: float,
     ramp: float,
 ) -> float:
-    """Return the contact force in N. It is `free_force`, or 0 without penetration or where the law would pull."""
+    """Return the contact force in N: `free_force`, but 0 without penetration and where the law would pull."""
     if penetration <= 0.0:
         return 0.0
     return max(0.0, free_force(penetration, rate, stiffness, exponent, damping_factor, viscous, ramp))

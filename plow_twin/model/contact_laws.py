@@ -1,7 +1,7 @@
 """Contact laws, each with its equation and its source.
 
 Most laws have the form F = K d^n (1 + lambda d'), where d is the penetration and its rate d' is positive inward. These
-laws differ in the damping number D = lambda v0, a function of the restitution e, where v0 is the speed at first touch.
+laws differ in the damping number D = lambda v0 that they derive from the restitution e. v0 is the speed at first touch.
 The additive laws add C d' to K d^n, either from the first touch (Kelvin-Voigt) or over a ramp.
 
 A new law is an entry of `_LAWS`, or a call of `add_law` from outside the package. The solver reads only the damping
@@ -26,10 +26,10 @@ DAMPING_NUMBER_CAP: Final = 1e3
 
 
 def exact_damping_number(restitution: float) -> float:
-    """Return the D that results in exactly the restitution e: D (1 + e) = ln((1 + D) / (1 - D e)).
+    """Return the damping number D for which an impact has exactly the restitution e.
 
-    The equation is valid for F = K d^n (1 + lambda d') with any K, n and mass. It is the first integral of the free
-    impact; cf. Hunt and Crossley, J. Appl. Mech. 42 (1975) 440.
+    D solves D (1 + e) = ln((1 + D) / (1 - D e)). This equation is the first integral of the free impact under F = K d^n
+    (1 + lambda d'), for any K, n and mass; cf. Hunt and Crossley, J. Appl. Mech. 42 (1975) 440.
     """
     if restitution >= 1.0:
         return 0.0

@@ -117,7 +117,7 @@ def penetrations_at_centre(scene: Scene) -> NDArray[np.float64]:
 
 
 def _of_places(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Convert coefficients of positions from a head that carries walls to the head of the scene, and return them.
+    """Return coefficients of positions for the head of the scene, given those for a head that carries walls.
 
     If the head carries corners, the rotation R replaces R^T and the position of the head has the opposite sign.
     """
@@ -127,7 +127,7 @@ def _of_places(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _of_arms(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Convert coefficients of arms from a head that carries walls to the head of the scene, and return them.
+    """Return coefficients of arms for the head of the scene, given those for a head that carries walls.
 
     If the head carries corners, the arms do not depend on the position of the head.
     """
@@ -194,7 +194,7 @@ def body_states(states: NDArray[np.float64], offset: tuple[float, float]) -> NDA
 
 
 def tumbles(scene: Scene) -> bool:
-    """Return whether the head may turn beyond 45 degrees. It may if it is a square block without wear."""
+    """Return whether the head may turn beyond 45 degrees. Only a square block without wear may do so."""
     alike = scene.frame.width_m == scene.frame.height_m and scene.wear is None
     return scene.head.carries == "corners" and alike
 

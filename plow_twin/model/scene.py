@@ -188,7 +188,8 @@ class Friction:
 
     Without `stick_stiffness_n_m`, friction is regularised Coulomb friction: T = mu N tanh(slip rate / regularisation
     speed). A corner then creeps under a small load instead of sticking. With `stick_stiffness_n_m`, a spring and a
-    damper connect a corner to the wall until their force exceeds static mu N. The corner then slips with T = mu N.
+    damper connect a corner to the wall until their force exceeds the `static_coefficient` times N. The corner then
+    slips with T = mu N.
 
     References
     ----------
@@ -490,7 +491,7 @@ def _check_choice(key: str, value: Any, spec: Field[Any]) -> Iterator[Problem]:
 
 
 def must_be_given(spec: Field[Any]) -> bool:
-    """Return whether a scene must give the field. It must if the field has no default or if its default is NaN."""
+    """Return whether a scene must give the field, because the field has no default or the default NaN."""
     if spec.default is MISSING:
         return spec.default_factory is MISSING
     return isinstance(spec.default, float) and math.isnan(spec.default)

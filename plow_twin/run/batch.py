@@ -88,9 +88,9 @@ class TwinBatch:
     before the call.
 
     Each SIMD vector advances eight twins if no scene has a ramp, wear, friction, a support, locks, an offset centre of
-    mass or overdamped contact. The results of such a twin do not depend on the other twins of the batch, bit for bit,
-    and agree with a `Twin` within the tolerance. In all other batches, a twin gives results that are bit-identical to a
-    `Twin` with the same terms.
+    mass or overdamped contact. The bits of such a twin's results do not depend on the other twins of the batch.
+    The results agree with those of a `Twin` within the tolerance. In all other batches, a twin gives results that are
+    bit-identical to a `Twin` with the same terms.
     """
 
     def __init__(
@@ -231,7 +231,8 @@ class TwinBatch:
         self._wrench = np.zeros((1, 3))
 
     def begin_beside(self, snapshot: bytes, moved: ArrayLike, *, again: bool = False) -> None:
-        """Set all twins to displaced states of a sampled twin. They take its contacts, last sample and travel speed.
+        """Set all twins to displaced states of a sampled twin, with the contacts, last sample and travel speed of that
+        twin.
 
         Parameters
         ----------

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """Balance of energy and momentum of a run. It compares integrals of the forces with the change of the state.
+    """Balance of energy and momentum of a run: comparison of integrals of the forces with the change of the state.
 
     Attributes
     ----------

@@ -424,8 +424,8 @@ def _beside(
 ) -> list[State]:
     """Return a state and its shadows: one for each free coordinate or rate, and one for each changed scene.
 
-    `moved` contains the displacements of the first group. Shadows of changed scenes are not displaced. Their damping
-    factors, which are set at their own touches, are taken from the states `before`.
+    `moved` contains the displacements of the first group. Shadows of changed scenes are not displaced. The damping
+    factors of these shadows were set at their own touches, and are taken from the states `before`.
     """
     start = _pose_and_rate(_follow(compiled, state, float(state.time), work))
     states = [state]
@@ -448,7 +448,7 @@ def _copy(state: State) -> State:
 
 
 def _follow(compiled: CompiledScene, state: State, end: float, work: Work) -> Motion:
-    """Return the motion from a copy of a state to the time `end`. It contains one output row, at `end`."""
+    """Return the motion from a copy of a state to the time `end`, with one output row at `end`."""
     motion = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)), outputs=True)
     motion.state = _copy(state)
     code, _ = run_events(compiled, motion, np.array([end]), end, work, int(motion.state.steps) + _SHADOW_BUDGET)

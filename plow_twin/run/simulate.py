@@ -52,7 +52,7 @@ class Result:
         All changes of contact mode, in order of time.
     statistics : mapping
         Values of each pair by its name: max, mean_in_contact and mean_over_time [N], impulse [N s], time_in_contact [s]
-        and makes (number of touches). They are computed from the whole motion, not from the output rows.
+        and makes (number of touches). The values are computed from the whole motion, not from the output rows.
     contact_sets : mapping
         Shares of contact time. The keys are the sense of the swing that the contacts stop (`ccw` or `cw`), and a set of
         corners. A value is the share of the sense's contact time in which exactly these corners carry force. Corners

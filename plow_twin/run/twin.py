@@ -282,7 +282,7 @@ class Twin:
 
     @property
     def wrench(self) -> NDArray[np.float64]:
-        """Last sample of the load, shape (3,): Fx, Fy [N] and M [N m]. It is zero before the first sample."""
+        """Last sample of the load, shape (3,): Fx, Fy [N] and M [N m]. The value is zero before the first sample."""
         return self._wrench.copy()
 
     def reset(

@@ -1,6 +1,7 @@
 """Growth of errors and effects of parameters along the motion of a live twin.
 
-They are computed from shadows, which are copies of the twin with a small displacement or a changed parameter.
+Growth and effects are computed from shadows, which are copies of the twin with a small displacement or a changed
+parameter.
 """
 
 from __future__ import annotations
@@ -44,15 +45,15 @@ class TwinSensitivity:
     ----------
     twin : Twin
         A twin with `excitation="sampled"`. From now on only the method `advance` of this object may advance the twin.
-        Its results are bit-identical to `Twin.advance`.
+        The results of this method are bit-identical to `Twin.advance`.
     parameters : sequence of str
         Paths of the parameters with respect to which derivatives are computed, from `sensitivity_parameters`.
 
     Attributes
     ----------
     t : float
-        Model time in s of the other attributes: the end of the last complete stretch. It is some 0.1 s before the time
-        of the twin, and up to 0.5 s during a contact.
+        Model time in s of the other attributes: the end of the last complete stretch. This time is some 0.1 s before
+        the time of the twin, and up to 0.5 s during a contact.
     from_start : ndarray, shape (k, k)
         Derivatives of the state at `t` with respect to the twin's state when this object was created. A state contains
         the coordinates of the k / 2 free degrees of freedom, followed by their rates.

@@ -55,7 +55,7 @@ STEP_SHARE = 3e-4
 LARGEST_STEP_ERROR = 1e-6
 #: `STEP_SHARE` for exponents that are not integers. It is smaller because series converge slowly near a branch point.
 STEP_SHARE_FRACTION = 1e-6
-#: Number of mode changes at one time after which the solver takes a step without event detection.
+#: Number of mode changes at one instant after which the solver takes a step without event detection.
 MAX_EVENTS_AT_ONCE = 64
 #: Largest harmonic load for which rest is detected, divided by the load that presses the head against its walls
 #: (`method.small_harmonics`).
@@ -197,7 +197,7 @@ class _Description:
     loads: LoadSet
 
     def compiled(self, params: Params | None = None) -> CompiledScene:
-        """Return the compiled scene. Its constants are written to `params`, or to a new record without `params`."""
+        """Return the compiled scene. Its constants are written to `params`, or to a new record if it is None."""
         if params is None:
             params = new_record(params_type(options(self.scene)))
             for name, value in self.values.items():
@@ -384,7 +384,7 @@ def _thresholds(admissible: float, order: int) -> Array:
 
 
 def order_for(admissible: float) -> int:
-    """Return the order of the series for an admissible error of a step. The formula fits measured optimal orders."""
+    """Return the order of the series for an admissible error of a step, fitted to the fastest orders in benchmarks."""
     return int(min(MAX_ORDER, max(8, round(6.0 - math.log10(admissible)))))
 
 

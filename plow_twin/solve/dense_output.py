@@ -35,7 +35,7 @@ def sigma_at(state, used):
 
 @kernel(fast=True)
 def sum_series(support, state, w, sigma, out) -> None:
-    """Write the state from its series at sigma to `out`, shape (8,). It is relative to a frame on springs."""
+    """Write the state from its series at sigma to `out`, shape (8,), relative to a frame on springs."""
     order, series = state.order, w.series
     value = row(series, order)
     for k in range(order - 1, -1, -1):

@@ -73,7 +73,7 @@ def push(p, slip, stick, state, frozen, pair, force, c, s, theta, omega, x, y, v
 
 @kernel(inline="source")
 def about_mass(p, c, s, load):
-    """Return the angular acceleration that a load through the cavity's centre causes about the centre of mass.
+    """Return the angular acceleration due to the moment, about the centre of mass, of a load at the cavity's centre.
 
     Gravity is part of the load, but it acts at the centre of mass, so its contribution is removed.
     """

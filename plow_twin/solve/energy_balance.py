@@ -1,6 +1,6 @@
 """Energy balance of a run: comparison of the change of energy and momentum with the work and impulse of the forces.
 
-The forces are computed at single times, independently of the series: loads from the time, and contact forces by
+The forces are computed at single instants, independently of the series: loads from the time, and contact forces by
 `model.contact` and `model.friction`. Powers and forces are integrated by Gauss-Legendre quadrature over each step of
 the series, or by the trapezoidal rule over fixed steps. Kinetic energy and momentum are computed from the state.
 """

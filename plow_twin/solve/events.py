@@ -155,9 +155,9 @@ def _unsafe_pairs(w, order, h):
 def _nothing_ends(p, state, w, order, h, penetrating, hysteretic) -> bool:
     """Return whether no pair changes its mode on [0, h], for an integer exponent without a ramp.
 
-    The function combines the first test of `_unsafe_pairs` with the test of `_stays`, for all pairs at once. It does
-    not count a positive linear term. The allowances for rounding ensure that every guard function that passes this test
-    would also pass the two other tests.
+    The function combines the first test of `_unsafe_pairs` with the test of `_stays`, for all pairs at once. The
+    function does not count a positive linear term. The allowances for rounding ensure that every guard function that
+    passes this test would also pass the two other tests.
     """
     weights = w.per_pair
     for pair in range(PAIR_COUNT):

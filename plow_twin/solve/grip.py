@@ -160,7 +160,8 @@ def grip_guard(p, state, w, order, pair, side) -> int:
     """Write a guard function of a corner to `w.column[0]`. Return the event of its root, or 0 without a guard function.
 
     A sticking corner has two guard functions, mu_s N -+ T, one for each direction of slip (`side`). A slipping corner
-    has one guard function, for side 0. It is the condition for slip in the docstring of this module, times dt/dsigma.
+    has one guard function, for side 0. This function is the condition for slip in the docstring of this module, times
+    dt/dsigma.
     """
     g, rate, force, drag = w.column[0], w.slip[0], w.force, w.slip[4]
     grip = state.grip[pair]

@@ -107,7 +107,7 @@ def slip_arm(p, pair, c, s, x, y):
 
 @kernel(fast=True, inline="code")
 def rolled(p, values, angle):
-    """Return all positions along the walls, or all slip rates, with the effect of the rounded corners' angle added."""
+    """Return positions along the walls, or slip rates, after adding the product of `roll` and `angle` (or its rate)."""
     if _is_rounded(p) is not None:
         values = values + splat(_roll(p) * angle)
     return values
@@ -183,7 +183,7 @@ def to_world(p, y, z) -> None:
 
 @kernel()
 def pose_of(p, y, offset, q, v) -> None:
-    """Write pose and rate of the cavity's centre in world axes from body coordinates. It inverts `body_state`."""
+    """Write pose and rate of the cavity's centre in world axes from body coordinates (inverse of `body_state`)."""
     x, yy, vx, vy, om = y[X], y[Y], y[VX], y[VY], y[OMEGA]
     if offset is not None:
         x, yy = x - p.offset[0], yy - p.offset[1]

@@ -77,7 +77,7 @@ def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
         if code != _OK:
             return code
         low = sigma_at(state, state.elapsed)
-        # rounding can place the stop time slightly beyond the end of the step; this rest must not become another step
+        # rounding can place the stop time slightly beyond the end of the step; the remainder must not become a step
         stopped = state.ends_at_stop == 1 and target >= state.stop_time
         if target < t0 + state.step_size and not stopped:
             if totals is not None:
@@ -221,9 +221,9 @@ def advance_rows(
     times : ndarray, shape (n,)
         Times in s, not decreasing.
     wrench : ndarray, shape (m, n + 1, 3), or None
-        Samples of the load, divided by mass and inertia. They are the sample before the first time, followed by the
-        sample at each time, and they are interpolated linearly. A step ends at each of these times. None for the loads
-        of the scene.
+        Samples of the load, divided by mass and inertia: the sample before the first time, then the sample at each
+        time. The load is interpolated linearly between samples, and a step ends at each time. None selects the loads of
+        the scene.
     rows : ndarray of `ROW`, shape (m, n), or None
         Array that receives the motion and the totals at each time, or None without `totals`.
     marks : ndarray of int64, shape (k,)

@@ -33,12 +33,12 @@ from plow_twin.solve.state import (
     Y,
 )
 
-#: Penetration that is treated as zero, divided by the release penetration. It also defines a speed that is treated as
-#: zero, divided by the speed that reaches the release penetration.
+#: Largest penetration that is treated as zero, divided by the release penetration. The same ratio applies to speeds,
+#: relative to the speed that reaches the release penetration.
 SHALLOW = 1e-3
 #: Number of iterations in which damping and impact speed of a pair that starts in contact are computed in turn.
 _ROUNDS = 8
-#: Number of bisections for the impact speed. It determines the last bit of a double.
+#: Number of bisections for the impact speed, sufficient to determine the last bit of a double.
 _BISECTIONS = 60
 #: Largest |theta| in rad at which each corner faces the walls of its pairs: 45 degrees, and a margin for rounding.
 LARGEST_ANGLE = 0.25 * math.pi + 1e-12
@@ -69,7 +69,7 @@ def _fallen_number(p, y, pair, speed):
     return (low + (at - index) * (high - low)) * RESTITUTIONS / at
 
 
-#: Return the damping number D of an impact. It depends on the speed only if the restitution does.
+#: Return the damping number D of an impact, which depends on the impact speed only if the restitution does.
 _damping_number = by_field(
     "fall", lambda p, y, pair, speed: _fallen_number(p, y, pair, speed), lambda p, y, pair, speed: p.damping_number
 )
@@ -194,7 +194,7 @@ def settle_moved(params, states, which, places, time, stick) -> None:
 
 @kernel(entry=True)
 def settle_many(params, states, members) -> None:
-    """Call `settle_modes` for each of `members`. Their scenes must have no friction with stick."""
+    """Call `settle_modes` for each of `members`. The scenes must not have friction with stick."""
     for member in members:
         settle_modes(params[member], states[member], None)
 

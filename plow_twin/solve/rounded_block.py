@@ -41,8 +41,8 @@ _STEPS = 70.0
 _SLOWEST, _LEAST, _LARGEST = 0.01, 0.05, 0.9
 #: Impact speed in m/s below which restitution and friction are constant.
 _SMALLEST_IMPACT = 0.05
-#: Reference mobility of a corner times the mass, relative to which the effective mass of an impact is computed. It is
-#: the value for a uniform square that lands on the end of an edge.
+#: Reference mobility of a corner times the mass, relative to which the effective mass of an impact is computed. The
+#: reference is the value for a uniform square that lands on the end of an edge.
 _USUAL_MOBILITY = 1.5
 
 

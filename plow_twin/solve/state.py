@@ -236,7 +236,7 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("evaluations", "i8"),  # evaluations of the equations of motion; one order of a series is one evaluation
     ("events", "i8"),
     ("guard_roots", "i8"),  # searches for the root of a guard function
-    ("recoveries", "i8"),  # steps that ended an endless alternation of modes at one time
+    ("recoveries", "i8"),  # steps that ended an endless alternation of modes at one instant
     ("bounded", "i8"),  # advances that ended with Runge-Kutta steps because of their limit of evaluations
     ("implicit_steps", "i8"),
 ]

@@ -30,7 +30,7 @@ from plow_twin.solve.tumbling import turn_at, turn_corners
 METHODS: Final[tuple[Method, ...]] = (flight, rest, implicit, taylor)
 #: Longest step in s. This bound ensures that all powers of a step are finite.
 LONGEST_STEP = 100.0
-#: Size, in sigma (the variable of the series), of the step that ends an endless alternation of modes at one time.
+#: Size, in sigma (the variable of the series), of the step that ends an endless alternation of modes at one instant.
 PAST_AN_INSTANT = 1e-9
 #: Largest relative difference of two times that are treated as equal. It covers a few rounding errors.
 ONE_INSTANT = 1e-15
@@ -112,7 +112,7 @@ def _end_at_event(p, state, w, span, penetrating, law, stick) -> None:
     sigma, order = state.sigma_end, state.order
     end, pair, target = first_event(p, state, w, order, sigma, penetrating, *law, stick)
     if pair >= 0 and state.events_at_once > p.max_events:
-        # modes alternate at one time: take a short step with the current modes
+        # modes alternate at one instant: take a short step with the current modes
         state.recoveries += 1
         end, pair = max(end, min(sigma, PAST_AN_INSTANT)), -1
     turn = turn_at(p, state, w, order, end)

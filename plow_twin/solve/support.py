@@ -43,7 +43,7 @@ def to_ground(y, frame, out) -> None:
 
 @kernel()
 def from_ground(y, frame, out) -> None:
-    """Write the head's body coordinates relative to the frame to `out`, which may be y. It inverts `to_ground`."""
+    """Write the head's body coordinates relative to the frame to `out`, which may be y (inverse of `to_ground`)."""
     theta, spin = y[THETA], frame[5]
     c, s = math.cos(theta), math.sin(theta)
     bx, by = to_body_axes(c, s, frame[0], frame[1])
@@ -67,7 +67,7 @@ def to_world_both(p, y, frame, z) -> None:
 
 @kernel()
 def to_body_both(p, z, y, frame) -> None:
-    """Write the head's body coordinates relative to the frame, and the frame's state. It inverts `to_world_both`."""
+    """Write the head's body coordinates relative to the frame, and the frame's state (inverse of `to_world_both`)."""
     head = np.empty(6)
     for j in range(3):
         head[j], head[3 + j] = z[j], z[6 + j]

@@ -37,7 +37,7 @@ from plow_twin.solve.step import complete_step, lay_out_series_step
 
 #: Number of columns that are computed in one vector.
 WIDTH: Final = 8
-#: Number of columns that are derivatives with respect to the state. They precede the derivatives by parameters.
+#: Number of columns that are derivatives with respect to the state. The derivatives by parameters follow.
 STATE_COLUMNS: Final = 6
 #: Indices of the components of a column.
 PLACE_X, PLACE_Y, PLACE_THETA, RATE_X, RATE_Y, RATE_THETA = range(6)

@@ -99,7 +99,7 @@ def _list_powers(lanes, order, hysteretic, fraction) -> None:
 def _may_end(series, factor, first, order, h):
     """Return a bit mask of the lanes whose guard function may become negative.
 
-    Term 0 of the guard function is `first`. Its other terms are those of `series`, multiplied by `factor`. The test is
+    Term 0 of the guard function is `first`. The other terms are those of `series`, multiplied by `factor`. The test is
     that of `_write_guard`.
     """
     reach = term = exact_splat(0.0)
@@ -280,7 +280,7 @@ def isolate(lanes, column, w, order, bits):
 
     `column` contains one polynomial for each lane. The number of sign changes of its Bernstein coefficients is the
     number of roots, or exceeds this number by an even number. A first estimate of the root is written to `lanes.root`.
-    It is the root of the chord between the coefficients that change sign.
+    This estimate is the root of the chord between the coefficients that change sign.
     """
     h, b, zero = exact_row(lanes.reach, 0), lanes.bernstein, exact_splat(0.0)
     to_bernstein(lanes, column, w, order, h)

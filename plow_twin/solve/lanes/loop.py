@@ -228,7 +228,7 @@ def end_of(lanes, lane, fraction):
 
 @kernel()
 def complete(p, sums, lanes, lane, hysteretic, fraction) -> None:
-    """Set the time, counts and modes of a lane to the end of its step. Its state must already be at the end.
+    """Set the time, counts and modes of a lane to the end of its step. The lane's state must already be there.
 
     If modes change, `lanes.stale` is set, and the caller has to call `note_modes` afterwards.
     """
@@ -270,7 +270,7 @@ def move(lanes) -> None:
 
 @kernel()
 def go_past_an_instant(params, lanes) -> None:
-    """Take a short step with the current modes in each lane whose modes would alternate endlessly at one time."""
+    """Take a short step with the current modes in each lane whose modes would alternate endlessly at one instant."""
     for lane in range(WIDTH):
         member = lanes.member[lane]
         if member >= 0 and lanes.event[lane] >= 0:

@@ -40,7 +40,7 @@ _LANES_OF: Final = (WIDTH,)
 #: Indices of the blocks of `staged`: five rows of the penetrations, two rows of the arms, then state, lambda, modes,
 #: and whether a pair can touch.
 _ARM, _Y, _FACTOR, _MODE, _ENABLED, _BLOCKS = 5, 7, 8, 9, 10, 11
-#: Indices in `counts`: steps, evaluations, events, searches of roots, recoveries, events at one time.
+#: Indices in `counts`: steps, evaluations, events, searches of roots, recoveries, events at one instant.
 STEPS, EVALUATIONS, EVENTS, GUARD_ROOTS, RECOVERIES, AT_ONCE = range(6)
 COUNTS: Final = 6
 

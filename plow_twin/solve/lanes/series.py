@@ -85,8 +85,8 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction,
     """Write the series of the state. Return the order.
 
     Under sampled loads, the series of a lane ends at the order from which its terms are negligible over the longest
-    admissible step. Its higher terms are set to zero, so that the bits of a lane's results do not depend on the orders
-    of other lanes.
+    admissible step. The higher terms of this series are set to zero, so that the bits of a lane's results do not depend
+    on the orders of other lanes.
     """
     series, moment = lanes.series, lanes.moment
     zero = exact_splat(0.0)
@@ -302,8 +302,8 @@ def _add_ends(load, k, c0, s0, c, s, share, wc, ws):
 def _start(lanes, viscous, c, s, x, y, dc, ds, dx, dy):
     """Return order 0 of the contacts' forces along X and Y, and of their factors of cosine and sine in the moment.
 
-    They are computed from the same penetrations as the guard functions. The summed maps (`record._weigh_lanes`) have
-    different rounding, so the force would begin 1e-17 m away from the event.
+    Forces and factors are computed from the same penetrations as the guard functions. The summed maps
+    (`record._weigh_lanes`) have different rounding, so the force would begin 1e-17 m away from the event.
     """
     fx = fy = gc = gs = exact_splat(0.0)
     for slot in range(PAIR_COUNT):
@@ -333,8 +333,8 @@ def _add_force(lanes, gear, push, fx, fy, gc, gs):
 def _push(lanes, w, k, acts, c, s, x, y, dc, ds, dx, dy):
     """Return order k of the forces along X and Y, and of the factors of cosine and sine in the contacts' moment.
 
-    They are sums over the slots for F = K d (1 + lambda d'). The next order of the penetrations and order k of F / K
-    are written to `lanes`.
+    Forces and factors are sums over the slots for F = K d (1 + lambda d'). The next order of the penetrations and order
+    k of F / K are written to `lanes`.
     """
     fx = fy = gc = gs = exact_splat(0.0)
     for slot in range(PAIR_COUNT):

@@ -2,7 +2,7 @@
 
 In overdamped contact, the damper stops a pair much faster than the spring moves it. Stability then limits the steps of
 an explicit series to a few decay times, even if the motion is smooth. Radau IIA collocation (Hairer and Wanner, Solving
-ODEs II, sec. IV.5) is stable for longer steps. Its solution is a polynomial in time. The polynomial is written as a
+ODEs II, sec. IV.5) is stable for longer steps. The solution is a polynomial in time. The polynomial is written as a
 series, so that events, outputs and totals are computed as for an explicit step.
 """
 
@@ -69,8 +69,8 @@ _MOST_REFUSED = 12
 def _coefficients(nodes: NDArray[np.longdouble]) -> NDArray[np.longdouble]:
     """Return the matrix that converts the values of a polynomial at the nodes to its coefficients, shape (n, n).
 
-    It is the inverse of a Vandermonde matrix. Extended precision is used because the inversion loses half of the
-    digits.
+    The matrix is the inverse of a Vandermonde matrix. Extended precision is used because the inversion loses half of
+    the digits.
     """
     n = len(nodes)
     columns = np.zeros((n, n), np.longdouble)

@@ -33,8 +33,8 @@ _SHORTER, _SHORT_ENOUGH = 20, 0.9
 def accurate_step(p, w, order, sigma_limit):
     """Return the sigma up to which the series meets the admissible error of a step, or NaN if a term is not finite.
 
-    The admissible size of term k is `threshold[k]`. It decreases geometrically with k to the admissible error at the
-    last order (root test of Jorba and Zou, sec. 3.2). Single terms can be zero, so the last `lacuna` terms are all
+    The admissible size of term k is `threshold[k]`. This size decreases geometrically with k to the admissible error at
+    the last order (root test of Jorba and Zou, sec. 3.2). Single terms can be zero, so the last `lacuna` terms are all
     checked.
     """
     least = np.inf
