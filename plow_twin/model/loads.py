@@ -1,7 +1,7 @@
 """Loads of a scene in the form that the solver uses: one list of harmonics and one piecewise linear wrench.
 
-The load (Fx, Fy) at the constant arm (x, y) in world axes has the moment M = x Fy - y Fx about the centre of the cavity
-in every pose (paper, section 2). Gravity is treated separately.
+A load (Fx, Fy) has a constant arm (x, y) in world axes. Its moment about the centre of the cavity is M = x Fy - y Fx in
+every pose (paper, section 2). Gravity is treated separately.
 """
 
 from __future__ import annotations

@@ -82,9 +82,9 @@ def simulate_many(
 ) -> Ensemble:
     """Simulate every scene from t = 0 to `t_end`. The bits of a result depend only on its own scene.
 
-    Scenes with constant or harmonic loads, any contact law without a ramp and no further terms run eight at a time in
-    the lanes of a SIMD vector. Their results agree with `simulate` within the tolerance. For all other scenes the
-    results are bit-identical to `simulate`.
+    Scenes run eight at a time in the lanes of a SIMD vector if they have constant or harmonic loads, a contact law
+    without a ramp, and no further terms. The results of these scenes agree with `simulate` within the tolerance. For
+    all other scenes the results are bit-identical to `simulate`.
 
     Parameters
     ----------

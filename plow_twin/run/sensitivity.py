@@ -380,8 +380,8 @@ def displacement_beside(
 ) -> float | None:
     """Return the largest displacement of shadows, relative to the clearance, for a stretch that begins now.
 
-    A stretch does not begin during a contact with an elastic wall, because the contact would turn a displacement into a
-    velocity larger than any error of the solver. If overdamped contact holds the head, a displacement decays slowly, so
+    A stretch does not begin during an elastic contact. The contact would turn a displacement into a velocity larger
+    than any error of the solver. If overdamped contact holds the head, a displacement decays slowly, so
     a small displacement is sufficient.
 
     Parameters

@@ -417,8 +417,8 @@ class Twin:
             return None
         if state.step_size < 0.0:
             return np.array(state.frame)
-        # under the scene's own loads the current time may lie within a step; the frame's state is then evaluated from
-        # the series of this step, at the sigma of `dense_output.sigma_at`
+        # under the scene's own loads the current time may be within a step, so the series of this step is evaluated (at
+        # the sigma of `dense_output.sigma_at`)
         used, beta = float(state.elapsed), float(state.beta)
         sigma = 2.0 * used / (state.alpha + math.sqrt(max(state.alpha**2 + 2.0 * beta * used, 0.0)))
         return frame_at(work.frame, int(state.order), sigma)

@@ -130,8 +130,9 @@ def _ramp_guard(p, state, w, order, pair) -> None:
 def _unsafe_pairs(w, order, h):
     """Return an integer with a bit for each pair whose guard function g may become negative on [0, h].
 
-    The function g stays positive if g_0 and g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are positive, because this
-    lower bound is concave in h. If the test fails for any pair, the signs of the Bernstein coefficients are tested.
+    The function g stays positive on [0, h] if g_0 and
+    b(h) = g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are positive. The reason is that b is a lower bound of g and
+    concave. If the test fails for any pair, the signs of the Bernstein coefficients are tested.
     """
     guard, b = w.guard, w.bernstein
     reach = splat(0.0)

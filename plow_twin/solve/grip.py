@@ -5,8 +5,8 @@ A spring and a damper connect a sticking corner to its anchor a on the wall. A s
     sticks    T = k (s - a) + c s'      while |T| <= mu_s N
     slips     T = +-mu N                while +-(k s' + c s'') >= mu N'
 
-T is the tangential force, N the normal force, s the corner's position along the wall, k the stiffness of the spring and
-c the damping of the damper. While a corner slips, the anchor follows the corner, so that spring and damper carry mu N.
+T is the tangential force and N the normal force. s is the corner's position along the wall. k and c are the constants
+of spring and damper. While a corner slips, the anchor follows the corner, so that spring and damper carry mu N.
 A corner slips as long as the force of spring and damper would grow at least as fast as mu N if the corner started to
 stick.
 

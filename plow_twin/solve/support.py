@@ -2,7 +2,7 @@
 
     m_f u'' = -k_x u - c_x u' - sum F_x      (v likewise)      I_f phi'' = -k_phi phi - c_phi phi' - sum (p x F)
 
-u, v, phi is the frame's displacement in world axes, F the force of a pair on the head, and p the point of action of F
+u, v, phi is the frame's displacement in world axes. F is the force of a pair on the head, and p is its point of action
 relative to the frame's centre. The head's equations of motion use its position relative to the ground. Penetrations,
 arms and slip depend on its position relative to the frame. `State.y` is relative to the frame, so that modes, events
 and outputs are computed as for a fixed frame. The series of both bodies are computed together (`solve.method.series`).

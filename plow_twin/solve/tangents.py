@@ -10,7 +10,7 @@ column satisfies
     dd   = n . xi - arm phi + de,             dd' its rate,     dF = F_d dd + F_d' dd' + the change by the law's
     constants
 
-where n contains the coefficients of X and Y in a penetration, de is the change of this penetration by a clearance, and
+where n contains the coefficients of X and Y in a penetration, and de is the change of this penetration by a clearance.
 dtau is the derivative of the contacts' moment with respect to the angle. The coefficients of these equations are series
 over the step, so each order of a column is a sum of Cauchy products. Eight columns are computed in one vector.
 

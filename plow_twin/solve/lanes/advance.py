@@ -93,8 +93,8 @@ class Samples(NamedTuple):
 
 
 #: Indices in `Samples.progress`: current block, number of twins that another method continues, state of the current
-#: block, first twin of the thread, and the twin after its last twin. The state of the block is 0 if it is not in the
-#: lanes, `_LOADED` if it is, or `_LEFT` if one of its twins has left the lanes.
+#: block, first twin of the thread, and the twin after its last twin. The state of a block is `_LOADED` in the lanes,
+#: `_LEFT` if one of its twins has left the lanes, and otherwise 0.
 BLOCK_NOW, OTHERS, LOADED, FIRST, END = range(5)
 _LOADED, _LEFT = 1, 2
 

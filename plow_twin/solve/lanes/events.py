@@ -160,7 +160,8 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
 
     `places` contains the lanes of the guard functions. None means one guard function of each lane, in order. Returns a
     bit mask of the guard functions that may become negative. A guard function g stays positive on [0, h] if g_0 and
-    g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are positive, because this lower bound is concave in h.
+    b(h) = g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are positive. The reason is that b is a lower bound of g and
+    concave.
     """
     cosine, sine, x, y = lanes.series[COS], lanes.series[SIN], lanes.series[X], lanes.series[Y]
     reach = term = deeper = zero = exact_splat(0.0)
@@ -482,8 +483,8 @@ def note_switches(lanes, order, viscous, fraction) -> None:
             guard, lane = lanes.guarded[at, i], lanes.owner[at, i]
             if lanes.event[lane] >= 0 and 0 <= guard < AGAIN:
                 pair = guard % PAIR_COUNT
-                # if both guard functions of a pair become negative here, the first guard function takes precedence; the
-                # second guard function is ignored for a pair that already has a new mode
+                # the first guard function of a pair takes precedence, so the second guard function is ignored for a
+                # pair that already has a new mode
                 if lanes.switch[pair, lane] < 0 and lanes.parted[pair, lane] >= lanes.step[lane]:
                     _note_switch(lanes, lane, guard, viscous, fraction)
     for lane in range(WIDTH):

@@ -44,8 +44,12 @@ def _smallest_gap(p, state) -> float:
 def _bounds(p, harmonics, t, z, w) -> None:
     """Write upper bounds of the motion along x, y and theta to `w.flight[1:]`, shape (4, 3).
 
-    The rows are the current speed, the speed without the oscillation due to the harmonic loads, the largest
-    acceleration by the harmonic loads, and the amplitude of the oscillation.
+    The rows are:
+
+    - the current speed;
+    - the speed without the oscillation due to the harmonic loads;
+    - the largest acceleration by the harmonic loads;
+    - the amplitude of the oscillation.
     """
     for j in range(3):
         drift, push, swing = z[3 + j], 0.0, 0.0

@@ -604,8 +604,8 @@ def note_step(implicit, state, w, step_size, has_event) -> None:
     if implicit is not None:
         note_decay(state, w.decay[0], step_size)
         if has_event:
-            # if a pair only approaches its wall, the polynomial of a long step can show a false event, so the next step
-            # is at most four times as long as this step
+            # the polynomial of a long step can show a false event if a pair only approaches its wall; the size of the
+            # next step is therefore limited
             state.implicit_size = min(state.implicit_size, 4.0 * step_size)
 
 

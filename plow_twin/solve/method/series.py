@@ -412,8 +412,8 @@ def _turn_frame(w, k, there, c, s):
 def _seen_rates(w, k, there, turned, om, turning):
     """Return order k of the rates of the head's cosine, sine and position relative to the frame.
 
-    `turned` is the result of `_turn_frame`: R^T u and R^T w, with the frame's displacement u and velocity w, where R
-    rotates from head axes to world axes. The rate of R^T u is R^T w plus omega times R^T u, rotated by -90 degrees.
+    `turned` is the result of `_turn_frame`: R^T u and R^T w with the frame's displacement u and velocity w. R rotates
+    from head axes to world axes. The rate of R^T u is R^T w plus omega times R^T u, rotated by -90 degrees.
     `turning` contains the rates of the head's position relative to the ground.
     """
     relative = om - lane(there, SPIN)
@@ -431,9 +431,9 @@ def _seen_rates(w, k, there, turned, om, turning):
 def _push_frame(p, w, k, there, c, s, x, y, dc, ds, pushed):
     """Return order k of the frame's rates under its springs, its dampers and the reactions of the contacts.
 
-    `pushed` contains the head's accelerations by the pairs (`_applied`). The moment of the pairs' forces about the
-    frame's centre is their moment about the head's centre of mass, plus the cross product of (x, y) and the forces.
-    Here (x, y) is the head's position.
+    `pushed` contains the head's accelerations by the pairs (`_applied`). The moment of the forces about the frame's
+    centre is their moment about the head's centre of mass, plus the cross product of the head's position (x, y) and the
+    forces.
     """
     fx, fy = lane(pushed, VX) / p.inverse_mass, lane(pushed, VY) / p.inverse_mass
     left, right = pack(c, s, s, c, x, y, 0.0, 0.0), pack(fx, fy, fx, fy, fy, fx, 0.0, 0.0)

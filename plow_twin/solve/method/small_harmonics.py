@@ -1,7 +1,7 @@
 """Rest under small harmonic loads: proof that the motion of a head in contact stays below the tolerance.
 
 Near its equilibrium, the head satisfies e'' + C e' + K e = r. Here e is its distance from the linear response to the
-harmonic loads, with the angle times the radius of gyration as third coordinate, and r is the remainder of the
+harmonic loads. The third coordinate of e is the angle times the radius of gyration. r is the remainder of the
 linearisation. The linear response is known in closed form, including resonance.
 
 Let s and c be the smallest eigenvalues of K and C, and S the largest eigenvalue of C. Choose eps at most c / 2,
