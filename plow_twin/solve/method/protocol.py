@@ -23,9 +23,8 @@
    `loop.lay_out_again` repeats the step after a snapshot is restored. The method for rest is an exception: it moves the
    head by a distance that is less than a thousandth of the tolerance.
 6. It adds its evaluations of the equations of motion to `state.evaluations`.
-7. Code that a scene does not need is not compiled. To this end, `own` returns None, or a tuple that contains None,
-because
-   numba omits branches on an argument that is None.
+7. Code that a scene does not need is not compiled. To this end, `own` returns None, or a tuple that contains None.
+   Numba omits branches on an argument that is None.
 """
 
 from __future__ import annotations
