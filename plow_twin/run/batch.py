@@ -88,8 +88,8 @@ class TwinBatch:
     before the call.
 
     Each SIMD vector advances eight twins if no scene has a ramp, wear, friction, a support, locks, an offset centre of
-    mass or overdamped contact. The bits of such a twin's results do not depend on the other twins of the batch.
-    The results agree with those of a `Twin` within the tolerance. In all other batches, a twin gives results that are
+    mass or overdamped contact. The bits of such a twin's results do not depend on the other twins of the batch. The
+    results agree with those of a `Twin` within the tolerance. In all other batches, a twin gives results that are
     bit-identical to a `Twin` with the same terms.
     """
 
@@ -231,8 +231,7 @@ class TwinBatch:
         self._wrench = np.zeros((1, 3))
 
     def begin_beside(self, snapshot: bytes, moved: ArrayLike, *, again: bool = False) -> None:
-        """Set all twins to displaced states of a sampled twin, with the contacts, last sample and travel speed of that
-        twin.
+        """Set all twins to displaced states of a sampled twin, and copy its contacts, last sample and travel speed.
 
         Parameters
         ----------

@@ -46,7 +46,7 @@ class Ensemble:
         Number of touches of each pair.
     set_time : ndarray, shape (m, 2, 16)
         Time in s in which exactly the corners of each set are in contact. Bit i of the last index is corner i. The
-        second index is 0 for counter-clockwise and 1 for clockwise contacts.
+        middle index is 0 for counter-clockwise and 1 for clockwise contacts.
     events : ndarray of int64, shape (m,)
         Number of changes of contact mode.
     wear_depth : ndarray, shape (m, 8)

@@ -169,7 +169,7 @@ class ChangedScene:
 
 
 def refuse_support(scene: Scene) -> None:
-    """Raise `ArgumentError` for a scene with a `Support`, because shadows have no displacement of the frame."""
+    """Raise `ArgumentError` for a scene with a `Support`, because shadows cannot displace the frame."""
     if scene.support is not None:
         raise ArgumentError(f"sensitivity: got a scene with {scene.support}, expected a scene without support")
 
@@ -378,11 +378,11 @@ def scale_of(compiled: CompiledScene) -> Array:
 def displacement_beside(
     penetration: Array, length: float, *, held: bool = False, reads_speed: bool = False
 ) -> float | None:
-    """Return the largest displacement of shadows, relative to the clearance, for a stretch that begins now.
+    """Return the largest displacement of shadows, relative to the clearance, for the start of a stretch.
 
     A stretch does not begin during an elastic contact. The contact would turn a displacement into a velocity larger
-    than any error of the solver. If overdamped contact holds the head, a displacement decays slowly, so
-    a small displacement is sufficient.
+    than any error of the solver. If overdamped contact holds the head, a displacement decays slowly, so a small
+    displacement is sufficient.
 
     Parameters
     ----------
@@ -399,8 +399,9 @@ def displacement_beside(
     Returns
     -------
     float or None
-        None if a pair is closer to its wall than `_CLEAR_OF_WALLS` times the smallest admissible displacement. None
-        also if a pair is in contact and the argument `reads_speed` is True.
+        Displacement, or None if no stretch can begin. There are two conditions. Each pair must be at least
+        `_CLEAR_OF_WALLS` times the smallest admissible displacement away from its wall. If `reads_speed` is True, no
+        pair may be in contact.
     """
     if reads_speed and bool((penetration > 0.0).any()):
         return None
