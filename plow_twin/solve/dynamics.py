@@ -73,9 +73,10 @@ def push(p, slip, stick, state, frozen, pair, force, c, s, theta, omega, x, y, v
 
 @kernel(inline="source")
 def about_mass(p, c, s, load):
-    """Return the angular acceleration due to the moment, about the centre of mass, of a load at the cavity's centre.
+    """Return the head's angular acceleration due to a load that acts at the cavity's centre.
 
-    Gravity is part of the load, but it acts at the centre of mass, so its contribution is removed.
+    It follows from the moment of the load about the centre of mass. Gravity is part of the load, but acts at the centre
+    of mass, so its contribution is removed.
     """
     across = (c * p.offset[0] - s * p.offset[1]) * (load[1] + p.gravity)
     return -(across - (s * p.offset[0] + c * p.offset[1]) * load[0]) * p.inverse_inertia / p.inverse_mass

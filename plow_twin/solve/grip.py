@@ -146,9 +146,9 @@ def weigh_grips(p, state, w) -> None:
 
 @kernel(fast=True, inline="code")
 def grip_terms(p, state, w, k, place, rate):
-    """Return order k of the series of the tangential forces T of the eight pairs.
+    """Return coefficient k of the series of the tangential forces T of the eight pairs.
 
-    `place` and `rate` are order k of the corners' positions and slip rates. `w.force` contains the normal forces.
+    `place` and `rate` are coefficient k of the corners' positions and slip rates. `w.force` contains the normal forces.
     """
     if k == 0:
         place = place - row(state.anchor, 0)

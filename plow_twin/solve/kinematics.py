@@ -115,7 +115,7 @@ def rolled(p, values, angle):
 
 @kernel(fast=True, inline="code")
 def slip_arms(p, arms, k):
-    """Return order k of the series of all friction arms, given order k for sharp corners. Only order 0 differs."""
+    """Return coefficient k of the series of all friction arms. For sharp corners, the result is `arms`."""
     if _is_rounded(p) is not None and k == 0:
         arms = arms - splat(_roll(p))
     return arms

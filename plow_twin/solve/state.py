@@ -250,8 +250,9 @@ _GRIP_FIELDS: Final[list[tuple[Any, ...]]] = [
 #: present, `State.y` is relative to the frame.
 _FRAME_FIELDS: Final[list[tuple[Any, ...]]] = [("frame", "f8", (6,))]
 
-#: Scratch space, mainly for the series of one step. Each row is one order of a series. The eight columns are components
-#: of the state, or pairs. Arrays of eight columns come first, so that each of their rows fills a cache line.
+#: Scratch space, mainly for the series of one step. Each row contains the coefficients of one order. The eight columns
+#: are components of the state, or pairs. Arrays of eight columns come first, so that each of their rows fills a cache
+#: line.
 WORK: Final = np.dtype(
     [
         ("series", "f8", _WIDE),  # state

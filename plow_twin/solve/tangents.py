@@ -94,7 +94,7 @@ _OK, _RANGE, _NON_FINITE, _BUDGET = (
 
 @kernel(fast=True)
 def _product(a, b, k):
-    """Return order k of the products of the series in a and b, column by column."""
+    """Return coefficient k of the products of the series in a and b, column by column."""
     low, high = splat(0.0), splat(0.0)
     for j in range(k // 2 + 1):
         low = low + row(a, j) * row(b, k - j)
@@ -191,7 +191,7 @@ def _expand_waves(omegas, amplitudes, state, w, columns, order) -> None:
 
 @kernel()
 def _times(factor, pair, series, k):
-    """Return order k of the products of the eight `series` with column `pair` of `factor`."""
+    """Return coefficient k of the products of the eight `series` with column `pair` of `factor`."""
     value = exact_splat(0.0)
     for j in range(k + 1):
         value = fused(exact_splat(factor[j, pair]), exact_row(series, k - j), value)
@@ -200,7 +200,7 @@ def _times(factor, pair, series, k):
 
 @kernel()
 def _change_force(p, state, w, along, columns, pair, k, moved, moved_rate, viscous, hysteretic, curved):
-    """Write and return order k of the change of a pair's force. `moved` is n . xi, and `moved_rate` is its rate."""
+    """Write and return coefficient k of the change of a pair's force. `moved` is n . xi with the rate `moved_rate`."""
     depth, rate, force, series = columns.depth[pair], columns.rate[pair], columns.force[pair], columns.series
     changed, changed_rate, by_angle = exact_splat(0.0), exact_splat(0.0), exact_splat(0.0)
     for j in range(k + 1):

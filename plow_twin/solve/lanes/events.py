@@ -32,7 +32,7 @@ from plow_twin.solve.state import CLIPPED, COS, OFF, ON, RELEASED, SIN, X, Y
 #: Largest difference of the times of two simultaneous events, divided by the size of the step that ends with them.
 _AT_ONCE = 1e-12
 #: Conditions for the end of a search for a root. `_FOUND`: relative change of the root; the next change would be of the
-#: order of its cube. `_STRAIGHT`: effect of the curvature on the change. `_ROUNDED`: relative change at rounding level.
+#: order of its cube. `_STRAIGHT`: effect of the curvature on the change. `_ROUNDED`: relative change due to rounding.
 _FOUND, _STRAIGHT, _ROUNDED = 1e-6, 1e-3, 2e-16
 _MOST_CHANGES = 80
 #: Factor for rounding. If the step has been shortened since the search for a root began, a root that exceeds the step
@@ -49,7 +49,7 @@ def _list_guards(lanes, order, hysteretic, power, fraction) -> None:
     The guard functions depend on the mode and on the penetration d:
 
     - OFF: -d.
-    - ON: F / K = d + (C / K) d'. With the damping lambda d', d and 1 + lambda d'.
+    - ON: F / K = d + (C / K) d'. For the damping lambda d', there are two functions: d and 1 + lambda d'.
     - CLIPPED: d, and the force with the opposite sign.
     - RELEASED (`modes`): d, and the distance to the release penetration.
     """

@@ -43,7 +43,7 @@ def _gather_harmonic(harmonics, extent, lanes, i) -> None:
 
 @kernel()
 def _add_wave(load, k, lanes, first, sine, cosine) -> None:
-    """Add order k of a harmonic load to `load`. Rows `first` and `first` + 1 of `lanes.harmonic` are its amplitudes."""
+    """Add coefficient k of a harmonic load to `load`. The row `first` of `lanes.harmonic` is its first amplitude."""
     wave = fused(exact_row(lanes.harmonic, first), sine, exact_row(load, k))
     set_row(load, k, fused(exact_row(lanes.harmonic, first + 1), cosine, wave))
 
@@ -293,14 +293,14 @@ def _set_state(series, k, x, y, vx, vy, om, c, s, angle) -> None:
 
 @kernel(inline="code")
 def _add_ends(load, k, c0, s0, c, s, share, wc, ws):
-    """Return order k of a load times cosine and sine, after adding the products with the first and the newest order."""
+    """Return coefficient k of a load times cosine and sine: `wc` and `ws` with the first and the last product added."""
     first, newest = exact_row(load, 0) * share, exact_row(load, k)
     return fused(newest, c0, fused(first, c, wc)), fused(newest, s0, fused(first, s, ws))
 
 
 @kernel()
 def _start(lanes, viscous, c, s, x, y, dc, ds, dx, dy):
-    """Return order 0 of the contacts' forces along X and Y, and of their factors of cosine and sine in the moment.
+    """Return coefficient 0 of the forces along X and Y, and of the factors of cosine and sine in the contacts' moment.
 
     Forces and factors are computed from the same penetrations as the guard functions. The summed maps
     (`record._weigh_lanes`) have different rounding, so the force would begin 1e-17 m away from the event.
@@ -331,7 +331,7 @@ def _add_force(lanes, gear, push, fx, fy, gc, gs):
 
 @kernel(inline="code")
 def _push(lanes, w, k, acts, c, s, x, y, dc, ds, dx, dy):
-    """Return order k of the forces along X and Y, and of the factors of cosine and sine in the contacts' moment.
+    """Return coefficient k of the forces along X and Y, and of the factors of cosine and sine in the contacts' moment.
 
     Forces and factors are sums over the slots for F = K d (1 + lambda d'). The next order of the penetrations and order
     k of F / K are written to `lanes`.
@@ -397,7 +397,7 @@ def _push_by_power(lanes, w, k, acts, hysteretic, fraction, c, s, x, y, dc, ds, 
 
 @kernel(inline="code")
 def _multiply(lanes, slot, k, hysteretic):
-    """Return order k of d^n, and order k of d^n d' without the product that contains order k of d^n.
+    """Return coefficient k of d^n, and coefficient k of d^n d' without the product that contains coefficient k of d^n.
 
     The exponents are integers from 2 to 4, and may differ between lanes.
     """
@@ -500,7 +500,7 @@ def _first_power(lanes, value):
 
 @kernel(inline="code")
 def _force(row, viscous, c, s, z, dc, ds, dz):
-    """Return order k > 0 of a contact force along X or Y."""
+    """Return coefficient k > 0 of a contact force along X or Y."""
     force = fused(exact_row(row, 2), z, fused(exact_row(row, 0), c, exact_row(row, 1) * s))
     if viscous is not None:
         rates = fused(exact_row(row, 3), dc, fused(exact_row(row, 4), ds, exact_row(row, 5) * dz))
@@ -510,7 +510,7 @@ def _force(row, viscous, c, s, z, dc, ds, dz):
 
 @kernel(inline="code")
 def _lever(row, viscous, c, s, x, y, dc, ds, dx, dy):
-    """Return order k > 0 of the factor of cosine or sine in the contacts' moment."""
+    """Return coefficient k > 0 of the factor of cosine or sine in the contacts' moment."""
     lever = fused(exact_row(row, 0), c, exact_row(row, 1) * s)
     lever = lever + fused(exact_row(row, 2), x, exact_row(row, 3) * y)
     if viscous is not None:

@@ -6,7 +6,8 @@ With the state in body coordinates (`model.geometry`) the equations of motion (p
     Y'  = VY - omega X            VY' = -omega VX - s (Fx/m) + c (Fy/m) + sum n_y F/m
     c'  = -omega s    s' = omega c    theta' = omega    omega' = M/I + sum arm F/I
 
-so each order of the series follows from the lower orders by Cauchy products (Jorba and Zou, Exp. Math. 14 (2005) 99).
+so each coefficient of the series follows from the coefficients of lower order by Cauchy products (Jorba and Zou, Exp.
+Math. 14 (2005) 99).
 
 The series variable is sigma. The time since the start of the step is t = alpha sigma + beta sigma^2 / 2. For (alpha,
 beta) = (1, 0), sigma is the time. For (0, 2), sigma is the square root of the time, in which a contact force with the
@@ -77,7 +78,7 @@ def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:
 
 @kernel(fast=True)
 def _multiply_older(a, b, k):
-    """Return order k of the products of the columns of a and b, without the terms that contain row k of a or b.
+    """Return coefficient k of the products of the columns of a and b, without the terms that contain row k of a or b.
 
     The rows with the highest orders are added last, so the processor can start the sum before they are available.
     """
@@ -94,7 +95,7 @@ def _multiply_older(a, b, k):
 
 @kernel(fast=True)
 def _join(a, b, k, a_k, b_k):
-    """Return order k of the products of the columns of a and b, whose rows k are a_k and b_k.
+    """Return coefficient k of the products of the columns of a and b, whose rows k are a_k and b_k.
 
     The rows k are passed as values, because reading them from memory would wait until they are stored.
     """
@@ -105,13 +106,13 @@ def _join(a, b, k, a_k, b_k):
 
 @kernel(fast=True)
 def _multiply(a, b, k):
-    """Return order k of the products of the columns of a and b."""
+    """Return coefficient k of the products of the columns of a and b."""
     return _join(a, b, k, row(a, k), row(b, k))
 
 
 @kernel(fast=True, inline="code")
 def _raise(w, k, penetration, touching, exponent):
-    """Write order k of penetration^exponent of the acting pairs to `w.power[0]`, and return it.
+    """Write coefficient k of penetration^exponent of the acting pairs to `w.power[0]`, and return it.
 
     For acting pairs, row BASE of `w.per_pair` is 1 / d, or half the square root of 1 / d for the exponent 1.5. For
     other pairs it is zero.
@@ -143,7 +144,7 @@ def _raise(w, k, penetration, touching, exponent):
 
 @kernel(fast=True, inline="code")
 def _damp(p, elastic, w, k, elastic_k, rate, viscous, hysteretic, ramp):
-    """Return order k of K d^n (1 + lambda d') or of K d^n + C psi d', where psi is the active share of C."""
+    """Return coefficient k of K d^n (1 + lambda d') or of K d^n + C psi d', where psi is the active share of C."""
     force = row(w.per_pair, ACTS) * elastic_k
     if ramp is not None:
         _ramp(p, w, k)
@@ -156,7 +157,7 @@ def _damp(p, elastic, w, k, elastic_k, rate, viscous, hysteretic, ramp):
 
 @kernel(fast=True, inline="code")
 def _ramp(p, w, k) -> None:
-    """Write order k of the active share of C to `w.ramp[2]`. The share is constant beyond the ramp."""
+    """Write coefficient k of the active share of C to `w.ramp[2]`. The share is constant beyond the ramp."""
     set_row(w.ramp[0], k, _multiply(w.penetration, w.penetration, k))
     set_row(w.ramp[1], k, _multiply(w.ramp[0], w.penetration, k))
     within = row(w.per_pair, RAMPS)
@@ -168,7 +169,7 @@ def _ramp(p, w, k) -> None:
 
 @kernel(fast=True, inline="code")
 def _push(p, state, w, k, penetration, rate, viscous, hysteretic, integer, fraction, ramp):
-    """Return order k of the eight contact forces (`model.contact`), zero for pairs that do not act.
+    """Return coefficient k of the eight contact forces (`model.contact`), zero for pairs that do not act.
 
     For acting pairs, row ACTS of `w.per_pair` is K, and row DAMPS is C or K lambda. For other pairs, both rows are
     zero.
@@ -188,7 +189,7 @@ def _push(p, state, w, k, penetration, rate, viscous, hysteretic, integer, fract
 
 @kernel(fast=True)
 def _hold(p, w, k, fx, fy):
-    """Return order k of the force per mass in head axes, without its component along a locked world axis."""
+    """Return coefficient k of the force per mass in head axes, without its component along a locked world axis."""
     if fixed_axes(p) is not None:
         return p.free[0] * fx, p.free[1] * fy
     w.world[0, k], w.world[1, k] = fx, fy
@@ -207,10 +208,10 @@ def _hold(p, w, k, fx, fy):
 
 @kernel(fast=True)
 def _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, second, segments):
-    """Return order k of the load per mass in head axes, and of its moment per inertia.
+    """Return coefficient k of the load per mass in head axes, and of its moment per inertia.
 
-    c and s are order k of cosine and sine, c1 and s1 order k - 1, c2 and s2 order k - 2. `product` contains order k of
-    S1 c and S1 s.
+    c and s are coefficient k of cosine and sine, c1 and s1 coefficient k - 1, c2 and s2 coefficient k - 2. `product`
+    contains coefficient k of S1 c and S1 s.
     """
     if fixed_axes(p) is not None:
         return _loads_along_world(p, w, k, alpha, beta, harmonics, second, segments)
@@ -242,7 +243,7 @@ def _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, secon
 
 @kernel(fast=True)
 def _loads_along_world(p, w, k, alpha, beta, harmonics, second, segments):
-    """Return order k of the load per mass in world axes, and of its moment per inertia."""
+    """Return coefficient k of the load per mass in world axes, and of its moment per inertia."""
     load, start, slope = w.load, w.wrench[0], w.wrench[1]
     held, rising = 1.0 if k == 0 else 0.0, 0.0
     if segments is not None:
@@ -269,7 +270,7 @@ def _applied(p, along_x, along_y, torque):
 
 @kernel(fast=True)
 def _drag(p, w, k, c, s, x, y, om, dc, ds, dx, dy):
-    """Return order k of the accelerations by regularised friction (`_applied`, `model.friction`).
+    """Return coefficient k of the accelerations by regularised friction (`_applied`, `model.friction`).
 
     Let s' be the slip rate, v_s the regularisation speed, r = s' / v_s and tau = tanh(r). Then k tau_k = sum_j j r_j (1
     - tau^2)_{k-j}.
@@ -298,7 +299,7 @@ def _drag(p, w, k, c, s, x, y, om, dc, ds, dx, dy):
 
 @kernel(fast=True)
 def _hold_on(p, state, w, k, c, s, x, y, theta, om, dc, ds, dx, dy):
-    """Return order k of the accelerations by friction with stick (`_applied`, `solve.grip`)."""
+    """Return coefficient k of the accelerations by friction with stick (`_applied`, `solve.grip`)."""
     drag, arm = w.slip[4], w.slip[5]
     rate = rolled(p, row_values(p.slip_rows, dc, ds, dx, dy), om)
     set_row(w.slip[0], k, rate)
@@ -312,7 +313,7 @@ def _hold_on(p, state, w, k, c, s, x, y, theta, om, dc, ds, dx, dy):
 
 @kernel(fast=True)
 def _slide(p, w, k, om, dc, ds, dx, dy) -> None:
-    """Write order k of force times sliding distance per travel to `w.rub[2]`.
+    """Write coefficient k of force times sliding distance per travel to `w.rub[2]`.
 
     The sliding distance of a corner per travel is the root r of q = 1 + (s' / v)^2, with 2 r_0 r_k = q_k -
     sum_{j=1}^{k-1} r_j r_{k-j}.
@@ -334,7 +335,7 @@ def _slide(p, w, k, om, dc, ds, dx, dy) -> None:
 
 @kernel(fast=True)
 def _run_in(p, state, w, rubbed, k) -> None:
-    """Write order k of the product of `rubbed` and the factor of running-in, 1 + a e, to `w.rub[5]`.
+    """Write coefficient k of the product of `rubbed` and the factor of running-in, 1 + a e, to `w.rub[5]`.
 
     With the wear depth h, e = exp(-h / h0) satisfies k e_k = -(1 / h0) sum_j j h_j e_{k-j}.
     """
@@ -351,7 +352,7 @@ def _run_in(p, state, w, rubbed, k) -> None:
 
 @kernel(fast=True)
 def _grow(p, w, rubbed, k, alpha, beta) -> None:
-    """Write order k + 1 of the increase of each pad's wear depth, dh/dt = k_s F v / A (Archard).
+    """Write coefficient k + 1 of the increase of each pad's wear depth, dh/dt = k_s F v / A (Archard).
 
     `rubbed` is the series of F, or the series of F times the factors of sliding and running-in.
     """
@@ -379,7 +380,7 @@ def _wear(p, state, w, k, alpha, beta, om, dc, ds, dx, dy, sliding, running_in) 
 
 @kernel(fast=True, inline="code")
 def _slide_size(p, w, k, sliding, running_in):
-    """Return the size of order k - 1 of the sliding speed of the pads that carry force. Order k is still unknown."""
+    """Return the size of coefficient k - 1 of the sliding speed of loaded pads. Coefficient k is still unknown."""
     size = 0.0
     if sliding is not None:
         for pair in range(PAIR_COUNT):
@@ -398,7 +399,7 @@ def one_by_one(terms):
 
 @kernel(fast=True)
 def _turn_frame(w, k, there, c, s):
-    """Return order k of the frame's displacement and velocity in head axes, in four lanes."""
+    """Return coefficient k of the frame's displacement and velocity in head axes, in four lanes."""
     u, v, wx, wy = lane(there, FRAME_X), lane(there, FRAME_Y), lane(there, FRAME_VX), lane(there, FRAME_VY)
     left, right = pack(c, s, c, s, c, s, c, s), pack(u, v, v, -u, wx, wy, wy, -wx)
     set_row(w.frame_left[0], k, left)
@@ -410,7 +411,7 @@ def _turn_frame(w, k, there, c, s):
 
 @kernel(fast=True)
 def _seen_rates(w, k, there, turned, om, turning):
-    """Return order k of the rates of the head's cosine, sine and position relative to the frame.
+    """Return coefficient k of the rates of the head's cosine, sine and position relative to the frame.
 
     `turned` is the result of `_turn_frame`: R^T u and R^T w with the frame's displacement u and velocity w. R rotates
     from head axes to world axes. The rate of R^T u is R^T w plus omega times R^T u, rotated by -90 degrees.
@@ -429,7 +430,7 @@ def _seen_rates(w, k, there, turned, om, turning):
 
 @kernel(fast=True)
 def _push_frame(p, w, k, there, c, s, x, y, dc, ds, pushed):
-    """Return order k of the frame's rates under its springs, its dampers and the reactions of the contacts.
+    """Return coefficient k of the frame's rates under its springs, its dampers and the reactions of the contacts.
 
     `pushed` contains the head's accelerations by the pairs (`_applied`). The moment of the forces about the frame's
     centre is their moment about the head's centre of mass, plus the cross product of the head's position (x, y) and the
