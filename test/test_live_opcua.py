@@ -34,7 +34,7 @@ from plow_twin.record.replay import replay
 from plow_twin.record.sources import Arrived
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
-from plow_twin.stream.journal import Hold, Sample
+from plow_twin.stream.journal import Entry, Hold, Sample
 from plow_twin.stream.session import Session
 
 MAP = "excitation: {fx: {node: 'ns=2;s=Load.Fx', unit: kN}, fy: {node: ns=2;s=Load.Fy}, m: {node: ns=2;s=Load.M}}\n"
@@ -252,6 +252,21 @@ def test_the_server_s_grants_are_compared_with_the_requests() -> None:
     assert "keeps 1 values, 100 come" in Revised(100.0, 1.0, 1).complaint(1.0)
 
 
+def _without_undone_holds(entries: list[Entry]) -> list[Sample | Hold]:
+    """Return samples and holds, without the holds that the session undoes because the next sample is late.
+
+    On a busy machine, the hold policy may act for a few milliseconds between two samples. Such a hold is not undone.
+    """
+    found: list[Sample | Hold] = []
+    for entry in entries:
+        if isinstance(entry, Sample | Hold):
+            if isinstance(entry, Sample) and found and found[-1].stamp_ns >= entry.stamp_ns:
+                while isinstance(found[-1], Hold):
+                    found.pop()
+            found.append(entry)
+    return found
+
+
 def test_a_minute_without_a_connection_is_filled_and_ends_in_the_digest_of_the_uninterrupted_run(
     server: Plant, tmp_path: Path
 ) -> None:
@@ -277,16 +292,18 @@ def test_a_minute_without_a_connection_is_filled_and_ends_in_the_digest_of_the_u
         assert float(live.heard["source"]["values"]["unfilled_s"]) == 0.0
         assert live.stop() == 0
     entries = [record.entry for record in RunReader(run) if isinstance(record, EntryRecord)]
-    last = max(index for index, entry in enumerate(entries) if isinstance(entry, Sample))
     interrupted, whole = (
         Session(Twin(load_scene("paper"), excitation="sampled"), rollback_span_s=2.0) for _ in range(2)
     )
-    for entry in entries[: last + 1]:
+    ends = 1 + max(index for index, entry in enumerate(entries) if isinstance(entry, Sample))
+    for entry in entries[:ends]:
         interrupted.apply(entry)
-    samples = sorted((entry for entry in entries if isinstance(entry, Sample)), key=lambda entry: entry.stamp_ns)
-    assert any(isinstance(entry, Hold) for entry in entries[:last]) and len(samples) == 6200
-    for part in whole.parts(samples):
-        whole.apply_samples(part)
+    lasting = _without_undone_holds(entries[:ends])
+    assert sum(isinstance(entry, Sample) for entry in lasting) == 6200
+    last_before = next(place for place, entry in enumerate(lasting) if entry.stamp_ns == start_ns + 199 * step_ns)
+    assert isinstance(lasting[last_before + 1], Sample)  # the holds of the break are undone
+    for entry in lasting:
+        whole.apply(entry)
     assert interrupted.twin.digest() == whole.twin.digest()
     assert replay(run).exit_code == 0
 

@@ -321,12 +321,18 @@ def _mixed(folder: Path, seed: int, **more: Any) -> None:
     assert report.first_divergence is None, (seed, report.divergences, report.first_divergence)
     assert report.exit_code == 0 and report.compared["alarms"] == len(live.front.alarms)
     assert report.compared["contact_forces"] == len(live.front.frames)
+    digests = replay(live.recording.recorder.path, digests_only=True)
+    assert digests.first_divergence is None and digests.compared["digest"] == report.compared["digest"]
     assert not any(frame.rows["force"].max() > 1e12 for frame in live.front.frames)
 
 
 @pytest.mark.parametrize("seed", [*range(20), 2002])  # with seed 2002, a step ends just after a sample
 def test_a_replay_gives_the_messages_of_any_mix(seed: int, tmp_path: Path) -> None:
     _mixed(tmp_path, seed)
+
+
+def test_a_replay_gives_the_messages_of_a_mix_with_a_bound_on_evaluations(tmp_path: Path) -> None:
+    _mixed(tmp_path, 1280, max_evaluations=60)
 
 
 @pytest.mark.stress

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import Phase, given, settings
+from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 
 from plow_twin.model.scene import Wear
@@ -18,7 +18,7 @@ from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.driver import Arrival, Driver, Policy, StreamState, counters
 from plow_twin.stream.intake import NS_PER_S, Intake
-from plow_twin.stream.journal import Digest, Entry, SetWear, Snapshot
+from plow_twin.stream.journal import Digest, Entry, Hold, Sample, SetWear, Snapshot, Travel
 from plow_twin.stream.limits import excitation_limits
 from plow_twin.stream.outputs import Published
 from plow_twin.stream.session import Session
@@ -94,9 +94,9 @@ def test_any_order_and_any_batches_end_in_the_bits_of_the_samples_in_order(
     ordered, live = Live(), Live(every_sample=every_sample)
     ordered.send(*(_arrival(index) for index in range(160)))
     arriving = [0, *sorted(range(1, 160), key=lambda index: (index + delays[index], index))]
-    travels = {20: 1.0, 90: 3.0}
+    travels = {20: 1.0, 55: 2.5, 90: 3.0}
     for index, speed in travels.items():
-        ordered.driver.travel(T0 + index * MS, speed)
+        ordered.driver.travel(T0 + index * MS + MS // 3, speed)
     begin, number = 0, 0
     while begin < 160:
         size = sizes[number % len(sizes)]
@@ -105,7 +105,7 @@ def test_any_order_and_any_batches_end_in_the_bits_of_the_samples_in_order(
         live.silence(begin * MS + 900 * MS * (number % 3 == 0))
         if number == 0:
             for index, speed in travels.items():
-                live.driver.travel(T0 + index * MS, speed)
+                live.driver.travel(T0 + index * MS + MS // 3, speed)
         begin, number = begin + size, number + 1
     live.send(_arrival(160))
     ordered.send(_arrival(160))
@@ -120,6 +120,53 @@ def test_any_order_and_any_batches_end_in_the_bits_of_the_samples_in_order(
     again = _replayed(live.journal)
     assert (again.stamp_ns, again.twin.digest()) == live.motion
     assert again.snapshot().data[: 8 * 5] == live.driver.session.snapshot().data[: 8 * 5]
+
+
+@settings(max_examples=25, phases=(Phase.explicit, Phase.generate))
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(("sample", "hold", "late", "travel")), st.integers(1, 12), st.booleans()),
+        min_size=10, max_size=40,
+    )
+)  # fmt: skip
+@example([*[("sample", 10, False)] * 10, *[("hold", 2, False), ("hold", 13, False), ("late", 5, False)],
+          *[("hold", 1, False), ("sample", 4, False), ("hold", 5, False), ("late", 2, False)]])  # fmt: skip
+def test_the_motion_after_holds_and_late_samples_does_not_depend_on_the_publications(
+    steps: list[tuple[str, int, bool]],
+) -> None:
+    never, often = (Session(Twin(SCENE, excitation="sampled"), rollback_span_s=SPAN_S) for _ in range(2))
+    used: set[int] = set()
+    for kind, step_ms, publishes in [("sample", 1, False), *steps]:
+        reached_ms = 0 if never.stamp_ns is None else (never.stamp_ns - T0) // MS
+        stamp_ms = reached_ms - step_ms if kind == "late" else reached_ms + step_ms
+        if kind in ("sample", "late") and (stamp_ms < 1 or stamp_ms in used):
+            continue
+        stamp_ns, wrench = _arrival(stamp_ms)
+        oldest_ns = never.history.oldest_ns
+        if oldest_ns is not None and stamp_ns <= oldest_ns:
+            continue
+        # holds and speeds have stamps between those of two samples
+        between: dict[str, Entry] = {"hold": Hold(stamp_ns + MS // 2), "travel": Travel(stamp_ns + MS // 4, step_ms)}
+        entry = between.get(kind, Sample(stamp_ns, wrench))
+        if isinstance(entry, Sample):
+            used.add(stamp_ms)
+        for session in (never, often):
+            session.apply(entry)
+        if publishes:
+            often.outputs.pop()
+    assert (often.stamp_ns, often.twin.digest()) == (never.stamp_ns, never.twin.digest())
+    assert (often.wear_depth == never.wear_depth).all()
+
+
+def test_the_load_at_the_stamp_of_a_speed_is_computed_again_from_a_late_sample() -> None:
+    live, ordered = Live(), Live()
+    for model in (live, ordered):
+        model.send(*(_arrival(index) for index in range(21)))
+        model.driver.travel(T0 + 25 * MS, 1.0)
+    live.send(_arrival(30))
+    live.send(_arrival(27))
+    ordered.send(_arrival(27), _arrival(30))
+    assert live.motion == ordered.motion
 
 
 def test_a_lasting_rise_of_the_delay_does_not_stop_the_twin() -> None:

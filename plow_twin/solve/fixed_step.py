@@ -37,7 +37,8 @@ def _switch(p, state, penetration, rate, time, totals, log) -> None:
             continue
         if mode == ON:
             touch(p, state, pair)
-            totals.makes[pair] += 1
+            if totals is not None:
+                totals.makes[pair] += 1
         if log is not None:
             log_event(log, totals, time, pair, state.mode[pair], mode, rate[pair])
         state.mode[pair] = mode
@@ -115,7 +116,8 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
             if (before[pair] > 0.0) != (now[pair] > 0.0):
                 doubt = 0.5 * dt * (before[pair] + now[pair]) * p.inverse_mass
                 bound.error += doubt * p.position_tolerance / p.velocity_tolerance
-        _add_to_totals(before, now, dt, totals)
+        if totals is not None:
+            _add_to_totals(before, now, dt, totals)
         if not within_range(p, state, y):
             return _RANGE
     state.step_start = state.time = target

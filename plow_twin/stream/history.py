@@ -39,6 +39,8 @@ class History:
         self._samples: list[Sample] = []
         self._stamps_ns: list[int] = []
         self._travels: list[Travel] = []
+        #: stamps of the first samples after a held load
+        self._resumed_ns: list[int] = []
         #: applied samples as arrays, which `_make_samples` converts to `Sample` objects when they are needed
         self._later: deque[tuple[NDArray[np.int64], NDArray[np.float64]]] = deque()
         self._due = True
@@ -73,7 +75,10 @@ class History:
 
     def clear(self) -> None:
         """Drop everything."""
-        for part in (self._snapshots, self._kept_ns, self._samples, self._stamps_ns, self._travels):
+        for part in (
+            *(self._snapshots, self._kept_ns, self._samples),
+            *(self._stamps_ns, self._travels, self._resumed_ns),
+        ):
             part.clear()
         self._later.clear()
         self._newest_kept_ns, self._due = None, True
@@ -155,6 +160,20 @@ class History:
         if kept and not (self._kept_ns and stamp_ns <= self._kept_ns[-1]):
             self._keep(np.array([stamp_ns]))
 
+    def add_resumed(self, stamp_ns: int) -> None:
+        """Note the stamp of the first sample after a held load."""
+        if self._span_ns:
+            self._resumed_ns = [*(found for found in self._resumed_ns if found > self._kept_ns[0]), stamp_ns]
+
+    def correction_limit_ns(self, stamp_ns: int) -> int:
+        """Return the stamp [ns] before which no correction may begin that inserts a sample at `stamp_ns`.
+
+        The samples that `rewind` returns do not contain the hold before a sample, so a correction that began before the
+        hold would lose it.
+        """
+        place = bisect_left(self._resumed_ns, stamp_ns)
+        return max(self._resumed_ns[place - 1] if place else 0, self.oldest_ns or 0)
+
     def rewind(self, stamp_ns: int) -> tuple[bytes, list[Sample], list[Travel]]:
         """Go back to the last snapshot before `stamp_ns`; return the snapshot, and the samples and speeds dropped after
         it.
@@ -162,8 +181,8 @@ class History:
         self._make_samples()
         while self._snapshots[-1][0] >= stamp_ns:
             self._snapshots.pop()
-        while self._kept_ns[-1] >= stamp_ns:
-            self._kept_ns.pop()
+        for stamps_ns in (self._kept_ns, self._resumed_ns):
+            del stamps_ns[bisect_left(stamps_ns, stamp_ns) :]
         reached_ns, data = self._snapshots[-1]
         kept = bisect_right(self._stamps_ns, reached_ns)
         samples, travels = self._samples[kept:], [item for item in self._travels if item.stamp_ns >= reached_ns]

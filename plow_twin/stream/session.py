@@ -444,8 +444,7 @@ class Session:
                 continue
             if travel is not None:
                 end = int(np.searchsorted(stamps, travel.stamp_ns, side="right"))
-            # a snapshot follows the first sample after a held load, so that the session never goes back to the held
-            # load
+            # a snapshot follows the first sample after a held load, because corrections of later motion begin there
             if resumed:
                 end = begin + 1
             here = slice(begin, end)
@@ -455,6 +454,7 @@ class Session:
             parts.append(self._advance(stamps[here], wrench[here], out, chosen, here_after, resumed=resumed))
             if resumed:
                 self._remember()
+                self.history.add_resumed(int(stamps[begin]))
             begin, resumed = end, False
         published = Published.joined([part.published for part in parts])
         digests = [digest for part in parts for digest in part.digests]
@@ -525,7 +525,8 @@ class Session:
             If an advance fails and the snapshot `undo` is given, from which the twin has been restored.
         """
         origin_ns = self._begin(int(stamps[0])) if self.origin_ns is None else self.origin_ns
-        if self.history.is_due and not resumed:
+        # no state is saved at the stamp of a speed, because a late sample may change the load there
+        if self.history.is_due and not resumed and self.stamp_ns in (None, self.history.newest_sample_ns):
             before_ns = int(stamps[0]) - 1 if self.stamp_ns is None else self.stamp_ns
             self.history.add_snapshot(before_ns, self.snapshot().data, kept=False)
         if self.following is not None:
@@ -593,7 +594,7 @@ class Session:
 
         The next publication covers the motion from the earliest late stamp since the previous publication.
         """
-        corrected_ns = self.outputs.correct(stamp_ns, self.history.oldest_ns or 0)
+        corrected_ns = self.outputs.correct(stamp_ns, self.history.correction_limit_ns(stamp_ns))
         again = self._rewind(corrected_ns, *travels)
         known = [sample for sample in again if sample.stamp_ns < corrected_ns]
         if known:
