@@ -1,1 +1,1 @@
-"""The live twin apart from ROS: session, recording, wear, alarms, diagnostics, and inputs without ROS."""
+"""The parts of the live twin that do not use ROS: session, recording, wear, alarms, diagnostics, and file inputs."""

@@ -1,6 +1,6 @@
-"""A local socket by which a twin that runs without ROS offers the services of the node.
+"""A local socket through which a twin without ROS offers the services of the node.
 
-A request and its answer are one datagram each, so that no client can hold up the twin.
+A request is a single datagram, and so is its answer. A slow client can therefore not block the twin.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from plow_twin.live.services import Services
 
 _LARGEST: Final = 65536
-#: Largest number of requests that a call of `Control.turn` answers.
+#: Largest number of requests that are answered in one call of `Control.turn`.
 _MOST: Final = 8
 _PATIENCE_S: Final = 5.0
-#: Period of the calls of `Control.turn` [s].
+#: Interval between the calls of `Control.turn` [s].
 TURN_S: Final = 0.1
 
 
@@ -30,10 +30,14 @@ class ControlError(PlowTwinError):
 
 
 class Control:
-    """Context manager of a twin's socket, to which only the twin's user may connect.
+    """Context manager that opens the socket of a twin. Only the user who runs the twin can connect to it.
 
-    `services` are those that clients can request, or None until the twin exists. A path that cannot be used raises
-    ControlError.
+    The attribute `services` must be set before clients can request a service.
+
+    Raises
+    ------
+    ControlError
+        The socket cannot be opened at the path.
     """
 
     def __init__(self, path: Path) -> None:
@@ -61,7 +65,7 @@ class Control:
         self._path.unlink(missing_ok=True)
 
     def turn(self) -> None:
-        """Answer the requests that have come."""
+        """Answer the requests that have arrived."""
         for _ in range(_MOST):
             try:
                 data, client = self._socket.recvfrom(_LARGEST)
@@ -71,7 +75,7 @@ class Control:
             try:
                 self._socket.sendto(json.dumps({"success": done, "message": message}).encode(), client or b"")
             except OSError:
-                continue  # the client has gone, or does not read
+                continue  # the client has ended or does not read its answer
 
     def _answer(self, data: bytes) -> tuple[bool, str]:
         try:
@@ -86,15 +90,25 @@ class Control:
 
 
 def call(path: Path, service: str, text: str | None = None) -> tuple[bool, str]:
-    """Request a service from the twin behind a socket; return whether it was done, and the answer.
+    """Request a service from a twin through its socket.
 
-    Raises ControlError if there is no socket, or nobody answers.
+    Returns
+    -------
+    success : bool
+        Whether the service succeeded.
+    message : str
+        Answer of the twin.
+
+    Raises
+    ------
+    ControlError
+        The socket does not exist, or no twin answers.
     """
     if not path.is_socket():
         kind = "a folder" if path.is_dir() else "a file" if path.exists() else "nothing there"
         raise ControlError(f"{path}: got {kind}, expected the socket that plow-twin live --control has opened")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
-        client.bind("")  # the system chooses a name outside the file system
+        client.bind("")  # the operating system assigns an address that is not a file
         client.settimeout(_PATIENCE_S)
         try:
             client.connect(str(path))

@@ -1,11 +1,12 @@
-"""A cutting load along the face: Gamma-distributed, correlated in space, drawn anew for each pass.
+"""Random cutting load along the face, with a Gamma distribution and a spatial correlation.
 
-The fluctuation depends on the pass and the place along the face, but not on the sampling rate or the speed.
+The random process is drawn anew for each pass. It is a function of the position along the face, so that it does not
+depend on the sampling rate or the speed. A Gaussian process with exponential correlation is transformed to the Gamma
+distribution by its quantiles, which is called a translation process.
 
 References
 ----------
-Grigoriu, M. (1995). Applied Non-Gaussian Processes. Prentice Hall. (Translation processes: a Gaussian process with
-exponential correlation, taken to another distribution by its quantiles.)
+Grigoriu, M. (1995). Applied Non-Gaussian Processes. Prentice Hall.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from plow_twin.scene_file.validation import Schema, validate
 
 Array = NDArray[np.float64]
 
-#: Grid points per correlation length; the linear interpolation between them loses 1 % of the field's variance.
+#: Number of grid points per correlation length. Linear interpolation between these points reduces the variance by 1 %.
 _POINTS: Final = 25
 
 
@@ -51,18 +52,21 @@ _SCHEMA: Final[Schema] = {
 
 @dataclass(frozen=True)
 class Face:
-    """The face, and the plough's motion along it: one way at `speed_m_s`, a turn of `turn_s`, and back."""
+    """The face, and the motion of the plough along it.
+
+    The plough travels along the face with the speed `speed_m_s` [m/s] and then returns. A reversal takes `turn_s` [s].
+    """
 
     length_m: float = 250.0
     speed_m_s: float = 2.0
     turn_s: float = 4.0
 
     def travel(self, t: Array) -> tuple[Array, Array, NDArray[np.int64]]:
-        """Return position [m], signed speed [m/s] and number of the pass at times `t` >= 0 (n,) [s].
+        """Return position [m], signed speed [m/s] and number of the pass at times `t` >= 0 [s], each of shape (n,).
 
-        In a turn the speed falls linearly to zero and rises in the other direction. The pass changes in its middle.
+        During a reversal, the speed changes linearly to the opposite speed. The next pass begins at the speed zero.
         """
-        # the head reaches the end of the face in the middle of a turn
+        # the head reaches the end of the face in the middle of a reversal
         steady = (self.length_m - 0.5 * self.speed_m_s * self.turn_s) / self.speed_m_s
         period = steady + self.turn_s
         number = np.floor(t / period).astype(np.int64)
@@ -83,20 +87,24 @@ class Face:
 
 @dataclass(frozen=True)
 class CuttingLoad:
-    """A fluctuating force into the face and a lateral force with mean zero, at one point of the head.
+    """Fluctuating cutting force into the face and lateral force with mean zero, which act at one point of the head.
 
     Parameters
     ----------
+    face : Face
+        The face and the motion along it.
     force_n : float
-        Mean cutting force along x [N]; its sign gives the direction.
+        Mean cutting force along x [N]. A negative force acts against the x direction.
     lateral_n : float
-        Standard deviation of the lateral force along y [N], normally distributed.
+        Standard deviation of the normally distributed lateral force along y [N].
     at_m : tuple of float
-        Point of action (x, y), measured from the cavity's centre [m]: M = x Fy - y Fx.
+        Point of action (x, y) from the centre of the cavity [m]. The moment is M = x Fy - y Fx.
     variation : float
         Coefficient of variation of the cutting force.
     correlation_m : float
-        Distance along the face at which the correlation has fallen to 1/e [m].
+        Distance along the face at which the correlation is 1/e [m].
+    seed : int
+        Seed of the random numbers.
     """
 
     face: Face
@@ -116,7 +124,10 @@ class CuttingLoad:
             raise ArgumentError(f"turn_s: got {face.turn_s!r}, expected less than two passes of {face.length_m:g} m")
 
     def at(self, t: Array) -> Array:
-        """Return Fx, Fy [N], M [N m] at times `t` (n,) [s], shape (n, 3), in proportion to the speed."""
+        """Return the load Fx, Fy [N], M [N m], shape (n, 3), at times `t` [s], shape (n,).
+
+        The load is proportional to the speed.
+        """
         position, speed, number = self.face.travel(t)
         force = np.zeros((len(t), 2))
         for one in np.unique(number):
@@ -128,7 +139,10 @@ class CuttingLoad:
         return np.column_stack([force, x * force[:, 1] - y * force[:, 0]])
 
     def _fields(self, number: int, position: Array) -> tuple[Array, Array]:
-        """Return cutting force over its mean, and lateral force over its deviation, in the pass `number`."""
+        """Return the normalized forces at positions [m] in the pass `number`.
+
+        The cutting force is divided by its mean, and the lateral force is divided by its standard deviation.
+        """
         step = self.correlation_m / _POINTS
         grid = np.arange(math.ceil(self.face.length_m / step) + 2) * step
         rho = math.exp(-1.0 / _POINTS)

@@ -1,4 +1,4 @@
-"""The `status` of a twin and the parts of its diagnostics, made from its counters."""
+"""Create the `status` message of a twin and the parts of `/diagnostics`."""
 
 from __future__ import annotations
 
@@ -15,152 +15,152 @@ if TYPE_CHECKING:
 
 OK, WARN, ERROR = 0, 1, 2
 
-#: Keys of each part of `/diagnostics` and their meanings.
+#: Keys of each part of `/diagnostics`, with their descriptions.
 KEYS: Final[dict[str, dict[str, str]]] = {
     "state": {
         "lifecycle": "unconfigured, inactive, active or finalized",
         "stream": "state of the stream",
-        "reason": "reason of a failed configure or of the last failed advance",
+        "reason": "reason of the last failure, which was in configure or in an advance",
         "scene": "scene in use",
-        "compile_s": "time of compiling or loading the solver [s]",
+        "compile_s": "time in which the solver was compiled or loaded [s]",
         "model_time_s": "model time since configure [s]",
         "real_time_factor": "model seconds per second",
         "real_time_factor_mean": "model seconds per second since the first advance",
         "solver_failures": "failed advances",
-        "coarse_advances": "advances cut short by max_evaluations",
+        "coarse_advances": "advances that were computed coarsely because of max_evaluations",
         "error_estimate_m": "largest estimated pose error of the coarse advances [m]",
         "resets": "resets of the model",
-        "wear_saved": "folder that keeps the wear",
+        "wear_saved": "folder in which the wear is saved",
         "wear_error": "reason why the wear could not be saved",
     },
     "input": {
         "source": "excitation source",
         "samples_in": "samples that arrived",
         "samples_used": "samples to which the model was advanced",
-        "rolled_back": "late samples among the samples used",
-        "newest_sample_age_s": "the node's time minus the stamp of the newest sample used [s]",
-        "samples_missing": "samples missing at expected_rate, by gaps in the stamps",
-        "samples_lost": "samples of the followed publisher that never arrived, by its numbering",
+        "rolled_back": "late samples among the used samples",
+        "newest_sample_age_s": "time since the stamp of the newest used sample [s]",
+        "samples_missing": "missing samples in gaps between stamps, computed with expected_rate",
+        "samples_lost": "samples of the followed publisher that never arrived, according to its message numbers",
         "samples_not_followed": "messages of publishers that are not followed",
         "queue_peak": "largest number of samples in the input queue",
         "queue_wait_ms": "longest wait in the input queue [ms]",
         "messages_lost": "messages of all inputs that never arrived",
-        "dropped_non_finite": "a number is not finite",
-        "dropped_unstamped": "the stamp is zero or negative",
-        "dropped_duplicate": "the stamp is that of another sample",
-        "dropped_out_of_order": "older than the newest sample by more than rollback_span",
-        "dropped_late": "older than every state that is kept",
-        "dropped_implausible": "beyond limit_force or another limit",
-        "dropped_unsteady": "the stamps have jumped too often",
-        "dropped_stray": "the stamp jumped, but the next stamp continued the stamps before the jump",
-        "dropped_malformed": "names do not match the loads of the scene",
-        "dropped_not_selected": "not the selected excitation source",
-        "dropped_inactive": "the node was not active",
-        "dropped_without_clock": "input_depth samples already waited for the first message on /clock",
-        "jumps_back": "stamps that stepped by more than the parameter jump_back or jump_forward",
-        "jumps_forward": "stamps that stepped by more than the parameter jump_back or jump_forward",
+        "dropped_non_finite": "samples with a number that is not finite",
+        "dropped_unstamped": "samples whose stamp is zero or negative",
+        "dropped_duplicate": "samples with the stamp of another sample",
+        "dropped_out_of_order": "samples older than the newest sample by more than rollback_span",
+        "dropped_late": "samples older than the oldest stored state",
+        "dropped_implausible": "samples beyond limit_force or another limit",
+        "dropped_unsteady": "samples dropped because the stamps had jumped too often",
+        "dropped_stray": "samples with a single jump of the stamp, after which the stamps continued as before",
+        "dropped_malformed": "messages that cannot be read, or whose names do not match the loads of the scene",
+        "dropped_not_selected": "samples on a topic that excitation_source does not select",
+        "dropped_inactive": "samples that arrived while the node was not active",
+        "dropped_without_clock": "samples that exceeded input_depth before the first message on /clock",
+        "jumps_back": "stamps that stepped back by more than jump_back",
+        "jumps_forward": "stamps that stepped forward by more than jump_forward",
         "out_of_plane": "samples used in spite of components outside the plane",
         "holds": "advances under the hold policy",
-        "silences": "silences longer than excitation_timeout and five times the previous interval, whether held or not",
-        "silent_s": "total length of the counted silences [s]",
+        "silences": "intervals without samples longer than excitation_timeout and five times the previous interval",
+        "silent_s": "total duration of the counted silences [s]",
         "travel_used": "messages used",
         "travel_dropped": "messages dropped",
-        "travel_misplaced": "speeds applied at the time reached, because their stamps are of another clock",
-        "travel_implausible": "dropped: beyond the limits of the input",
+        "travel_misplaced": "speeds that took effect immediately, because their stamps are from another clock",
+        "travel_implausible": "messages dropped because they exceed the limits of the input",
         "travel_not_followed": "messages of publishers that are not followed",
         "head_pose_used": "messages used",
         "head_pose_dropped": "messages dropped",
-        "head_pose_implausible": "dropped: beyond the limits of the input",
+        "head_pose_implausible": "messages dropped because they exceed the limits of the input",
         "head_pose_not_followed": "messages of publishers that are not followed",
         "gaps_used": "messages used",
         "gaps_dropped": "messages dropped",
-        "gaps_implausible": "dropped: beyond the limits of the input",
+        "gaps_implausible": "messages dropped because they exceed the limits of the input",
         "gaps_not_followed": "messages of publishers that are not followed",
-        "head_pose_residual": "model minus newest measured pose: x, y [m], theta [rad]",
-        "refused_publishers": "publishers that cannot connect because of type or quality of service",
+        "head_pose_residual": "pose of the model minus the last measured pose: x, y [m], theta [rad]",
+        "refused_publishers": "publishers with an incompatible type or quality of service",
     },
     "output": {
         "published": "messages on contact_forces",
-        "withheld": "messages withheld, because a number was not finite",
-        "held": "published messages computed without a sample",
-        "corrected": "published messages that correct earlier ones",
-        "latency_p50_ms": "time from the reception of a sample to its forces: median, 99 %, largest [ms]",
-        "latency_p99_ms": "time from the reception of a sample to its forces: median, 99 %, largest [ms]",
-        "latency_max_ms": "time from the reception of a sample to its forces: median, 99 %, largest [ms]",
-        "age_p50_ms": "system time minus stamp when published: median, 99 % [ms]; empty under use_sim_time",
-        "age_p99_ms": "system time minus stamp when published: median, 99 % [ms]; empty under use_sim_time",
-        "recent_latency_p99_ms": "the 99 % points since the last report [ms]",
-        "recent_age_p99_ms": "the 99 % points since the last report [ms]",
+        "withheld": "messages that were not sent, because a number was not finite",
+        "held": "published messages that were computed without a sample",
+        "corrected": "published messages that correct an earlier message",
+        "latency_p50_ms": "median time from the reception of a sample to its forces [ms]",
+        "latency_p99_ms": "99 % quantile of the time from the reception of a sample to its forces [ms]",
+        "latency_max_ms": "longest time from the reception of a sample to its forces [ms]",
+        "age_p50_ms": "median age of the stamp at publication by the system clock [ms]; empty under use_sim_time",
+        "age_p99_ms": "99 % quantile of the same age [ms]; empty under use_sim_time",
+        "recent_latency_p99_ms": "latency_p99_ms since the last report [ms]",
+        "recent_age_p99_ms": "age_p99_ms since the last report [ms]",
         "periods_missed": "missed periods of publish_rate or step_rate",
-        "period_mean_ms": "mean, standard deviation and largest value of the period [ms]",
-        "period_deviation_ms": "mean, standard deviation and largest value of the period [ms]",
-        "period_max_ms": "mean, standard deviation and largest value of the period [ms]",
+        "period_mean_ms": "mean period since the last report [ms]",
+        "period_deviation_ms": "standard deviation of the period since the last report [ms]",
+        "period_max_ms": "longest period since the last report [ms]",
     },
     "estimate": {
-        "ready": "1 once the estimator is compiled; until then data wait",
+        "ready": "1 if the estimator is compiled, otherwise 0",
         "estimates": "estimates since configure",
-        "skipped": "windows skipped for a newer one: the machine is too slow for estimate_interval",
-        "window_age_s": "the node's time minus the end of the newest window [s]",
-        "wall_s": "time that the newest estimate took [s]",
-        "reasons": "reasons why model or sensor is suspect",
+        "skipped": "windows skipped because a newer window was complete; the computer is then too slow",
+        "window_age_s": "time since the end of the last estimated window [s]",
+        "wall_s": "computing time of the last estimate [s]",
+        "reasons": "reasons why the model or the sensor is suspect",
         "error": "reason why the estimation has ended",
     },
     "follow": {
         "follow": "off, parameters or full",
-        "source": "source of the model's numbers: prior or estimate",
+        "source": "source of the parameters of the model: prior or estimate",
         "members": "twins that are advanced",
-        "members_lost": "twins that have left the model's range since the last pose",
-        "poses_used": "measured poses that have moved the twins",
-        "poses_outlying": "poses left out as too far from their predictions",
-        "poses_dropped": "poses dropped: over an hour ahead of the load, or too many waiting",
-        "taken_over": "redraws of the twins after an estimate, its withdrawal or a change of the machine",
-        "reduced": "1 if the twins were too slow and only the parameters follow",
+        "members_lost": "twins that have left the range of the model since the last pose",
+        "poses_used": "measured poses that corrected the motion of the twins",
+        "poses_outlying": "poses that were ignored, because they are too far from their predictions",
+        "poses_dropped": "poses dropped because they were an hour ahead of the load or too many poses waited",
+        "taken_over": "times that the twins were drawn again, because an estimate or the machine changed",
+        "reduced": "1 if poses no longer correct the motion, because the twins were too slow",
     },
     "recorder": {
-        "recording": "file being written",
-        "written": "items in the file",
-        "queued": "items waiting",
-        "lost": "items lost, by topic",
-        "marks": "rings written",
+        "recording": "path of the file that is being written",
+        "written": "items that were written",
+        "queued": "items in the queue",
+        "lost": "items that were lost, by topic",
+        "marks": "rings that were written",
         "marks_lost": "rings that could not be written",
-        "error": "reason of the trouble",
+        "error": "reason why data were lost or the recording has stopped",
     },
 }
 
-#: Keys of `status` and their meanings.
+#: Keys of `status`, with their descriptions.
 STATUS_KEYS: Final[dict[str, str]] = {
     "lifecycle": "unconfigured, inactive, active or finalized",
     "stream": "waiting, running, stale, ended or failed",
     "stale_inputs": "silent inputs, separated by commas",
-    "clock": "running; under use_sim_time also waiting (for /clock) or paused",
+    "clock": "running; under use_sim_time, the clock can also be waiting (for the first message) or paused",
     "recorder": "off, recording, or trouble (items were lost, or the recording has stopped)",
-    "solver_failures": "failed advances: their samples have no forces",
-    "horizontal": "state of the interval: prior, estimated, rough, not_observable or withdrawn",
-    "vertical": "state of the interval: prior, estimated, rough, not_observable or withdrawn",
-    "pads": "state of the interval: prior, estimated, rough, not_observable or withdrawn",
-    "model": "agreement with the measurements: ok or suspect",
-    "sensor": "agreement with the measurements: ok or suspect",
-    "follow": "off, or the source of the twin's numbers: prior or estimate",
-    **{f"publishers_{topic}": "number of publishers that the node is connected to" for topic in TOPICS},
+    "solver_failures": "failed advances, whose samples have no forces",
+    "horizontal": "state of the horizontal clearance: prior, estimated, rough, not_observable or withdrawn",
+    "vertical": "state of the vertical clearance: prior, estimated, rough, not_observable or withdrawn",
+    "pads": "state of the intervals of the pads: prior, estimated, rough, not_observable or withdrawn",
+    "model": "agreement of the model with the measurements: ok or suspect",
+    "sensor": "plausibility of the measured motion: ok or suspect",
+    "follow": "off, or the source of the parameters of the model: prior or estimate",
+    **{f"publishers_{topic}": "number of publishers that are connected to the node" for topic in TOPICS},
 }
 
-#: Keys of the part `source`, which a connection to an OPC UA server adds, and their meanings.
+#: Keys of the part `source`, with their descriptions. Only a twin with an OPC UA server has this part.
 SOURCE_KEYS: Final[dict[str, str]] = {
-    "server": "address",
+    "server": "address of the server",
     "connected": "whether the subscription exists",
-    "publishing_ms": "granted interval of messages [ms]",
-    "sampling_ms": "granted interval of samples [ms]",
-    "queue": "granted length of the queue of a node",
-    "values": "values received",
-    "bad": "values with a bad status, not used",
-    "uncertain": "values with an uncertain status, not used",
-    "not_numbers": "values that are not numbers, not used",
-    "unstamped": "values without a stamp, not used",
-    "notifications_lost": "missing messages",
-    "overflows": "values before which the server's queue overflowed",
+    "publishing_ms": "interval of messages that the server grants [ms]",
+    "sampling_ms": "interval of samples that the server grants [ms]",
+    "queue": "length of the queue of a node that the server grants",
+    "values": "values that were received",
+    "bad": "values that were not used because of a bad status",
+    "uncertain": "values that were not used because of an uncertain status",
+    "not_numbers": "values that were not used because they are not numbers",
+    "unstamped": "values that were not used because they have no stamp",
+    "notifications_lost": "messages of the server that are missing",
+    "overflows": "values before which the queue of the server overflowed",
     "breaks": "broken connections",
-    "breaks_filled": "breaks filled by the history",
-    "values_filled": "values from the history",
+    "breaks_filled": "broken connections whose missing values were read from the history",
+    "values_filled": "values that were read from the history",
     "history_strays": "values of the history from other times than requested",
     "unfilled_s": "time without values [s]",
     "no_history": "reason why the history cannot be read",
@@ -168,7 +168,7 @@ SOURCE_KEYS: Final[dict[str, str]] = {
 
 
 def keys_text() -> str:
-    """Return the meaning of every key of `status` and of each part of `/diagnostics`, as YAML."""
+    """Return a YAML text that describes the keys of `status` and of each part of `/diagnostics`."""
     lines = ["# Keys of `status` and of the parts of /diagnostics."]
     for part, keys in {"status": STATUS_KEYS, **KEYS, "source": SOURCE_KEYS}.items():
         lines += [f"{part}:", *(f'  {key}: "{text}"' for key, text in keys.items())]
@@ -185,7 +185,7 @@ _LEVELS: Final = {
 
 
 def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: bool = False) -> Part:
-    """Return level, message and values of `status`."""
+    """Return the level, the message and the values of `status`."""
     values = dict.fromkeys(STATUS_KEYS, "")
     values["lifecycle"] = lifecycle
     if runtime is None:
@@ -236,7 +236,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
 
 
 def failures(runtime: Runtime) -> list[str]:
-    """Describe the failed advances of the model, and how it continued."""
+    """Return a text about the failed advances of the model and the motion after them, or no text without failures."""
     failed = runtime.driver.failed
     if not failed.count:
         return []
@@ -251,13 +251,13 @@ def failures(runtime: Runtime) -> list[str]:
 
 
 class Health:
-    """The parts of `/diagnostics`; it keeps the last report's counters, from which it computes what is new."""
+    """Creator of the parts of `/diagnostics`. It compares the counters with the counters of the previous report."""
 
     def __init__(self) -> None:
         self._before: dict[str, int] = {}
 
     def parts(self, lifecycle: str, reason: str, runtime: Runtime | None, now_ns: int) -> dict[str, Part]:
-        """Return all parts by name; `now_ns` is a steady time."""
+        """Return all parts by name; `now_ns` is the time of the monotonic clock [ns]."""
         parts = {"state": self.state(lifecycle, reason, runtime, now_ns)}
         if runtime is not None:
             parts["input"] = self.input(runtime)
@@ -268,7 +268,7 @@ class Health:
         return parts
 
     def state(self, lifecycle: str, reason: str, runtime: Runtime | None, now_ns: int) -> Part:
-        """Return the part `state`: the lifecycle, the stream of samples, and the solver."""
+        """Return the part `state` about the lifecycle, the stream of samples, and the solver."""
         level, message, _ = summary(lifecycle, reason, runtime)
         if runtime is not None and self._grown({"solver_failures": runtime.driver.failed.count}, ("solver_failures",)):
             level, message = ERROR, "; ".join(failures(runtime))
@@ -297,7 +297,7 @@ class Health:
         return level, message, values
 
     def input(self, runtime: Runtime) -> Part:
-        """Return the part `input`: samples arrived, used and dropped."""
+        """Return the part `input` about the samples that arrived, were used, and were dropped."""
         counted = counters(runtime.driver)
         inputs, residual, age_s = runtime.inputs, runtime.residual(), runtime.newest_sample_age_s()
         peak, wait_s = inputs.pop_queue_peak()
@@ -338,7 +338,7 @@ class Health:
         return (WARN if grown else OK), "; ".join(grown) or "no trouble since the last report", values
 
     def output(self, runtime: Runtime) -> Part:
-        """Return the part `output`: the published messages, their latency and their age."""
+        """Return the part `output` about the published messages, their latency and their age."""
         latency, age = runtime.publishing.latency, runtime.publishing.age
         values = {
             "published": str(runtime.publishing.published),
@@ -359,7 +359,7 @@ class Health:
         return (WARN if missed else OK), missed or "publishing", values
 
     def _note_periods(self, runtime: Runtime, values: dict[str, str]) -> str:
-        """Add the statistics of the loop's periods to `values`; return the fault found."""
+        """Add statistics of the publishing period to `values`; return a warning about missed periods or ""."""
         keys = ("periods_missed", "period_mean_ms", "period_deviation_ms", "period_max_ms")
         values |= dict.fromkeys(keys, "")
         if runtime.periods is None:
@@ -371,7 +371,7 @@ class Health:
         return f"{new} periods left out since the last report" if 0 < runtime.settings.missed_periods <= new else ""
 
     def estimate(self, runtime: Runtime) -> Part:
-        """Return the part `estimate`."""
+        """Return the part `estimate` about the estimates and their process."""
         values = dict.fromkeys(KEYS["estimate"], "")
         found = runtime.estimation
         if found is None:
@@ -391,7 +391,7 @@ class Health:
         return (ERROR if found.worker.error else WARN if trouble else OK), trouble or doing, values
 
     def follow(self, runtime: Runtime) -> Part:
-        """Return the part `follow`: how the twin follows the machine."""
+        """Return the part `follow` about the twins that follow the measurements."""
         follower, reduced = runtime.follower, runtime.reduced
         values = dict.fromkeys(KEYS["follow"], "")
         values["follow"] = "off" if follower is None else "full" if follower.steered else "parameters"
@@ -414,7 +414,7 @@ class Health:
         return OK, "following", values
 
     def recorder(self, runtime: Runtime) -> Part:
-        """Return the part `recorder`; lost data are an error."""
+        """Return the part `recorder` about the recording. Lost data have the level ERROR."""
         values = dict.fromkeys(KEYS["recorder"], "")
         if runtime.recording is None:
             return OK, "not recording", values
@@ -438,7 +438,7 @@ class Health:
         return grown
 
 
-#: Counters of the part `input` whose growth is a warning.
+#: Counters of the part `input` that cause a warning when they have grown since the last report.
 _TROUBLE: Final = (
     "dropped_unstamped",
     "dropped_non_finite",

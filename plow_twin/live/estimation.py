@@ -1,4 +1,4 @@
-"""The estimates of a live twin, which another process computes."""
+"""Pass the measurements of a live twin to another process that computes estimates, and use its results."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ from plow_twin.stream.journal import (
 from plow_twin.stream.session import Series, Session
 
 ESTIMATE, WINDOW_FORCES, FORECAST = ESTIMATES
-#: SI unit in which a forecast is published, by the unit in which it is made.
+#: SI unit in which a forecast is published, for each unit in which it is computed.
 _SI: Final = {"hours": "seconds", "km": "metres"}
-#: Rate at which a finished estimate is looked for [Hz].
+#: Rate of the checks for a finished estimate [Hz].
 RATE_HZ: Final = 10.0
 
 
 class Estimation:
-    """The estimates of a live twin: their inputs, and the use of their results."""
+    """Interface of a live twin to the process that computes its estimates."""
 
     def __init__(self, settings: Settings, scene: Scene) -> None:
         self._frame_id, self._follows = settings.frame_id, settings.follows != "off"
@@ -50,35 +50,35 @@ class Estimation:
         self.worker = Worker(scene, windows, asked)
         sent = {ESTIMATE: True, WINDOW_FORCES: bool(asked.members), FORECAST: asked.plan is not None}
         self._topics = [topic for topic, wanted in sent.items() if wanted]
-        #: stamp [ns] at which other pads were set, until the old estimate is withdrawn by empty messages
+        #: stamp [ns] at which the wear of the pads was set; None after empty messages have withdrawn the old estimate
         self._set_ns: int | None = None
-        #: state of each clearance in the newest estimate
+        #: state of each clearance in the last estimate
         self.states = {"horizontal": State.PRIOR, "vertical": State.PRIOR}
-        #: trust in model and sensor in the newest estimate
+        #: agreement of the model and of the sensor with the measurements, according to the last estimate
         self.trust = {"model": "", "sensor": ""}
         self.reasons: tuple[str, ...] = ()
-        #: number of estimates, and of windows that a newer window replaced before they were estimated
+        #: number of estimates, and number of windows that were skipped because a newer window was complete
         self.count = self.skipped = 0
         self.wall_s = 0.0
         self.end_ns: int | None = None
-        #: the newest forecast, or the reason why there is none
+        #: last forecast, or None; the reason for None is in `forecast_error`
         self.forecast: dict[str, Any] | None = None
         self.forecast_error = "nothing has been estimated yet"
-        #: the newest estimate, which a new journal needs again
+        #: journal entry of the last estimate, which is repeated at the start of a new part of the recording
         self.entry: Estimated | None = None
 
     @property
     def done(self) -> bool:
-        """Whether the last window is done, or the process has failed."""
+        """Whether the last window has been estimated, or the process has failed."""
         return self.worker.ended is not None or bool(self.worker.error)
 
     @property
     def shortage(self) -> str:
-        """Why no estimate was made, once the source has ended; otherwise empty."""
+        """Reason why no estimate was computed before the source ended; empty if there is an estimate."""
         return "" if self.count else self.worker.ended or ""
 
     def add(self, entry: Entry) -> None:
-        """Pass an entry of the journal to the estimate."""
+        """Pass a journal entry to the estimating process."""
         match entry:
             case Sample(stamp_ns, wrench):
                 self.worker.add_load(stamp_ns, wrench)
@@ -97,7 +97,7 @@ class Estimation:
                 self.trust, self.reasons = dict.fromkeys(self.trust, ""), ()
                 self.forecast, self.forecast_error = None, "nothing has been estimated since the pads were set"
             case SetModel():
-                # these clearances replace those of an older estimate
+                # the new clearances of the model replace the clearances of an older estimate
                 self.worker.restart()
                 self._forget()
             case Reset():
@@ -106,14 +106,15 @@ class Estimation:
                     self._forget()
 
     def add_series(self, series: Series) -> None:
-        """Pass samples that were applied together to the estimate."""
+        """Pass a series of samples to the estimating process."""
         for stamp_ns, wrench in zip(series.stamps.tolist(), series.wrench.tolist(), strict=True):
             self.worker.add_load(stamp_ns, tuple(wrench))
 
     def poll(self, session: Session) -> dict[str, plain.JointState]:
-        """Apply a finished estimate to the session; return its messages by topic, empty without an estimate.
+        """Apply a finished estimate to the session, and return its messages by topic.
 
-        After other pads have been set, empty messages replace the old estimate's latched messages.
+        Without a finished estimate, the result is an empty dictionary. If the wear of the pads has been set, the
+        messages are empty: they replace the latched messages of the old estimate.
         """
         found = self.worker.poll()
         stamp_ns, self._set_ns = self._set_ns, None
@@ -138,16 +139,16 @@ class Estimation:
         return messages
 
     def _forget(self) -> None:
-        """Discard the estimate, so that the model's clearances apply again."""
+        """Discard the estimate, so that the clearances of the model are valid again."""
         self.entry = None
         self.states = dict.fromkeys(self.states, State.PRIOR)
 
 
 def entry_of(found: Found, session: Session, before: Estimated | None) -> Estimated:
-    """Return the journal's entry of an estimate.
+    """Return the journal entry of an estimate.
 
-    A clearance that is not observable keeps its last estimate, with an interval that widens like the wear's prior. A
-    withdrawn clearance gets the model's value.
+    If a clearance is not observable, the shift from the previous estimate `before` is used again. If a clearance is
+    withdrawn, the shift is 0, so that the clearance of the model is used.
     """
     model = session.outputs.modelled(session.wear_depth)
     shift = np.array(before.shift) if before is not None else np.zeros(6)
@@ -165,7 +166,10 @@ def entry_of(found: Found, session: Session, before: Estimated | None) -> Estima
 
 
 def message_of(found: Found, frame_id: str) -> plain.JointState:
-    """Return the message of an estimate, stamped with the end of its window; empty if it is withdrawn."""
+    """Return the message of an estimate, with the end of its window as stamp.
+
+    The message of a withdrawn estimate has no values.
+    """
     result = found.estimate
     names: list[str] = []
     numbers: list[float] = []
@@ -177,7 +181,10 @@ def message_of(found: Found, frame_id: str) -> plain.JointState:
 
 
 def forces_message(found: Found, frame_id: str) -> plain.JointState:
-    """Return the message of a window's forces, in the form of `contact_peaks`; empty without forces."""
+    """Return the message of the contact forces in a window, in the form of `contact_peaks`.
+
+    If the forces were not computed, the message has no values.
+    """
     names: list[str] = []
     peaks: list[float] = []
     impulses: list[float] = []
@@ -191,7 +198,7 @@ def forces_message(found: Found, frame_id: str) -> plain.JointState:
 
 
 def forecast_message(found: Found, frame_id: str) -> plain.JointState:
-    """Return the message of a forecast: seconds, metres, passes and shifts to each limit that is reached."""
+    """Return the message of a forecast: the time [s], distance [m], passes and shifts until the limit is reached."""
     forecast = found.also["forecast"] or {}
     names: list[str] = []
     numbers: list[float] = []
@@ -209,7 +216,7 @@ def forecast_message(found: Found, frame_id: str) -> plain.JointState:
 
 
 def asked_of(settings: Settings) -> Asked:
-    """Return which results the parameters request besides the estimate."""
+    """Return the further results that the parameters request in addition to the estimate."""
     horizontal, vertical = settings.forecast_limits
     plan = None
     if horizontal or vertical:
@@ -219,12 +226,18 @@ def asked_of(settings: Settings) -> Asked:
 
 
 def scenarios_of(settings: Settings) -> tuple[Scenario, ...]:
-    """Return the scenarios of the parameters; raise LifeError if they cannot be read."""
+    """Return the scenarios from the parameter `forecast_scenarios`.
+
+    Raises
+    ------
+    LifeError
+        The text is invalid.
+    """
     return tuple(Scenario.parse(text) for text in settings.forecast_scenarios.split(";") if text.strip())
 
 
 def problems(settings: Settings, scene: Scene) -> list[Problem]:
-    """Return contradictions among the parameters of the estimate, or with the scene."""
+    """Return contradictions between the parameters of the estimate, or between these parameters and the scene."""
     found = []
     if settings.excitation_source == "scene":
         found.append(Problem("estimate", True, "false with excitation_source scene: no load arrives"))

@@ -1,4 +1,4 @@
-"""The live twin without ROS: a bridge feeds the twin, and a function receives its reports."""
+"""Run a live twin without ROS. A bridge provides the messages, and a function receives the reports."""
 
 from __future__ import annotations
 
@@ -31,35 +31,52 @@ from plow_twin.stream.outputs import Published
 from plow_twin.stream.topics import TOPICS
 
 NAME: Final = "/plow_twin"
-#: Longest wait for a message, and thus for the response to a stop request [s].
+#: Longest wait for a message [s]. It also limits the delay of a stop.
 _POLL_S: Final = 0.1
 _REPORT_S: Final = 1.0
-#: Share of unused samples above which a likely cause is reported.
+#: Share of unused samples above which a probable cause is reported.
 _MANY: Final = 0.01
 
-#: Receives `status`, `alarms` or a part of the diagnostics: its name, and its level, message and values.
+#: Function that receives the name and the content of a report: `status`, `alarms`, or a part of the diagnostics.
 Say = Callable[[str, Part], None]
 
 
 class Watcher(Protocol):
-    """Receives each report and each publication."""
+    """Receiver of all reports and publications."""
 
     def publication(self, published: Published) -> None:
-        """Add a publication of at least one row."""
+        """Receive a publication with at least one row."""
 
     def part(self, name: str, part: Part) -> None:
-        """Receive a part of the diagnostics."""
+        """Receive a report: `status`, `alarms`, or a part of the diagnostics."""
 
 
 class BridgeFront:
-    """A live twin fed by a bridge.
+    """Live twin that receives its messages from a bridge.
 
-    Without a mapping, columns are recognised by name; `units` (of fx, ..., t) replace those of the mapping. `say`
-    receives status and alarms when they change, and the diagnostics once a second; `on_error` may be called from
-    another thread.
+    Parameters
+    ----------
+    bridge
+        Source of the messages.
+    mapping
+        Mapping file. Without a file, columns are recognised by their names.
+    settings
+        Parameters of the twin.
+    prepared
+        Scene and compiled twin.
+    say
+        Function that receives the status and the alarms when they change, and the diagnostics once a second.
+    on_error
+        Function that receives errors. It may be called from another thread.
+    units
+        Units of quantities (fx, ..., or t for the time), which replace the units in the mapping.
 
-    Raises BridgeError if the source cannot be used or gives no load, and RecordingError, WearStateError or OSError if
-    the mapping, the recording or the saved wear cannot be used.
+    Raises
+    ------
+    BridgeError
+        The source cannot be used, or the mapping assigns no load.
+    RecordingError, WearStateError, OSError
+        The mapping, the recording or the saved wear cannot be used.
     """
 
     def __init__(
@@ -91,13 +108,13 @@ class BridgeFront:
         self.runtime = Runtime(self, settings, prepared)
         self._feeder = Feeder(self.roles, self.runtime, self.send, model if "drive" in self.roles else None)
         self._health = diagnostics.Health()
-        #: calls between the messages
+        #: further functions to call periodically
         self.timers: list[Timer] = []
         self._watchers: list[Watcher] = []
         self.more_parts: dict[str, Callable[[], Part]] = {}
 
     def attach(self, watcher: Watcher) -> None:
-        """Add a watcher."""
+        """Add a watcher, which then receives all reports and publications."""
         self._watchers.append(watcher)
         self.runtime.publishing.watch = self._published
 
@@ -106,11 +123,14 @@ class BridgeFront:
             watcher.publication(published)
 
     def now_ns(self) -> int:
-        """Return the system's time, or the samples' own time [ns]; 0 would mean that there is no time yet."""
+        """Return the system time [ns], or the newest stamp if the samples advance the time.
+
+        The result is never 0, because 0 means that the time is unknown.
+        """
         return (self._feeder.newest_ns or 1) if self.follows_samples else time.time_ns()
 
     def send(self, topic: str, message: memoryview | Message) -> None:
-        """Report alarms and estimates; messages of the motion are only recorded."""
+        """Report the message if it contains alarms or an estimate. Messages of the motion are only recorded."""
         if isinstance(message, DiagnosticStatus):
             self._tell(topic, (message.level, message.message, dict(message.values)))
         elif isinstance(message, JointState):
@@ -124,17 +144,17 @@ class BridgeFront:
             watcher.part(name, part)
 
     def look_for_senders(self, topic: str) -> None:
-        """Do nothing: the feeder knows its sender."""
+        """Do nothing, because the feeder has only one sender."""
 
     def sender_name(self, topic: str, sender: bytes) -> str:
-        """Return the name of a sender of an input."""
+        """Return the name of the sender with the identifier `sender`."""
         return sender.decode(errors="replace")
 
     def say_alarm(self, level: int, text: str) -> None:
-        """Do nothing: `say` gets the alarms."""
+        """Do nothing, because the function `say` receives the alarms."""
 
     def time_text(self, stamp_ns: int) -> str:
-        """Return a stamp as text, in the form that the input has."""
+        """Return a stamp as text: a date, or seconds as in the input."""
         return time_text(stamp_ns, own_start=True)
 
     def changed(self) -> None:
@@ -148,7 +168,7 @@ class BridgeFront:
         self.runtime.record_status(DiagnosticStatus(level, self.name, message, head, tuple(values.items())))
 
     def run(self, stop_asked: Callable[[], bool], seconds: float = float("inf")) -> list[str]:
-        """Feed the twin until the source ends, a stop is requested, or time is up; return the losses."""
+        """Process messages until the source ends, a stop is requested, or `seconds` have passed; return the losses."""
         runtime, bridge = self.runtime, self._bridge
         lost: list[str] = []
         broken = ""
@@ -180,7 +200,7 @@ class BridgeFront:
         return []
 
     def causes(self) -> list[str]:
-        """Describe silences, and likely causes of unused samples and of resets."""
+        """Return texts about silences, and about probable causes of unused samples and resets."""
         counts, found = self.runtime.driver.intake.counts, []
         many = _MANY * max(1, sum(counts.values()))
         if self._feeder.unfit:
@@ -257,7 +277,7 @@ class BridgeFront:
 
     def _report(self) -> None:
         self.changed()
-        # the twin sends alarms only when a level changes
+        # the alarms are sent here because the twin sends them only when a level changes
         self.send(ALARMS, alarms_message(self.runtime.alarms, self.name, self._settings.hardware_id))
         for name, part in self.parts().items():
             self._tell(name, part)
@@ -277,10 +297,25 @@ def roles_of(
     modelled: bool,
     units: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, Role]:
-    """Return the roles that a twin takes from a bridge.
+    """Return the roles of the topics of a bridge.
 
-    Raises BridgeError or RecordingError if the mapping cannot be used, or lacks the load that `source`, the parameter
-    `excitation_source`, requires.
+    Parameters
+    ----------
+    bridge
+        Source of the messages.
+    mapping
+        Mapping file, or None.
+    source
+        Value of the parameter `excitation_source`.
+    modelled
+        Whether the mapping contains a load model.
+    units
+        Units of quantities, which replace the units in the mapping.
+
+    Raises
+    ------
+    BridgeError, RecordingError
+        The mapping is invalid, or it assigns no load although the parameter `excitation_source` requires a load.
     """
     if source == "tool_forces":
         raise BridgeError("excitation_source: got 'tool_forces', expected 'excitation' or 'scene' without ROS")
@@ -293,7 +328,7 @@ def roles_of(
     if ("drive" in roles) != modelled or {"drive", "excitation"} <= roles.keys():
         raise BridgeError("mapping: expected drive and load_model together, and no excitation beside them")
     if source == "excitation" and not {"drive", "excitation"} & roles.keys():
-        # the content may not be text, so the types are cut
+        # the first line of a file that is not a table may be long, so each type is truncated
         there = "; ".join(f"{topic} ({str(kind)[:120]})" for topic, kind in (topics or {}).items())
         setup = "" if topics is None else "; plow-twin setup FILE writes a mapping"
         raise BridgeError(

@@ -1,4 +1,4 @@
-"""The inputs of a live twin from any transport: choice of the sender, counts, and checks of the optional inputs."""
+"""Process the inputs of a live twin: choose the sender, count messages, and check the optional inputs."""
 
 from __future__ import annotations
 
@@ -19,20 +19,31 @@ if TYPE_CHECKING:
     from plow_twin.live.publishing import Front
 
 TOPICS: Final = ("excitation", "tool_forces", "travel", "head_pose", "gaps")
-#: The inputs besides the load.
+#: Inputs that are not the load.
 OPTIONAL: Final = ("travel", "head_pose", "gaps")
-#: Another sender counts as present for this time after its last sample [ns].
+#: Time after its last sample for which a sender that is not followed counts as present [ns].
 _OTHER_SENDER_NS: Final = 3_000_000_000
-#: An optional input that was heard counts as silent after this time without a message [ns].
+#: Time without a message after which an optional input counts as silent [ns].
 _SILENT_NS: Final = 10_000_000_000
 
 
 class Inputs:
-    """The inputs of a live twin.
+    """Inputs of a live twin.
 
-    `source` is the input that gives the load, `depth` the length of its queue, and `intake` has the arguments of the
-    `Intake` that judges it. `late_span_s` is the largest delay with which a measured pose or gap is still used. If
-    `journaled`, unused messages are collected for the journal.
+    Parameters
+    ----------
+    front
+        Interface to the transport.
+    source
+        Input that provides the load.
+    depth
+        Length of the queue of this input [messages].
+    late_span_s
+        Largest delay at which a measured pose or gap is used [s].
+    journaled
+        Whether unused messages are collected for the journal.
+    **intake
+        Arguments of the `Intake` of the load.
     """
 
     def __init__(
@@ -41,7 +52,7 @@ class Inputs:
         self._front, self._source = front, source
         self.intake = Intake(on_unused=self._sample_unused, **intake)
         self.unused = UnusedMessages(journaled)
-        #: topic and sender of the message being processed, unless the selected source has sent it
+        #: topic and sender of the message that is being processed; not set for the input `source`
         self.arriving = ("", b"")
         self._poses, self._gap_stamps = RecentStamps(late_span_s), RecentStamps(late_span_s)
         self.depth = depth
@@ -56,52 +67,61 @@ class Inputs:
         self.wait_s = 0.0
         self._heard_ns: dict[str, int] = {}
         self._other_heard_ns: dict[str, int] = {}
-        #: number of messages that could not be read
+        #: number of messages that the transport has lost
         self.lost = 0
         self.travel, self.head_pose, self.gaps = (Intake(on_unused=self._unused) for _ in OPTIONAL)
         self._gap_limits: Limits | None = None
-        #: newest stamp [ns] and gap [m] of each pair
+        #: stamp [ns] and value [m] of the newest gap of each pair
         self._newest_gaps: dict[int, tuple[int, float]] = {}
         self._newest_pose = (0.0, 0.0, 0.0)
         self.measured: tuple[float, float, float] | None = None
         self.refused_publishers = 0
-        #: number of senders to which each input is connected
+        #: number of senders that are connected to each input
         self.publishers = dict.fromkeys(TOPICS, 0)
 
     def set_limits(self, travel: Limits, pose: Limits, gap: Limits) -> None:
-        """Set the limits of speed [m/s], pose (x, y [m], theta [rad]) and gap [m]."""
+        """Set the limits of the speed [m/s], the pose (x, y [m], theta [rad]) and the gaps [m]."""
         self.travel.limits, self.head_pose.limits, self._gap_limits = travel, pose, gap
 
     def other_senders(self) -> list[str]:
-        """Return the inputs on which a sender that is not followed sends too."""
+        """Return the inputs on which a sender that is not followed is sending."""
         if not self._other_heard_ns:
             return []
         now_ns = time.monotonic_ns()
         return [topic for topic, heard_ns in self._other_heard_ns.items() if now_ns - heard_ns < _OTHER_SENDER_NS]
 
     def silent(self) -> list[str]:
-        """Return the optional inputs that have become silent."""
+        """Return the optional inputs that have received messages, but none for some time."""
         if self.ended:
             return []
         now_ns = time.monotonic_ns()
         return [topic for topic, heard_ns in self._heard_ns.items() if now_ns - heard_ns > _SILENT_NS]
 
     def waited(self, messages: int, longest_s: float) -> None:
-        """Record how many messages waited, and how long the first of them waited [s]."""
+        """Register the number of messages in the queue, and the time that the first message waited [s]."""
         self.wait_s = max(self.wait_s, longest_s)
         most, before_s = self._queue_peak
         if messages > most or longest_s > before_s:
             self._queue_peak = (max(most, messages), max(before_s, longest_s))
 
     def pop_queue_peak(self) -> tuple[int, float]:
-        """Return the largest number of messages that waited, and their longest wait [s], since the last call."""
+        """Return the largest number of messages in the queue, and the longest wait [s], since the last call."""
         peak, self._queue_peak = self._queue_peak, (0, 0.0)
         return peak
 
     def wanted(self, sender: bytes, number: int, stamp_ns: int, values: Sequence[float], fits: bool = True) -> bool:
-        """Register message `number` (from 1) of a sender; if it cannot be used, count it and return False.
+        """Register a message of a sender, and return whether it is used. An unused message is counted.
 
-        `fits` states whether the message can be read as a sample; `values` are all its numbers.
+        Parameters
+        ----------
+        sender
+            Identifier of the sender.
+        number
+            Number of the message, counted from 1 for each sender.
+        stamp_ns, values
+            Stamp [ns] and numbers of the message.
+        fits
+            Whether the message can be read as a sample.
         """
         lost = self.senders.lost
         followed = self.senders.hear(sender, number)
@@ -118,7 +138,10 @@ class Inputs:
         return False
 
     def lost_at_first(self, sender: bytes, more: int) -> bool:
-        """Count `more` samples before a sender's first sample as lost; return False unless it is followed."""
+        """Count `more` samples before the first sample of a sender as lost.
+
+        Returns False, without an effect, if the sender is not followed.
+        """
         if sender != self.senders.followed:
             return False
         self.senders.lost += more
@@ -132,7 +155,10 @@ class Inputs:
         self.unused.note(topic, sender, "not_followed", stamp_ns, values)
 
     def _follows(self, topic: str, stamp_ns: int, values: Sequence[float]) -> bool:
-        """Return whether a message on an optional input comes from the followed sender; count other senders."""
+        """Return whether the current message on an optional input comes from the followed sender.
+
+        A message from another sender is counted.
+        """
         sender = self.arriving[1]
         followed = self.optional[topic].hear(sender, time.monotonic_ns())
         if not followed:
@@ -140,20 +166,20 @@ class Inputs:
         return followed
 
     def uses_travel(self, stamp_ns: int, speed_m_s: float) -> bool:
-        """Judge a speed along the face; return whether it is used."""
+        """Check a speed along the face, and return whether it is used."""
         if not self._follows("travel", stamp_ns, (speed_m_s,)):
             return False
         return self._judged("travel", self.travel, stamp_ns, (speed_m_s,)).used
 
     def uses_pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...] = ()) -> bool:
-        """Judge a measured pose x, y [m], theta [rad] and its standard deviations; return whether it is used.
+        """Check a measured pose x, y [m], theta [rad] and its standard deviations, and return whether it is used.
 
-        A component that was not measured is NaN; a pose of three NaN is refused.
+        A component that was not measured is NaN. A pose without a measured component is refused.
         """
         if not self._follows("head_pose", stamp_ns, (*pose, *deviation)):
             return False
         missing = [math.isnan(value) for value in pose]
-        # a component that was not measured cannot exceed its limit
+        # for the check of the limits, the last value replaces a component that was not measured
         judged = pose if all(missing) else _filled(pose, self._newest_pose)
         verdict = self._judged("head_pose", self.head_pose, stamp_ns, (*judged, *deviation), self._poses)
         if verdict.used and verdict is not Verdict.WORKED_IN:
@@ -163,7 +189,7 @@ class Inputs:
         return verdict.used
 
     def uses_gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> bool:
-        """Judge measured gaps [m] by number of their pairs; return whether they are used."""
+        """Check measured gaps [m], by number of the pair, and return whether they are used."""
         values = tuple(gaps.values())
         if not self._follows("gaps", stamp_ns, values):
             return False
@@ -176,10 +202,10 @@ class Inputs:
         return verdict.used
 
     def _is_implausible(self, stamp_ns: int, gaps: Mapping[int, float]) -> bool:
-        """Return whether a gap is too large, or has changed too fast since the newest gap of its pair."""
+        """Return whether a gap is too large, or has changed too fast since the last gap of the same pair."""
         limits = self._gap_limits
         if limits is None or not all(map(math.isfinite, gaps.values())):
-            return False  # the intake refuses a value that is not finite
+            return False  # the intake refuses NaN and infinity later
         for pair, gap in gaps.items():
             before_ns, before = self._newest_gaps.get(pair, (stamp_ns, gap))
             passed_s = (stamp_ns - before_ns) * 1e-9
@@ -213,11 +239,11 @@ class Inputs:
         self.unused.note(*self.arriving, verdict.value, stamp_ns, values)
 
     def residual(self, q: NDArray[Any]) -> tuple[float, float, float] | None:
-        """Return model minus measured pose, or None without a measurement."""
+        """Return the pose `q` of the model minus the measured pose, or None without a measurement."""
         if self.measured is None:
             return None
         x, y, theta = (float(model) - data for model, data in zip(q, self.measured, strict=True))
-        # angles that differ by a full turn are the same
+        # the difference of two angles is between -pi and pi
         return x, y, math.remainder(theta, 2.0 * math.pi)
 
 

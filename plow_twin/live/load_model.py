@@ -1,11 +1,15 @@
-"""The load on the head with its standard deviation, computed from signals of the drive.
+"""Compute the load on the head, and its standard deviation, from signals of the drive.
 
-The drive pulls the chain with C = efficiency P / v, unless C is measured. Without the drag of chain and plough, the
-cutting force along the face remains: Z = C - idle. The coal gives a second value, Z = specific_force * depth *
-resistance(position). The mean of both is weighted by the inverse variances. The force into the face is Fx = push_ratio
-Z, the lateral force Fy = lateral_ratio Z; both act at one point of the head, so that M = x Fy - y Fx. All coefficients
-have a standard deviation, which propagates to the result. They are measured at a machine, by idle runs and weighing;
-the paper publishes none.
+The cutting force Z along the face is determined in two ways:
+
+- From the drive: Z = C - idle, where C is the chain force. If C is not measured, C = efficiency P / v with the motor
+  power P and the speed v.
+- From the coal: Z = specific_force * depth * resistance(position).
+
+If both values are available, Z is their mean, weighted by the inverse variances. The force into the face is
+Fx = push_ratio Z, and the lateral force is Fy = lateral_ratio Z. The point of action (x, y) gives the moment
+M = x Fy - y Fx. Each coefficient has a standard deviation, which propagates to the load. The coefficients must be
+measured at the machine, because the paper does not publish them.
 """
 
 from __future__ import annotations
@@ -21,7 +25,7 @@ import numpy as np
 
 from plow_twin.record.map_file import LOAD_MODEL, map_error, read_map_file
 
-#: Smallest speed at which the chain's force is computed from the power [m/s].
+#: Smallest speed at which the chain force is computed from the power [m/s].
 SLOWEST_M_S: Final = 0.1
 
 Number = tuple[float, float]
@@ -30,22 +34,25 @@ Wrench = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class LoadModel:
-    """Coefficients, each a mean and a standard deviation.
+    """Coefficients of the load model. Each coefficient is a mean and a standard deviation.
 
     Attributes
     ----------
-    push_ratio, lateral_ratio : tuple of float
-        Ratios of the force into the face and of the lateral force to the cutting force.
+    push_ratio : tuple of float
+        Ratio of the force into the face to the cutting force.
+    lateral_ratio : tuple of float
+        Ratio of the lateral force to the cutting force.
     at_m : tuple of float
-        Point of action x, y [m] from the cavity's centre.
+        Point of action x, y from the centre of the cavity [m].
     efficiency : tuple of float, optional
         Ratio of the power at the chain to the motor power.
     idle_force_n : tuple of float
-        Pull of the chain without cutting [N].
+        Chain force without cutting [N].
     specific_force_n_m : tuple of float, optional
         Cutting force per metre of depth [N/m].
     resistance : tuple of tuples, optional
-        Places along the face [m] and the factors of the specific force there, linear between them.
+        Positions along the face [m], and the factor of the specific force at each position. The factor is interpolated
+        linearly.
     """
 
     push_ratio: Number
@@ -57,10 +64,20 @@ class LoadModel:
     resistance: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def cutting_force(self, drive: Mapping[str, float]) -> Number | None:
-        """Return mean and deviation of the cutting force [N], or None if the signals do not suffice.
+        """Return the mean and the standard deviation of the cutting force [N].
 
-        `drive` has some of `power` [W], `chain_force` [N], `speed` [m/s], `depth` and `position` [m]; NaN counts as
-        missing. The force is zero at a standstill.
+        At a standstill, the force is zero.
+
+        Parameters
+        ----------
+        drive
+            Signals: `power` [W], `chain_force` [N], `speed` [m/s], `depth` [m] and `position` [m]. A signal may be
+            missing or NaN.
+
+        Returns
+        -------
+        tuple of float or None
+            None if the signals are not sufficient.
         """
         known = {name: value for name, value in drive.items() if math.isfinite(value)}
         if abs(known.get("speed", math.inf)) < SLOWEST_M_S and "chain_force" not in known:
@@ -69,7 +86,7 @@ class LoadModel:
         if not opinions:
             return None
         deviations = [max(deviation, 1.0) for _, deviation in opinions]
-        # weights relative to the smallest deviation do not overflow; a later check refuses huge numbers
+        # weights relative to the smallest deviation do not overflow, even for huge numbers, which are refused later
         smallest = min(deviations)
         shares = [smallest / deviation for deviation in deviations]
         total = sum(share * share for share in shares)
@@ -77,7 +94,7 @@ class LoadModel:
         return max(mean, 0.0), smallest / math.sqrt(total)
 
     def wrench(self, drive: Mapping[str, float]) -> tuple[Wrench, Wrench] | None:
-        """Return Fx, Fy [N], M [N m], and their standard deviations, or None if the signals do not suffice."""
+        """Return Fx, Fy [N], M [N m] and their standard deviations, or None if the signals are not sufficient."""
         force = self.cutting_force(drive)
         if force is None:
             return None
@@ -118,7 +135,13 @@ class LoadModel:
 
 
 def read_load_model(path: Path | None) -> LoadModel | None:
-    """Return the load model in a mapping file, or None; raise MapError if it cannot be used."""
+    """Return the load model in a mapping file, or None if the file has no load model.
+
+    Raises
+    ------
+    MapError
+        The file or the load model is invalid.
+    """
     entry = None if path is None else read_map_file(path).get(LOAD_MODEL)
     if path is None or entry is None:
         return None

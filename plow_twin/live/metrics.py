@@ -1,4 +1,4 @@
-"""The diagnostics of a live twin as metrics for Prometheus."""
+"""Serve the diagnostics of a live twin as metrics for Prometheus."""
 
 from __future__ import annotations
 
@@ -27,10 +27,15 @@ class MetricsError(PlowTwinError):
 
 
 class Metrics:
-    """Context manager of a page `http://127.0.0.1:PORT/metrics`, which Prometheus reads.
+    """Context manager that serves the page `http://127.0.0.1:PORT/metrics`, which Prometheus reads.
 
-    Each number of each part in the newest report is a gauge `plow_twin_<part>_<key>`; texts are left out. A port that
-    cannot be used raises MetricsError.
+    Each number in the last report is a gauge with the name `plow_twin_<part>_<key>`. Values that are not numbers are
+    omitted.
+
+    Raises
+    ------
+    MetricsError
+        The port cannot be used.
     """
 
     def __init__(self, port: int) -> None:
@@ -52,11 +57,11 @@ class Metrics:
         self._thread.join()
 
     def update(self, name: str, part: Part) -> None:
-        """Take a part of the diagnostics."""
+        """Replace a part of the diagnostics."""
         self._parts = {**self._parts, name: part}
 
     def collect(self) -> Iterator[Metric]:
-        """Yield the gauges."""
+        """Yield a gauge for each number."""
         for name, (level, _, values) in self._parts.items():
             yield _gauge(f"{name}_level", "0 OK, 1 warning, 2 error", float(level))
             for key, text in values.items():
@@ -66,7 +71,10 @@ class Metrics:
 
 
 def _bound(server: Any) -> None:
-    """Refuse readers beyond `_READERS` and close silent readers, since each reader takes a thread and a file."""
+    """Limit the number of simultaneous readers to `_READERS`, and disconnect silent readers.
+
+    Each reader occupies a thread and a file descriptor.
+    """
     free = threading.BoundedSemaphore(_READERS)
     start, serve = server.process_request, server.process_request_thread
     handler = server.RequestHandlerClass

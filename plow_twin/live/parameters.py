@@ -1,4 +1,4 @@
-"""Table of the node's parameters, from which defaults, checks, ROS descriptors and config/twin.yaml follow."""
+"""Table of the parameters of the node. The checks, the ROS descriptors and config/twin.yaml are made from it."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from plow_twin.live.service_names import SERVICES
 from plow_twin.scene_file.presets import PRESETS
 from plow_twin.stream.topics import Cadence, names_of
 
-#: Topics of the estimate and of results that follow from it.
+#: Topics of the estimate, and of the results that are computed from the estimate.
 ESTIMATES: Final = names_of(Cadence.ESTIMATE)
 
 
 class Effect(Enum):
-    """When a changed value takes effect."""
+    """Time at which a changed value takes effect."""
 
     START = "at start (read only)"
     CONFIGURE = "on configure; can be changed while unconfigured"
@@ -29,7 +29,7 @@ class Effect(Enum):
 
 
 class ParameterError(InputError):
-    """Parameters cannot be used."""
+    """Parameters are invalid."""
 
     def __init__(self, problems: Iterable[Problem], source: str = "parameters") -> None:
         super().__init__(problems, source)
@@ -44,11 +44,11 @@ def _limit(unit: str, doc: str, default: float = 0.0, high: float = 1e300) -> An
 
 
 def _of_scene(unit: str, high: float, doc: str) -> Any:
-    return _number(-1.0, unit, -1.0, high, Effect.NOW, f"{doc}; -1: as in the scene")
+    return _number(-1.0, unit, -1.0, high, Effect.NOW, f"{doc}; with -1, the value in the scene")
 
 
 def _alarm(unit: str, high: float, doc: str) -> Any:
-    doc = f"{doc} that raise a warning and an error; 0: never"
+    doc = f"{doc} that raise a warning and an error; with 0, no alarm is raised"
     return _number((0.0, 0.0), unit, 0.0, high, Effect.CONFIGURE, doc)
 
 
@@ -62,25 +62,32 @@ def _plain(default: bool | str, effect: Effect, doc: str) -> Any:
 
 @dataclass(frozen=True)
 class Settings:
-    """All parameters with their defaults; numbers in SI units."""
+    """All parameters with their defaults. Numbers are in SI units."""
 
-    autostart: bool = _plain(True, Effect.START, "configure and activate at start; false: wait for lifecycle requests")
+    autostart: bool = _plain(
+        True, Effect.START, "configure and activate the node at start; if false, the node waits for lifecycle requests"
+    )
     hardware_id: str = _plain("plough_head", Effect.START, "serial number of the head, shown in status and diagnostics")
     file_root: str = _plain(
         "",
         Effect.START,
-        "folder within which scene, record_path and wear_state_path must be; empty: after the start they can only be "
-        "changed to the name of a preset",
+        "folder that must contain the paths scene, record_path and wear_state_path; if empty, these parameters cannot "
+        "be changed after the start, but scene can be set to the name of a preset",
     )
     services_off: str = _plain(
         "", Effect.START, "services that are refused, separated by commas, e.g. set_wear,acknowledge_alarms"
     )
     opcua_server: str = _plain(
-        "", Effect.START, "OPC UA server, opc.tcp://HOST:PORT, that replaces the topics of some inputs; empty: none"
+        "",
+        Effect.START,
+        "OPC UA server, opc.tcp://HOST:PORT, whose nodes replace the topics of some inputs; if empty, all inputs are "
+        "topics",
     )
-    opcua_map: str = _plain("", Effect.START, "YAML file that gives the nodes of opcua_server for these inputs")
+    opcua_map: str = _plain("", Effect.START, "YAML file that assigns nodes of opcua_server to inputs")
     opcua_access: str = _plain(
-        "", Effect.START, "YAML file with the credentials for opcua_server; empty: none (a server on this machine)"
+        "",
+        Effect.START,
+        "YAML file with the credentials for opcua_server; a server on this machine may need no credentials",
     )
     priority: int = _number(
         0,
@@ -88,18 +95,24 @@ class Settings:
         0,
         99,
         Effect.START,
-        "priority of the computing thread; 0: normal; a refusal by the system is a warning",
+        "real-time priority of the computing thread; with 0, the normal priority; a refusal by the system is a warning",
     )
-    cpu_affinity: str = _plain("", Effect.START, "processors to run on, e.g. 2,3; empty: all; a refusal is a warning")
-    lock_memory: bool = _plain(False, Effect.START, "keep all memory from being paged out; a refusal is a warning")
+    cpu_affinity: str = _plain(
+        "",
+        Effect.START,
+        "processors on which the node runs, e.g. 2,3; if empty, all processors; a refusal by the system is a warning",
+    )
+    lock_memory: bool = _plain(
+        False, Effect.START, "lock all memory, so that it is not paged out; a refusal by the system is a warning"
+    )
     scene: str = _plain("paper", Effect.CONFIGURE, "scene file, or the name of a preset: paper, bench_kv, bench_hc")
     tolerance: float = _number(1e-9, "1", 1e-13, 1e-3, Effect.CONFIGURE, "relative tolerance of the solver")
     excitation_source: str = _choice(
         "excitation",
         ("excitation", "tool_forces", "scene"),
         Effect.CONFIGURE,
-        "source of the load: a topic, or the scene's own loads by the node's clock; samples on the other topic are "
-        "counted and ignored",
+        "source of the load: a topic, or the loads in the scene at the time of the node's clock; samples on the other "
+        "topic are counted and ignored",
     )
     input_depth: int = _number(1000, "messages", 200, 100000, Effect.CONFIGURE, "queue depth of the excitation topics")
     expected_rate: float = _number(
@@ -108,25 +121,25 @@ class Settings:
         0.0,
         1e5,
         Effect.CONFIGURE,
-        "expected rate of the samples, from which gaps in the stamps are counted as missing samples; 0: not counted",
+        "expected rate of the samples, from which missing samples are counted; with 0, they are not counted",
     )
     publish_mode: str = _choice(
         "on_sample",
         ("on_sample", "fixed_rate"),
         Effect.CONFIGURE,
-        "publish after each sample used, or at publish_rate; the stamp is that of the newest sample used",
+        "publish after each used sample, or at publish_rate; each message has the stamp of the newest used sample",
     )
-    publish_rate: float = _number(100.0, "Hz", 0.1, 1000.0, Effect.CONFIGURE, "rate of publish_mode fixed_rate")
+    publish_rate: float = _number(100.0, "Hz", 0.1, 1000.0, Effect.CONFIGURE, "rate with publish_mode fixed_rate")
     missed_periods: int = _number(
         1,
         "periods",
         0,
         1000000,
         Effect.NOW,
-        "number of missed periods between two reports that gives a warning; 0: never",
+        "number of missed periods between two reports that causes a warning; with 0, no warning",
     )
     step_rate: float = _number(
-        100.0, "Hz", 1.0, 1000.0, Effect.CONFIGURE, "rate of advances under the scene's own loads and the hold policy"
+        100.0, "Hz", 1.0, 1000.0, Effect.CONFIGURE, "rate of advances under the loads in the scene and the hold policy"
     )
     rollback_span: float = _number(
         2.0,
@@ -134,15 +147,15 @@ class Settings:
         0.0,
         600.0,
         Effect.CONFIGURE,
-        "largest age, relative to the newest sample, at which a late sample is used; 0: late samples are dropped",
+        "largest age, relative to the newest sample, at which a late sample is used; with 0, late samples are dropped",
     )
     estimate: bool = _plain(
         False,
         Effect.CONFIGURE,
-        "estimate clearances and contact from load and head_pose or gaps, in a process of its own",
+        "estimate clearances and contact parameters from the load and head_pose or gaps, in a separate process",
     )
     estimate_window: float = _number(
-        32.0, "s", 1.0, 600.0, Effect.CONFIGURE, "length of the window of an estimate; ten load periods are enough"
+        32.0, "s", 1.0, 600.0, Effect.CONFIGURE, "duration of the window of an estimate; ten load periods are enough"
     )
     estimate_interval: float = _number(10.0, "s", 0.5, 3600.0, Effect.CONFIGURE, "time between the ends of two windows")
     estimate_forces: int = _number(
@@ -151,14 +164,16 @@ class Settings:
         0,
         4096,
         Effect.CONFIGURE,
-        "number of twins drawn from each estimate for window_forces, at least 20; 256 is plenty; 0: no intervals",
+        "number of twins, at least 20, that are drawn from each estimate for the intervals on window_forces; 256 are "
+        "sufficient; with 0, window_forces is not published",
     )
     follow: str = _choice(
         "full",
         ("off", "parameters", "full"),
         Effect.CONFIGURE,
-        "how the twin follows the machine with `estimate`; off: not at all; parameters: each estimate sets the numbers "
-        "of the model; full: each measured pose also corrects the motion, and the forces have intervals",
+        "how the twin follows the machine if `estimate` is true. With off, it does not follow. With parameters, each "
+        "estimate sets the parameters of the model. With full, each measured pose also corrects the motion, and the "
+        "forces have intervals",
     )
     follow_members: int = _number(
         128,
@@ -166,7 +181,7 @@ class Settings:
         20,
         4096,
         Effect.CONFIGURE,
-        "number of twins with follow: full; each takes the same computing time",
+        "number of twins with follow: full; the computing time is proportional to this number",
     )
     forecast_limits: tuple[float, ...] = _number(
         (0.0, 0.0),
@@ -174,10 +189,10 @@ class Settings:
         0.0,
         1.0,
         Effect.CONFIGURE,
-        "limits of the horizontal and the vertical clearance for the forecast after each estimate; 0: no forecast",
+        "limits of the horizontal and the vertical clearance for the forecast after each estimate; with 0, no forecast",
     )
     forecast_horizon: float = _number(
-        1.44e7, "s", 1.0, 1e10, Effect.CONFIGURE, "time of operation beyond which a limit counts as not reached"
+        1.44e7, "s", 1.0, 1e10, Effect.CONFIGURE, "time of operation after which a limit counts as not reached"
     )
     forecast_stop: float = _number(
         0.0,
@@ -185,58 +200,77 @@ class Settings:
         0.0,
         1e10,
         Effect.CONFIGURE,
-        "time of operation to a planned stop; the forecast gives the probability of a limit before it; 0: no stop",
+        "time of operation until a planned stop; the forecast contains the probability that a limit is reached before "
+        "the stop; with 0, no stop is planned",
     )
     forecast_scenarios: str = _plain(
         "",
         Effect.CONFIGURE,
-        "scenarios as multiples of load and wear coefficient: NAME:load=X,coefficient=Y; NAME:...; the answer of "
-        "~/forecast has a forecast for each scenario",
+        "scenarios with factors of the load and the wear coefficient: NAME:load=X,coefficient=Y; NAME:...; the answer "
+        "of ~/forecast contains a forecast for each scenario",
     )
     wear_state_path: str = _plain(
         "",
         Effect.CONFIGURE,
-        "folder that keeps the wear of the pads after the process ends; the wear of another head or scene is refused; "
-        "empty: not kept",
+        "folder in which the wear of the pads is saved; the wear of another head or scene is refused; if empty, the "
+        "wear is not saved",
     )
     wear_save_period: float = _number(10.0, "s", 0.1, 3600.0, Effect.CONFIGURE, "interval at which the wear is saved")
-    frame_id: str = _plain("slide_frame", Effect.CONFIGURE, "frame of all outputs: centre of the slide, x right, y up")
-    child_frame_id: str = _plain("head_frame", Effect.CONFIGURE, "frame of the head in head_state")
+    frame_id: str = _plain(
+        "slide_frame",
+        Effect.CONFIGURE,
+        "frame of all outputs; the origin is the centre of the slide, x points to the right and y points up",
+    )
+    child_frame_id: str = _plain("head_frame", Effect.CONFIGURE, "frame of the head in messages on head_state")
     marker_rate: float = _number(
         0.0,
         "Hz",
         0.0,
         100.0,
         Effect.CONFIGURE,
-        "rate of the topic markers: walls, pads and forces for RViz; needs visualization_msgs; node only; 0: off",
+        "rate of the topic markers, on which the ROS node sends walls, pads and forces for RViz; needs "
+        "visualization_msgs; with 0, no markers are sent",
     )
     tf: bool = _plain(
         False,
         Effect.CONFIGURE,
-        "send the head's pose on /tf with the markers, from frame_id to child_frame_id; needs tf2_msgs; node only",
+        "send the pose of the head on /tf with the markers, from frame_id to child_frame_id; needs the ROS node and "
+        "tf2_msgs",
     )
     record_path: str = _plain(
         "",
         Effect.CONFIGURE,
-        "folder for the recording of each configured run, with _2, _3, ... if it exists; empty: no recording",
+        "folder for the recording of each configured run; if it exists, _2, _3, ... is added to its name; if empty, no "
+        "run is recorded",
     )
     record_outputs: str = _choice(
         "all",
         ("all", "decimated", "none"),
         Effect.CONFIGURE,
-        "recorded outputs; none: the journal alone, from which `plow-twin replay --write` computes them",
+        "recorded outputs; with none, only the journal is recorded, from which `plow-twin replay --write` computes the "
+        "outputs",
     )
     record_rate: float = _number(
-        50.0, "Hz", 0.1, 10000.0, Effect.CONFIGURE, "rate of the outputs in a decimated recording; peaks are kept"
+        50.0,
+        "Hz",
+        0.1,
+        10000.0,
+        Effect.CONFIGURE,
+        "rate of the outputs in a decimated recording; each output contains the peaks since the previous output",
     )
     record_part_mb: float = _number(
-        0.0, "MB", 0.0, 1e6, Effect.CONFIGURE, "size at which the recording continues in a new part; 0: never"
+        0.0, "MB", 0.0, 1e6, Effect.CONFIGURE, "size after which a new file of the recording begins; with 0, no limit"
     )
     record_part_s: float = _number(
-        0.0, "s", 0.0, 1e9, Effect.CONFIGURE, "time after which the recording continues in a new part; 0: never"
+        0.0, "s", 0.0, 1e9, Effect.CONFIGURE, "time after which a new file of the recording begins; with 0, no limit"
     )
     record_keep_mb: float = _number(
-        0.0, "MB", 0.0, 1e9, Effect.CONFIGURE, "total size of closed parts above which the oldest are removed; 0: never"
+        0.0,
+        "MB",
+        0.0,
+        1e9,
+        Effect.CONFIGURE,
+        "total size of completed files above which the oldest files are removed; with 0, no file is removed",
     )
     record_ring: float = _number(
         0.0,
@@ -244,7 +278,8 @@ class Settings:
         0.0,
         3600.0,
         Effect.CONFIGURE,
-        "keep only the last seconds, in memory, and write them to a folder at each alarm or mark; 0: record everything",
+        "duration of a recording in memory, which is written to a folder at each alarm or mark; with 0, the whole run "
+        "is recorded on the disk",
     )
     record_sync: bool = _plain(
         False, Effect.CONFIGURE, "wait for the disk every half second, so that the recording survives a loss of power"
@@ -255,35 +290,42 @@ class Settings:
         0.01,
         3600.0,
         Effect.NOW,
-        "silence after which the excitation counts as stale; in files and under use_sim_time it is only counted",
+        "time without samples after which the excitation counts as stale; in files and under use_sim_time, such a "
+        "silence is only counted",
     )
     hold_policy: str = _choice(
         "hold", ("hold", "zero"), Effect.NOW, "load while the excitation is stale: the last load, or zero"
     )
     hold_limit: float = _number(
-        60.0, "s", 0.0, 86400.0, Effect.NOW, "silence beyond the timeout after which the model stops"
+        60.0, "s", 0.0, 86400.0, Effect.NOW, "time for which the model continues while the excitation is stale"
     )
-    limit_force: float = _limit("N", "force component; 0: ten times the scene's loads and weight")
-    limit_moment: float = _limit("N m", "moment; 0: derived from the scene's loads and weight")
-    limit_force_rate: float = _limit("N/s", "rate of change of a force; 0: a change by limit_force within 1 ms")
-    limit_moment_rate: float = _limit("N m/s", "rate of change of the moment; 0: a change by limit_moment within 1 ms")
+    limit_force: float = _limit("N", "force component; with 0, ten times the loads and the weight in the scene")
+    limit_moment: float = _limit("N m", "moment; with 0, derived from the loads and the weight in the scene")
+    limit_force_rate: float = _limit("N/s", "rate of change of a force; with 0, a change by limit_force within 1 ms")
+    limit_moment_rate: float = _limit(
+        "N m/s", "rate of change of the moment; with 0, a change by limit_moment within 1 ms"
+    )
     limit_travel: float = _limit("m/s", "speed along the face", 10.0, 1000.0)
-    limit_travel_rate: float = _limit("m/s^2", "acceleration along the face; 0: a change by limit_travel within 1 ms")
-    limit_pose: float = _limit(
-        "m", "measured displacement; 0: half the larger side of the frame or clearance", high=1000.0
+    limit_travel_rate: float = _limit(
+        "m/s^2", "acceleration along the face; with 0, a change by limit_travel within 1 ms"
     )
-    limit_pose_rate: float = _limit("m/s", "rate of change of a displacement; 0: a change by limit_pose within 1 ms")
-    limit_gap: float = _limit("m", "measured gap; 0: as limit_pose", high=1000.0)
-    limit_gap_rate: float = _limit("m/s", "rate of change of a gap; 0: a change by limit_gap within 1 ms")
+    limit_pose: float = _limit(
+        "m", "measured displacement; with 0, half the larger side of the frame or clearance", high=1000.0
+    )
+    limit_pose_rate: float = _limit(
+        "m/s", "rate of change of a displacement; with 0, a change by limit_pose within 1 ms"
+    )
+    limit_gap: float = _limit("m", "measured gap; with 0, the limit of a displacement", high=1000.0)
+    limit_gap_rate: float = _limit("m/s", "rate of change of a gap; with 0, a change by limit_gap within 1 ms")
     set_wear: tuple[float, ...] = _number(
         (0.0,) * 8,
         "m",
         0.0,
         1.0,
         Effect.NOW,
-        "wear depth of the eight pads for the service ~/set_wear; all 0: new pads",
+        "wear depths of the eight pads, which the service ~/set_wear applies; new pads have the depth 0",
     )
-    mark: str = _plain("", Effect.NOW, "text that the service ~/mark puts into the journal")
+    mark: str = _plain("", Effect.NOW, "text that the service ~/mark writes to the journal")
     clearance_horizontal: float = _of_scene("m", 10.0, "horizontal clearance of unworn pads")
     clearance_vertical: float = _of_scene("m", 10.0, "vertical clearance of unworn pads")
     stiffness: float = _of_scene("N/m^exponent", 1e300, "stiffness of the contact law")
@@ -296,14 +338,14 @@ class Settings:
         0,
         1000000000,
         Effect.CONFIGURE,
-        "largest number of evaluations of the equations of motion in an advance, at least 16; the rest is computed "
-        "coarsely, with an estimate of its error; 0: unlimited",
+        "largest number of evaluations of the equations of motion in an advance, at least 16; the rest of the advance "
+        "is computed coarsely, with an estimate of the error; with 0, the number is unlimited",
     )
     head_pose_type: str = _choice(
         "pose",
         ("pose", "pose_with_covariance"),
         Effect.CONFIGURE,
-        "message of head_pose: PoseStamped, or PoseWithCovarianceStamped with variances of x, y and theta",
+        "type of the messages on head_pose: PoseStamped, or PoseWithCovarianceStamped with variances of x, y and theta",
     )
     head_pose_deviation: tuple[float, ...] = _number(
         (0.0, 0.0, 0.0),
@@ -311,42 +353,54 @@ class Settings:
         0.0,
         1.0,
         Effect.CONFIGURE,
-        "standard deviation of head_pose: x, y, theta; 0: not known",
+        "standard deviations of x, y and theta on head_pose; 0 means unknown",
     )
-    gaps_deviation: float = _number(0.0, "m", 0.0, 1.0, Effect.CONFIGURE, "standard deviation of gaps; 0: not known")
+    gaps_deviation: float = _number(
+        0.0, "m", 0.0, 1.0, Effect.CONFIGURE, "standard deviation of the measured gaps; 0 means unknown"
+    )
     excitation_deviation: tuple[float, ...] = _number(
         (0.0, 0.0, 0.0),
         "N, N, N m",
         0.0,
         1e12,
         Effect.CONFIGURE,
-        "standard deviation of the excitation: Fx, Fy, M; 0: not known",
+        "standard deviations of Fx, Fy and M on excitation; 0 means unknown",
     )
-    alarm_force: tuple[float, ...] = _alarm("N", 1e12, "forces")
+    alarm_force: tuple[float, ...] = _alarm("N", 1e12, "contact forces")
     alarm_clearance: tuple[float, ...] = _alarm("m", 10.0, "values of the larger clearance")
     alarm_wear_rate: tuple[float, ...] = _alarm("m/s", 1.0, "wear rates of a pad")
     alarm_clearance_rate: tuple[float, ...] = _alarm("m/s", 1.0, "growth rates of the larger clearance, over 10 s,")
     alarm_residual: tuple[float, ...] = _alarm("m", 10.0, "distances of head_pose from the model at the same stamp")
     alarm_duration: float = _number(
-        0.0, "s", 0.0, 3600.0, Effect.CONFIGURE, "time that a level must last before it raises an alarm"
+        0.0, "s", 0.0, 3600.0, Effect.CONFIGURE, "time for which a value must exceed a threshold to raise an alarm"
     )
     jump_back: float = _number(
-        1.0, "s", 0.0, 3600.0, Effect.NOW, "a stamp older than the newest by more than this resets the model"
+        1.0, "s", 0.0, 3600.0, Effect.NOW, "largest age relative to the newest stamp; an older stamp resets the model"
     )
     jump_forward: float = _number(
-        10.0, "s", 0.1, 3600.0, Effect.NOW, "a stamp ahead of the model's time by more than this resets the model"
+        10.0,
+        "s",
+        0.1,
+        3600.0,
+        Effect.NOW,
+        "largest lead of a stamp ahead of the model time; a stamp further ahead resets the model",
     )
     failure_limit: int = _number(
-        10, "advances", 0, 1000000, Effect.NOW, "failed advances in a row after which the model is reset; 0: never"
+        10,
+        "advances",
+        0,
+        1000000,
+        Effect.NOW,
+        "number of consecutive failed advances after which the model is reset; with 0, the model is not reset",
     )
 
     @property
     def follows(self) -> str:
-        """`follow`, or `off` without an estimate."""
+        """The parameter `follow`, or `off` if the parameter `estimate` is false."""
         return self.follow if self.estimate else "off"
 
 
-#: Parameters that change the running model, by their keys in the scene file.
+#: Parameters that change the running model, with the keys of these numbers in the scene file.
 MODEL: Final[Mapping[str, str]] = {
     "clearance_horizontal": "clearance.horizontal_m",
     "clearance_vertical": "clearance.vertical_m",
@@ -355,22 +409,23 @@ MODEL: Final[Mapping[str, str]] = {
     "restitution": "contact.restitution",
     "wear_coefficient": "wear.coefficient_m2_n",
 }
-#: Parameters that name files or folders. Anybody on the ROS graph may set parameters, so these are limited.
+#: Parameters that contain paths. Any participant of the ROS graph can set parameters, so the paths are restricted.
 FILES: Final = ("scene", "record_path", "wear_state_path")
 SPECS: Final[Mapping[str, Field[Any]]] = {spec.name: spec for spec in fields(Settings)}
-#: A number, also in a form like 1e-9 that YAML 1.1, which ROS launch files use, reads as a text.
+#: Pattern of a number. ROS launch files use YAML 1.1, which reads a number such as 1e-9 as a string.
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-#: Longest text [characters], which is the longest path on Linux.
+#: Largest length of a text [characters], equal to the largest length of a path on Linux.
 _LONGEST: Final = 4096
-#: One line without control characters, which a terminal would obey.
+#: Pattern of a line without control characters, which could change the state of a terminal.
 _ONE_LINE: Final = r"^[^\x00-\x1f\x7f-\x9f]*\Z"
 _FOREIGN: Final = ("use_sim_time", "start_type_description_service")
 
 
 def coerce(name: str, value: Any) -> Any:
-    """Return the value in the parameter's type, or unchanged if the conversion would not be exact.
+    """Convert a value to the type of the parameter `name`; return the value unchanged if this is impossible.
 
-    Integers and texts like `1e-9`, which YAML 1.1 does not read as numbers, become doubles; sequences become tuples.
+    Integers, and strings such as `1e-9`, which YAML 1.1 does not read as numbers, become floats. Sequences become
+    tuples.
     """
     default = SPECS[name].default
     if isinstance(default, tuple):
@@ -391,7 +446,7 @@ def _is_list(value: Any) -> bool:
 
 
 def expected(spec: Field[Any]) -> str:
-    """Return in words which values a parameter can have."""
+    """Return a text that describes the values that a parameter can have."""
     if "choices" in spec.metadata:
         return f"one of {', '.join(spec.metadata['choices'])}"
     if isinstance(spec.default, tuple):
@@ -406,7 +461,7 @@ def _range(kind: str, spec: Field[Any]) -> str:
 
 
 def problems(values: Mapping[str, Any]) -> list[Problem]:
-    """Return the problems of values; unknown names are ignored."""
+    """Return the problems of parameter values. Unknown names are ignored."""
     from plow_twin.scene_file.validation import validate
 
     known = {name: coerce(name, value) for name, value in values.items() if name in SPECS}
@@ -437,7 +492,13 @@ def _property(spec: Field[Any]) -> dict[str, Any]:
 
 
 def settings(values: Mapping[str, Any]) -> Settings:
-    """Return the settings with given values in place of defaults; raise ParameterError if some cannot be used."""
+    """Return the settings in which `values` replace the defaults.
+
+    Raises
+    ------
+    ParameterError
+        A value is invalid, or values contradict each other.
+    """
     found = problems(values)
     if found:
         raise ParameterError(found)
@@ -472,7 +533,7 @@ def _swapped_thresholds(given: Settings) -> list[Problem]:
 
 
 def outside(settings: Settings) -> list[Problem]:
-    """Return a problem for each parameter that names a file outside `file_root`, after symbolic links."""
+    """Return a problem for each path that is not in the folder `file_root`. Symbolic links are resolved first."""
     if not settings.file_root:
         return []
     root = Path(settings.file_root).resolve()
@@ -485,7 +546,7 @@ def outside(settings: Settings) -> list[Problem]:
 
 
 def refused_changes(before: Settings, after: Settings) -> list[str]:
-    """Return why parameters that name files cannot be changed after the start; presets can."""
+    """Return the reasons why paths cannot be changed after the start; a change to a preset is allowed."""
     if after.file_root:
         return [str(problem) for problem in outside(after)]
     changed = [name for name in FILES if getattr(before, name) != getattr(after, name)]
@@ -501,13 +562,16 @@ def _is_path(name: str, given: str) -> bool:
 
 
 def model_changes(given: Settings) -> dict[str, float]:
-    """Return the numbers of the scene that parameters change, by their keys in the scene."""
+    """Return the numbers that replace numbers of the scene, by their keys in the scene file."""
     values = {key: getattr(given, name) for name, key in MODEL.items()}
     return {key: value for key, value in values.items() if value != -1.0}
 
 
 def read_parameters(path: Path) -> dict[str, Any]:
-    """Return the parameters in a YAML file, by plain names or under `ros__parameters` as for a ROS node."""
+    """Return the parameters in a YAML file.
+
+    The file contains a mapping of names to values, or the key `ros__parameters` as in a parameter file of a ROS node.
+    """
     from plow_twin.scene_file.yaml_text import read_yaml
 
     given, found = read_yaml(path, "parameter", "a mapping of names to values")
@@ -522,7 +586,7 @@ def read_parameters(path: Path) -> dict[str, Any]:
 
 
 def read_value(text: str) -> Any:
-    """Return a value read as YAML; other text stays text."""
+    """Return the value of a YAML text, or the text itself if it is not valid YAML."""
     from plow_twin.scene_file.yaml_text import load_yaml
 
     value, found = load_yaml(text, "value", "a value")
@@ -530,7 +594,7 @@ def read_value(text: str) -> Any:
 
 
 def unknown(names: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Yield unknown names, each with the nearest parameter or an empty text."""
+    """Yield each unknown name with the most similar parameter, or with an empty string if no parameter is similar."""
     for name in names:
         if name not in SPECS and name not in _FOREIGN and not name.startswith("qos_overrides."):
             yield name, next(iter(difflib.get_close_matches(name[:100], SPECS, 1)), "")
@@ -542,13 +606,13 @@ def _yaml_value(value: Any) -> str:
     if isinstance(value, tuple):
         return f"[{', '.join(map(_yaml_value, value))}]"
     if isinstance(value, float):
-        # YAML 1.1 needs a point in the mantissa
+        # in YAML 1.1, a number with an exponent needs a decimal point
         return f"{value!r}" if "e" not in repr(value) else f"{value:.1e}"
     return f'"{value}"' if isinstance(value, str) else str(value)
 
 
 def yaml_text() -> str:
-    """Return a parameter file with all defaults and their meanings."""
+    """Return the text of a parameter file with the descriptions and defaults of all parameters."""
     lines = ["# Parameters of the node plow_twin, all at their defaults.", "/**:", "  ros__parameters:"]
     for spec in SPECS.values():
         doc, effect = spec.metadata["doc"], spec.metadata["effect"].value

@@ -1,4 +1,4 @@
-"""The form of a part of `/diagnostics`."""
+"""Type of a part of `/diagnostics`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Part = tuple[int, str, dict[str, str]]
 
 
 def number_of(text: str) -> float | None:
-    """Return the number in a value, or None if the value is no finite number."""
+    """Return the number that a value contains, or None if the value is not a finite number."""
     try:
         found = float(text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Messages of a live twin: sending, recording, alarms and counters."""
+"""Send and record the messages of a live twin, and update its alarms and counters."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from plow_twin.stream.session import Series
 if TYPE_CHECKING:
     from plow_twin.live.recording import Recording
 
-#: Base name of the topic, and the message; a message of the motion is the bytes of its buffer.
+#: Base name of a topic and a message. A message of the motion is the buffer with its bytes.
 Outgoing = tuple[str, memoryview | Message]
 
 
 class Front(Protocol):
-    """The side of a live twin that faces the transport: it brings the samples and sends the messages.
+    """Interface of a live twin to its transport, which delivers the samples and sends the messages.
 
     Attributes
     ----------
     name : str
-        Name of the twin, with its namespace.
+        Name of the twin, including the namespace.
     topics : mapping
-        Resolved names of the outputs by their base names.
+        Resolved name of each output topic, by base name.
     follows_samples : bool
-        Whether only samples advance the time, as with `/clock` or a file, so that a silence does not.
+        Whether only samples advance the time, as with `/clock` or a file. Time then stops while no samples arrive.
     sends_motion : bool
-        Whether messages of the motion are sent, and not only recorded.
+        Whether messages of the motion are sent. If not, they are only recorded.
     """
 
     name: str
@@ -43,35 +43,35 @@ class Front(Protocol):
     sends_motion: bool
 
     def now_ns(self) -> int:
-        """Return the time [ns] on the clock of the stamps; 0 if there is none yet."""
+        """Return the time on the clock of the stamps [ns], or 0 if the time is still unknown."""
 
     def send(self, topic: str, message: memoryview | Message) -> None:
-        """Send a message on the topic with a base name."""
+        """Send a message on the topic with the base name `topic`."""
 
     def look_for_senders(self, topic: str) -> None:
         """Check whether the followed sender of an input still exists."""
 
     def sender_name(self, topic: str, sender: bytes) -> str:
-        """Return the name of a sender of an input."""
+        """Return the name of the sender with the identifier `sender`."""
 
     def changed(self) -> None:
-        """Take notice that the state of the stream may have changed."""
+        """Update the status, because the state of the stream may have changed."""
 
     def time_text(self, stamp_ns: int) -> str:
-        """Return a stamp as text, in the form that the input has."""
+        """Return a stamp as text, in the form of the times in the input."""
 
     def say_alarm(self, level: int, text: str) -> None:
-        """Log an alarm that has been raised to a level."""
+        """Log an alarm with its level."""
 
     def say_error(self, text: str) -> None:
-        """Log an error, perhaps from another thread."""
+        """Log an error. The method may be called from another thread."""
 
 
 class Publishing:
-    """The output of a live twin.
+    """Output of a live twin.
 
-    `on_alarm` receives a text when an alarm is latched. `catch_up` computes the intervals of a publication after its
-    forces have been sent; without it they are computed before.
+    The function `on_alarm` receives a text when an alarm is latched. The function `catch_up` computes the intervals of
+    a publication after the forces have been sent. It is None if the intervals are computed earlier.
     """
 
     def __init__(
@@ -93,29 +93,30 @@ class Publishing:
             self._messages = Messages(*frames, intervals=settings.follows == "full")
         self.latency = DurationHistogram()
         self.age = DurationHistogram()
-        #: number of publications, and of those not sent because a number was not finite
+        #: number of publications that were sent, and number that were withheld because a number was not finite
         self.published = self.withheld = 0
-        #: number of publications computed without a sample, and of those that correct earlier ones by late samples
+        #: number of publications without a sample, and number of publications that a late sample corrected
         self.held_frames = self.corrected_frames = 0
-        #: steady time at which the samples of the next publication were received [ns]; 0 without samples
+        #: monotonic time at which the samples of the next publication were received [ns]; 0 without samples
         self.received_ns = 0
-        #: stamp of the sample that changed the alarms within a series [ns]
+        #: while a series is processed, the stamp of the sample that changed the alarms [ns]
         self.series_ns: int | None = None
-        #: newest published row, shape (1,), which the next publication overwrites
+        #: last published row, shape (1,), which the next publication overwrites
         self.newest: Rows | None = None
         self._catch_up = catch_up
         self.watch: Callable[[Published], object] | None = None
 
     @property
     def memory(self) -> Mapping[str, memoryview]:
-        """The buffer of each message of the motion, by base name of its topic."""
+        """Buffer of each message of the motion, by base name of the topic."""
         return {} if self._messages is None else self._messages.memory
 
     def messages(self, published: Published) -> Iterator[Outgoing]:
-        """Yield the messages of a publication of at most one row, or nothing if a number is not finite.
+        """Yield the messages of a publication, which has at most one row.
 
-        The forces come first, the intervals last, because many twins must first be advanced for them. In between, the
-        publication is counted, recorded and judged by the alarms.
+        If a number is not finite, no message is yielded. The forces are yielded first. The intervals are yielded after
+        the other messages of the motion, because many twins must be advanced to compute the intervals. The publication
+        is then counted and recorded, and the alarms are updated.
         """
         rows, _ = published
         if not len(rows):
@@ -150,7 +151,7 @@ class Publishing:
             yield from self.alarms_changed(stamp_ns)
 
     def series(self, series: Series, journal: Callable[[Series], object]) -> Iterator[Outgoing]:
-        """Journal and record samples that were applied together; yield only the alarms that they change."""
+        """Write a series of samples to the journal, record its publications, and yield the alarms that it changes."""
         published, begin = series.published, 0
         if not len(published.rows):
             journal(series)
@@ -174,7 +175,7 @@ class Publishing:
                 self.recording.publications(series.published)
 
     def alarms_changed(self, stamp_ns: int) -> Iterator[Outgoing]:
-        """Yield the alarms, and report those that were raised."""
+        """Yield the message with the alarms, and log each alarm that was raised."""
         yield self.alarms_now(stamp_ns)
         if self.alarms.raised:
             self._on_alarm(f"alarm: {', '.join(self.alarms.raised)}")
@@ -186,7 +187,7 @@ class Publishing:
         return next(text for text in alarm_texts(dict(status.values)) if text.startswith(name.replace("_", " ") + " "))
 
     def alarms_now(self, stamp_ns: int) -> Outgoing:
-        """Return the present alarms."""
+        """Record and return the message with the current alarms."""
         status = alarms_message(self.alarms, self._front.name, self._head)
         if self.recording:
             self.recording.message(ALARMS, stamp_ns, status)

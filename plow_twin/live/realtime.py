@@ -1,4 +1,4 @@
-"""Priority, processors and locked memory of this process; a refusal by the system is only a warning."""
+"""Set the priority, the processors and the memory lock of this process."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Final
 
 from plow_twin.live.parameters import Settings
 
-#: Flags of `mlockall`: present pages, future pages.
+#: Flags of `mlockall` that lock the existing pages and the future pages of memory.
 _MCL_CURRENT: Final = 1
 _MCL_FUTURE: Final = 2
 
 
 def apply_realtime(settings: Settings) -> list[str]:
-    """Request the settings; return the refusals."""
+    """Request the real-time settings from the operating system, and return a text for each refused setting."""
     refused = []
     if settings.priority:
         try:

@@ -1,4 +1,4 @@
-"""The recording of a live twin; imported only when a run is recorded."""
+"""Record the run of a live twin. The module is imported only if a run is recorded."""
 
 from __future__ import annotations
 
@@ -27,11 +27,20 @@ _QUEUE_SIZE: Final = 20_000
 
 
 class Recording:
-    """The recording of a configured node.
+    """Recording of a configured twin.
 
-    `topics` are the resolved names of the outputs by their base names. `clock` returns the time [ns] on `/clock`;
-    without it the system's time is used. `on_error` is called from the recorder's thread with the reason when recording
-    stops early.
+    Parameters
+    ----------
+    settings, scene
+        Parameters and scene of the twin.
+    node_name
+        Name of the node.
+    topics
+        Resolved name of each output topic, by base name.
+    clock
+        Function that returns the time on `/clock` [ns], or None if the system time is used.
+    on_error
+        Function that receives the reason when recording stops early. It is called in the thread of the recorder.
     """
 
     def __init__(
@@ -69,12 +78,12 @@ class Recording:
             now_ns=clock or time.time_ns,
             on_error=on_error,
         )
-        #: for each sample of the newest series, the number of the last journal entry before its publication
+        #: result of `Recorder.series` for the last series, shape (n,)
         self._series = np.zeros(0, np.int64)
         self.recorder = in_free_folder(Path(settings.record_path), make)
 
     def publication(self, published: Published, sent: Mapping[str, bytes]) -> None:
-        """Record a sent publication; `sent` has the bytes of its messages, if there are any."""
+        """Record a publication. `sent` contains the bytes of its messages by base name, or is empty."""
         wanted = self._decimation.select(published)
         if wanted is not None:
             self.recorder.publication(wanted, sent if wanted is published else {})
@@ -84,11 +93,11 @@ class Recording:
                 self.message(topic, stamp_ns, message)
 
     def series(self, series: Series) -> None:
-        """Journal samples that were applied together."""
+        """Write a series of samples to the journal."""
         self._series = self.recorder.series(series)
 
     def publications(self, published: Published) -> None:
-        """Record the publications after each sample of the newest series."""
+        """Record the publications of the last series, one for each sample."""
         if self._decimation.keeps_all:
             self.recorder.publications(published, self._series)
             return
@@ -98,16 +107,16 @@ class Recording:
                 self.recorder.publications(wanted, np.array([sequence]))
 
     def message(self, topic: str, stamp_ns: int, message: Message) -> None:
-        """Record another message, by base name of its topic."""
+        """Record any other message on the topic with the base name `topic`."""
         self.recorder.output(self._topics[topic], stamp_ns, message)
 
     @property
     def behind(self) -> bool:
-        """Whether the recorder's queue is so full that messages may soon be lost."""
+        """Whether the queue of the recorder is more than half full."""
         return self.recorder.counters.queued > _QUEUE_SIZE // 2
 
     def renew(self, session: Session) -> bool:
-        """Journal a snapshot if entries were lost and there is room again; return whether this was done."""
+        """Write a snapshot to the journal if the recorder wants one; return whether it was written."""
         wanted = self.recorder.snapshot_wanted
         if wanted:
             self.recorder.journal(session.renew())

@@ -1,6 +1,7 @@
-"""A live twin without its transport, and the way of a sample through it: intake, twin, publication, recording.
+"""The live twin without its transport.
 
-A front, either the ROS node or `plow-twin live`, brings samples and sends messages.
+A front, which is the ROS node or the command `plow-twin live`, delivers samples and sends messages. Each sample is
+checked by the intake, advances the twin, and causes a publication, which is recorded.
 """
 
 from __future__ import annotations
@@ -43,17 +44,26 @@ if TYPE_CHECKING:
 
 _CATCH_UP_S: Final = 0.002
 _LOOK_FOR_CLOCK_HZ: Final = 20.0
-#: Rate at which unused messages are journalled [Hz].
+#: Rate at which unused messages are written to the journal [Hz].
 _UNUSED_HZ: Final = 5.0
-#: Following twins are too slow if samples wait longer than `_LONGEST_WAIT_S` in each of `_WAITING_SECONDS` seconds.
+#: Twins that follow measurements are too slow if samples wait for longer than `_LONGEST_WAIT_S` [s] in each of
+#: `_WAITING_SECONDS` consecutive seconds.
 _LONGEST_WAIT_S, _WAITING_SECONDS = 0.5, 5
 
 
 class Runtime:
-    """A configured twin, made on configure and closed on cleanup.
+    """A configured twin. It is created when the node is configured and closed when the node is cleaned up.
 
-    The `prepared` twin belongs to this runtime alone. `kept_wear` is the wear of earlier runtimes of this process, by
-    the scene's identity.
+    Parameters
+    ----------
+    front
+        Interface to the transport.
+    settings
+        Parameters of the twin.
+    prepared
+        Scene and compiled twin, which no other runtime may use.
+    kept_wear
+        Wear of earlier runtimes of this process; the key is the result of `scene_identity` for the scene.
 
     Raises
     ------
@@ -73,19 +83,19 @@ class Runtime:
         self._front = front
         self.settings = settings
         self.scene = prepared.scene
-        #: time that compiling or loading the solver took [s]
+        #: time in which the solver was compiled or loaded [s]
         self.compile_s = prepared.compile_s
-        #: periods of the loop at a fixed rate or on the clock; None if the samples advance the twin
+        #: statistics of the period of publications at a fixed rate, or of advances by the clock; otherwise None
         self.periods = _periods(settings)
         #: `waiting` until the first message on `/clock`, then `paused` or `running`
         self.clock = "running"
-        #: whether another node publishes on this twin's topics
+        #: whether another node publishes on the output topics of this twin
         self.others_publish = False
-        #: whether only the parameters still follow the measurements, because the twins were too slow
+        #: whether measured poses no longer correct the motion, because the twins were too slow
         self.reduced = False
         self._waiting_seconds = 0
         self._clock_before_ns = 0
-        #: whether the journal still waits for a clock, so that services are refused
+        #: whether the journal is not open, because the time is unknown; services are refused in this state
         self.waits_for_clock = True
         self._early: list[Arrival] = []
         self._seen: tuple[Any, ...] = ()
@@ -97,7 +107,7 @@ class Runtime:
         if misplaced:
             raise ParameterError(misplaced)
         self.alarms = alarms_of(asdict(settings))
-        # an impossible change of the model is refused before samples come
+        # an invalid change of the model raises an error here, before the first sample
         changed_twin(prepared.twin, prepared.scene, model_changes(settings))
         with ExitStack() as made:
             if settings.wear_state_path:
@@ -138,7 +148,7 @@ class Runtime:
         self._set_limits(settings)
 
     def start(self) -> None:
-        """Open the journal; without a clock, the first sample opens it."""
+        """Open the journal if the time is known; otherwise the journal is opened later."""
         self.waits_for_clock = self.without_clock
         self.inputs.started = not self.waits_for_clock
         self.clock = "waiting" if self.waits_for_clock else "running"
@@ -147,7 +157,7 @@ class Runtime:
             self.driver.set_model(self.stamp_ns, model_changes(self.settings))
 
     def refusals(self, settings: Settings) -> list[str]:
-        """Return why the running twin cannot take parameters."""
+        """Return the reasons why the running twin cannot use new parameters."""
         try:
             self.driver.session.check_model(model_changes(settings))
         except ArgumentError as error:
@@ -161,50 +171,50 @@ class Runtime:
 
     @property
     def without_clock(self) -> bool:
-        """Whether the node uses `/clock`, on which nothing has come."""
+        """Whether the node uses `/clock` and has received no message on it."""
         return self._front.now_ns() == 0
 
     def kept_wear(self) -> KeptWear:
-        """Return the wear for the next runtime of this process, after `close`."""
+        """Return the wear for the next runtime of this process. `close` must be called before."""
         depth = self.driver.session.wear_depth
         return self.wear_keeper.kept(depth) if self.wear_keeper else KeptWear(tuple(depth.tolist()))
 
     @property
     def follower(self) -> Follower | None:
-        """The twin, if it follows measurements."""
+        """The twin, or None if it does not follow measurements."""
         found: Follower | None = cast(Any, self.driver.session.following)
         return found
 
     @property
     def reads_at_once(self) -> bool:
-        """Whether many samples may be used in one call: they have their own time, and no motion is sent."""
+        """Whether `step_series` may be used: only samples advance the time, and messages of the motion are not sent."""
         return self._front.follows_samples and not self._front.sends_motion
 
     @property
     def recorder_state(self) -> str:
-        """`off`, `recording`, or `trouble` if something was lost or the recording has stopped."""
+        """State of the recorder: `off`, `recording`, or `trouble` if data were lost or the recording has stopped."""
         if self.recording is None:
             return "off"
         found = self.recording.recorder.counters
         return "trouble" if found.error or found.lost else "recording"
 
     def residual(self) -> tuple[float, float, float] | None:
-        """Return model minus newest measured pose: x, y [m], theta [rad], or None."""
+        """Return the pose of the model minus the last measured pose: x, y [m], theta [rad], or None."""
         newest = self.publishing.newest
         return None if newest is None else self.inputs.residual(newest["q"][0])
 
     def newest_sample_age_s(self) -> float | None:
-        """Return the time since the stamp of the newest sample used [s], or None."""
+        """Return the time since the stamp of the newest used sample [s], or None without a sample."""
         newest_ns = self.driver.newest_ns
         return None if newest_ns is None else (self._front.now_ns() - newest_ns) * 1e-9
 
     def estimate_age_s(self) -> float | None:
-        """Return the time since the end of the newest estimate's window [s], or None."""
+        """Return the time since the end of the window of the last estimate [s], or None without an estimate."""
         end_ns = self.estimation.end_ns if self.estimation else None
         return None if end_ns is None else (self._front.now_ns() - end_ns) * 1e-9
 
     def look_at_clock(self) -> None:
-        """Check, at intervals, whether the clock advances."""
+        """Update the state of the clock. A clock without a change since the last call is paused."""
         now_ns = self._front.now_ns()
         if self._front.follows_samples:
             stands = now_ns == self._clock_before_ns
@@ -216,11 +226,11 @@ class Runtime:
         return self._front.time_text(stamp_ns)
 
     def send_alarms(self) -> None:
-        """Send the present alarms."""
+        """Send the current alarms."""
         self._send([self.publishing.alarms_now(self.stamp_ns)])
 
     def mark(self, text: str) -> tuple[bool, str]:
-        """Write a text to the journal, and the recorder's ring to the disk; return success and an answer."""
+        """Write a text to the journal, and the ring of the recorder to the disk; return success and an answer."""
         if (problem := mark_problem(text)) is not None:
             return False, problem
         self.driver.mark(self.stamp_ns, text)
@@ -238,20 +248,20 @@ class Runtime:
             self.recording.message("status", self.stamp_ns, status)
 
     def activate(self) -> None:
-        """Start taking samples."""
+        """Begin to use samples."""
         self.driver.resume(time.monotonic_ns())
         if self.periods:
             self.periods.begin()
         self.inputs.active = True
 
     def deactivate(self) -> None:
-        """Stop taking samples."""
+        """Stop using samples."""
         self.inputs.active = False
         self.driver.pause()
         self._journal_unused()
 
     def close(self) -> list[str]:
-        """Save the wear, end journal and recording; return the losses."""
+        """Save the wear, close the journal and the recording, and return texts about the losses."""
         self.deactivate()
         lost = []
         if self.estimation:
@@ -266,7 +276,10 @@ class Runtime:
         return lost
 
     def periodic(self) -> list[tuple[float, Callable[[], float | None]]]:
-        """Return the calls to make while the twin is active, each with its rate [Hz]; they return as in `Timer`."""
+        """Return the functions to call periodically while the twin is active, each with its rate [Hz].
+
+        The result of a function is described in `Timer`.
+        """
         settings = self.settings
         periodic: list[tuple[float, Callable[[], float | None]]] = []
         if settings.excitation_source == "scene":
@@ -290,7 +303,7 @@ class Runtime:
         return periodic
 
     def parameter(self, name: str, value: Any, settings: Settings) -> None:
-        """Apply a parameter that takes effect at once."""
+        """Apply a parameter that takes effect immediately."""
         self.settings = settings
         self.driver.policy = policy(settings)
         self.driver.intake.limits = limits(settings, self.scene)
@@ -298,11 +311,11 @@ class Runtime:
         for intake in (self.driver.intake, self.driver.clock):
             intake.jump_back_s, intake.jump_forward_s = settings.jump_back, settings.jump_forward
         if self.waits_for_clock:
-            return  # `start` opens the journal with the settings that hold then
+            return  # the journal is not open; `start` will apply the settings
         if name in MODEL:
             self.driver.set_model(self.stamp_ns, model_changes(settings))
             self._front.changed()
-        elif not isinstance(value, tuple):  # a list takes effect through its service, which journals it
+        elif not isinstance(value, tuple):  # the list `set_wear` takes effect, and is journalled, by its service
             self.driver.parameter(name, value)
 
     def _set_limits(self, settings: Settings) -> None:
@@ -316,11 +329,11 @@ class Runtime:
         )
 
     def step(self, arrived: list[Arrival]) -> Iterator[Outgoing]:
-        """Use samples in order of arrival; yield each message before anything further is computed."""
+        """Use samples in the order of arrival, and yield each message as soon as it is computed."""
         if self.waits_for_clock:
             self.start()
         if self.waits_for_clock:
-            # a player of a recording may start the clock after the samples, so they wait
+            # samples are stored, because the player of a recording may send the first samples before `/clock`
             room = self.settings.input_depth - len(self._early)
             self._early += arrived[:room]
             for stamp_ns, wrench in arrived[max(room, 0) :]:
@@ -334,9 +347,17 @@ class Runtime:
         self._advanced(len(arrived))
 
     def step_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64]) -> Iterator[Outgoing]:
-        """Do the same as `step` for many samples with their own time: stamps [ns], shape (n,), wrenches (n, 3)."""
+        """Use many samples in one call, like `step`; `reads_at_once` must be true.
+
+        Parameters
+        ----------
+        stamps : ndarray of int64, shape (n,)
+            Stamps [ns].
+        wrench : ndarray, shape (n, 3)
+            Loads [N, N, N m].
+        """
         if self.waits_for_clock or self.publishing.watch is not None or self.settings.record_ring:
-            # a watcher gets each sample, and a ring needs the state right after the sample that raises its alarm
+            # a watcher receives each publication, and a ring needs the state directly after the sample of an alarm
             yield from self.step(list(zip(stamps.tolist(), map(tuple, wrench.tolist()), strict=True)))
             return
         self.publishing.received_ns = now_ns = time.monotonic_ns()
@@ -358,7 +379,7 @@ class Runtime:
             self._front.send(topic, message)
 
     def silence(self) -> float:
-        """Continue without samples once they are overdue; return the time [s] until they can be overdue."""
+        """Advance without samples if the samples are overdue; return the time until they can be overdue [s]."""
         holds, now_ns = self.driver.holds, time.monotonic_ns()
         published = self.driver.silence(now_ns)
         if len(published.rows) or self.driver.holds != holds:
@@ -368,7 +389,7 @@ class Runtime:
         return self.driver.quiet_ns(now_ns) * 1e-9
 
     def clock_tick(self) -> None:
-        """Continue under the scene's own loads."""
+        """Advance under the loads in the scene."""
         if self.periods and self.settings.publish_mode != "fixed_rate":
             self.periods.turn(time.monotonic())
         if self.waits_for_clock:
@@ -380,7 +401,7 @@ class Runtime:
         self._advanced()
 
     def publish_due(self) -> None:
-        """Publish the state reached since the last publication."""
+        """Publish the current state if the twin has advanced since the last publication."""
         if self.periods:
             self.periods.turn(time.monotonic())
         self._send(self.publishing.messages(self.driver.due()))
@@ -418,12 +439,12 @@ class Runtime:
         return both
 
     def add_travel(self, stamp_ns: int, speed_m_s: float) -> None:
-        """Use a speed along the face."""
+        """Check and use a speed along the face."""
         if self.inputs.uses_travel(stamp_ns, speed_m_s):
             self.driver.travel(stamp_ns, speed_m_s)
 
     def add_pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...] = ()) -> None:
-        """Use a measured pose, as `Inputs.uses_pose` describes it."""
+        """Check and use a measured pose. The arguments are those of `Inputs.uses_pose`."""
         if not self.inputs.uses_pose(stamp_ns, pose, deviation):
             return
         known = tuple(index for index, value in enumerate(pose) if math.isfinite(value))
@@ -435,7 +456,7 @@ class Runtime:
             self._send(self.publishing.alarms_changed(stamp_ns))
 
     def add_gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> None:
-        """Use measured gaps [m] by number of their pairs."""
+        """Check and use measured gaps [m], by number of the pair."""
         if self.inputs.uses_gaps(stamp_ns, gaps):
             self.driver.session.apply(Gaps(stamp_ns, tuple(gaps), tuple(gaps.values())))
 
@@ -450,7 +471,7 @@ class Runtime:
             self._front.changed()
 
     def _look_for_lag(self) -> None:
-        """Let only the parameters follow the measurements if the twins are too slow."""
+        """Stop the correction of the motion by measured poses if the twins are too slow."""
         waited_s, self.inputs.wait_s = self.inputs.wait_s, 0.0
         self._waiting_seconds = self._waiting_seconds + 1 if waited_s > _LONGEST_WAIT_S else 0
         if self._waiting_seconds == _WAITING_SECONDS and not self.reduced and not self.waits_for_clock:
@@ -468,13 +489,13 @@ class Runtime:
                 self.driver.session.emit(entry)
 
     def save_wear(self) -> None:
-        """Save the wear, if it is kept."""
+        """Save the wear if the parameter `wear_state_path` is set."""
         if self.wear_keeper:
             self.wear_keeper.save(self.driver.session.wear_depth)
 
     @property
     def stamp_ns(self) -> int:
-        """The time that the model has reached [ns], or the present time before the first sample."""
+        """The time that the model has reached [ns], or the current time before the first sample."""
         stamp_ns = self.publishing.series_ns or self.driver.session.stamp_ns
         return self._front.now_ns() if stamp_ns is None else stamp_ns
 
@@ -482,7 +503,8 @@ class Runtime:
         if self.recording and self.recording.recorder.snapshot_wanted:
             self._renew_recording()
         if self._front.follows_samples:
-            # a source with its own time has no deadline, so recorder and estimate may catch up, in bounded time
+            # Without a deadline, the twin waits until the recorder and the estimate have caught up. The wait is
+            # limited to `_CATCH_UP_S` per sample.
             while count and self._behind:
                 time.sleep(_CATCH_UP_S)
                 count -= 1
@@ -500,7 +522,7 @@ class Runtime:
         assert self.recording is not None
         renewed = self.recording.renew(self.driver.session)
         if renewed and self.estimation and self.estimation.entry and self.driver.session.following is None:
-            # only the snapshot of a following twin contains the estimate
+            # the snapshot of a twin that does not follow measurements does not contain the estimate
             self.recording.recorder.journal(self.estimation.entry)
 
 
@@ -511,16 +533,16 @@ def _periods(settings: Settings) -> Periods | None:
 
 
 def policy(settings: Settings) -> Policy:
-    """Return the parameters about silence and failures."""
+    """Return the policy for silences and failures from the parameters."""
     return Policy(settings.excitation_timeout, settings.hold_policy, settings.hold_limit, settings.failure_limit)
 
 
 def limits(settings: Settings, scene: Scene) -> Limits:
-    """Return the limits of the load."""
+    """Return the limits of the load from the parameters."""
     return excitation_limits(
         scene, settings.limit_force, settings.limit_moment, settings.limit_force_rate, settings.limit_moment_rate
     )
 
 
 def _ignore(entry: Entry) -> None:
-    """Drop an entry: there is no recording."""
+    """Ignore a journal entry, because the run is not recorded."""

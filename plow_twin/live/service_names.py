@@ -1,4 +1,4 @@
-"""Names of a live twin's services, which are the methods of `Services`, and the check of a mark's text."""
+"""Names of the services of a live twin, and the check of the text of a mark."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ SERVICES: Final = (
     "forecast",
 )
 
-#: Longest text of a mark [characters].
+#: Largest length of the text of a mark [characters].
 MOST_MARK: Final = 200
 
 
 def mark_problem(text: str) -> str | None:
-    """Return what is wrong with the text of a mark, or None."""
+    """Return a message if the text of a mark is invalid, otherwise None."""
     if not text.strip() or len(text) > MOST_MARK:
         return f"text of a mark: got {len(text.strip())} characters, expected 1 to {MOST_MARK}"
     if not text.isprintable():

@@ -1,4 +1,4 @@
-"""Services of a live twin, each answered by success and a text."""
+"""Services of a live twin. Each service returns whether it succeeded, and an answer."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from plow_twin.stream.journal import Snapshot
 
 
 class Services:
-    """The services of a live twin, by the names of its methods; `changed` is called when the stream's state may have
-    changed.
+    """Services of a live twin. Each method with a name in `SERVICES` is a service.
+
+    The function `changed` is called when the state of the stream may have changed.
     """
 
     def __init__(self, runtime: Runtime, changed: Callable[[], None]) -> None:
@@ -22,7 +23,7 @@ class Services:
         self._kept: Snapshot | None = None
 
     def call(self, name: str, text: str | None = None) -> tuple[bool, str]:
-        """Carry out the service `name`, unless `services_off` names it; `text` belongs to a mark."""
+        """Call the service `name`, unless the parameter `services_off` contains it; `text` is the text of a mark."""
         if name in services_off(self._runtime.settings):
             return False, f"{name}: switched off by the parameter services_off"
         if name == "mark":
@@ -31,7 +32,7 @@ class Services:
         return done
 
     def mark(self, text: str | None = None) -> tuple[bool, str]:
-        """Write a text, by default the parameter `mark`, to the journal, and the recorder's ring to the disk."""
+        """Write a text, by default the parameter `mark`, to the journal, and the ring of the recorder to the disk."""
         return self._runtime.mark((self._runtime.settings.mark or "service") if text is None else text)
 
     def reset(self) -> tuple[bool, str]:
@@ -41,12 +42,12 @@ class Services:
         return True, "initial motion restored, the wear stays; the next sample is model time 0"
 
     def snapshot(self) -> tuple[bool, str]:
-        """Journal the exact state, and keep it for `restore`."""
+        """Write the exact state to the journal, and store it for the service `restore`."""
         self._kept = self._runtime.driver.snapshot()
         return True, f"the state at {self._kept.stamp_ns} ns is kept and journalled"
 
     def restore(self) -> tuple[bool, str]:
-        """Return to the motion of the kept snapshot."""
+        """Restore the motion from the stored snapshot."""
         if self._kept is None:
             return False, "no snapshot has been taken since configure"
         self._runtime.driver.restore(self._runtime.stamp_ns, self._kept)
@@ -63,7 +64,7 @@ class Services:
         return True, f"still there: {'; '.join(alarm_texts(values, newest=True))}" if left else "no alarm is left"
 
     def forecast(self) -> tuple[bool, str]:
-        """Return the newest forecast as JSON."""
+        """Return the last forecast as JSON."""
         if self._runtime.estimation is None or not any(self._runtime.settings.forecast_limits):
             return False, "no forecast is made: estimate is false or forecast_limits are 0"
         found = self._runtime.estimation.forecast
@@ -82,7 +83,7 @@ class Services:
         return True, f"the pads are worn by {list(depth)} m from now on; the motion starts anew"
 
     def switch_publisher(self) -> tuple[bool, str]:
-        """Follow the other sender of the excitation."""
+        """Follow the other sender of the load."""
         done = self._runtime.inputs.senders.switch()
         self._changed()
         if done:

@@ -1,4 +1,4 @@
-"""Preparation of scene and solver in a thread, so that the node answers while the compiler works."""
+"""Load the scene and compile the solver in a thread, so that the node can answer during the compilation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream import outputs
 from plow_twin.stream.driven import Driven
 
-#: Interval of checks for a request to stop [s].
+#: Interval between checks for a requested stop [s].
 _LOOK_S: Final = 0.05
 _started: list[Future[Prepared]] = []
 
@@ -29,7 +29,7 @@ class StartAbandoned(PlowTwinError):
 
 @dataclass(frozen=True)
 class Prepared:
-    """A scene, its twin with all kernels compiled or loaded, and the time that this took [s]."""
+    """A scene, its twin with compiled kernels, and the time of compilation [s]."""
 
     scene: Scene
     twin: Driven
@@ -37,7 +37,7 @@ class Prepared:
 
 
 class Preparation:
-    """A twin that a thread prepares; `warm_up` compiles further kernels in the same thread."""
+    """Preparation of a twin in a thread. The function `warm_up` compiles further kernels in the same thread."""
 
     def __init__(self, settings: Settings, warm_up: Callable[[], None] = lambda: None) -> None:
         self.key = key(settings)
@@ -49,14 +49,18 @@ class Preparation:
 
     @property
     def done(self) -> bool:
-        """Whether `result` returns at once."""
+        """Whether the method `result` returns without waiting."""
         return self._future.done()
 
     def result(self, stop_asked: Callable[[], bool]) -> Prepared:
-        """Wait for the twin.
+        """Wait for the twin and return it.
 
-        Raises SceneError or OSError if the scene cannot be used, and StartAbandoned if a stop was requested; the
-        compiler, which cannot be interrupted, then still works.
+        Raises
+        ------
+        SceneError, OSError
+            The scene is invalid or cannot be read.
+        StartAbandoned
+            A stop was requested. The compilation cannot be interrupted and continues in its thread.
         """
         while not wait((self._future,), _LOOK_S).done:
             if stop_asked():
@@ -65,7 +69,10 @@ class Preparation:
 
 
 def key(settings: Settings) -> tuple[object, ...]:
-    """Return the settings on which a prepared twin depends; a rewritten scene file is another scene."""
+    """Return the settings on which a prepared twin depends, with the time and size of the scene file.
+
+    A changed scene file thus gives another key.
+    """
     follow = settings.follows, settings.follow_members
     own = settings.scene, settings.tolerance, settings.excitation_source, settings.max_evaluations, *follow
     try:
@@ -93,8 +100,11 @@ def _prepare(settings: Settings, warm_up: Callable[[], None]) -> Prepared:
 
 
 def leave(code: int, *, at_once: bool = False) -> int:
-    """Return the exit code, or end the process here `at_once`, or if an abandoned compiler would delay the end."""
-    if at_once:  # a stream without a reader cannot be flushed
+    """Return the exit code `code`, or end the process immediately.
+
+    The process is ended by `at_once`, or if a compilation that still runs would delay the end.
+    """
+    if at_once:  # standard output has no reader, so it is not flushed
         os._exit(code)
     if all(future.done() for future in _started):
         return code

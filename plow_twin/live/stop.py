@@ -1,4 +1,4 @@
-"""SIGINT, SIGTERM and SIGHUP as a clean stop."""
+"""Stop a program cleanly at the signals SIGINT, SIGTERM and SIGHUP."""
 
 from __future__ import annotations
 
@@ -8,17 +8,20 @@ from typing import Self
 
 
 class StopRequested(BaseException):
-    """The process was asked to stop while it could not check a flag."""
+    """A stop signal arrived while the program could not check a flag."""
 
 
 def stop_signals() -> list[signal.Signals]:
-    """Return the signals that ask for a stop; SIGHUP, which a closing terminal sends, unless it is ignored."""
+    """Return the signals that request a stop. SIGHUP, which a closing terminal sends, is omitted if it is ignored."""
     ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     return [signal.SIGINT, signal.SIGTERM, *([] if ignored else [signal.SIGHUP])]
 
 
 class StopSignals:
-    """Context manager in which stop signals set a flag, or raise `StopRequested` while `interrupt` is set."""
+    """Context manager in which a stop signal sets the flag `stopped`.
+
+    While the attribute `interrupt` is true, the signal also raises `StopRequested`.
+    """
 
     def __init__(self) -> None:
         self.stopped = False
@@ -33,10 +36,10 @@ class StopSignals:
             signal.signal(number, handler)
 
     def ignore(self) -> None:
-        """Ignore the signals at the end of a program.
+        """Ignore further stop signals at the end of a program.
 
-        The interpreter restores their default handlers while it ends, and a second signal, sent by terminal and launch
-        alike, would turn success into an error.
+        A terminal and `ros2 launch` may both send a signal. While the interpreter ends, it restores the default
+        handlers, and the second signal would change the exit code.
         """
         for number in self._before:
             signal.signal(number, signal.SIG_IGN)

@@ -1,4 +1,4 @@
-"""A call repeated at intervals of a steady clock."""
+"""Call a function periodically."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from collections.abc import Callable
 
 
 class Timer:
-    """Calls `do` every `period_s`; missed calls are left out, and later calls keep their phase.
+    """Timer that calls the function `do` every `period_s` seconds of the monotonic clock.
 
-    `do` may return the time [s] before which it need not be called.
+    Missed calls are omitted, and later calls are made at the original multiples of the period. `do` may return a time
+    [s] for which it need not be called again.
     """
 
     def __init__(self, period_s: float, do: Callable[[], float | None]) -> None:
@@ -17,11 +18,11 @@ class Timer:
         self.restart()
 
     def restart(self) -> None:
-        """Make the next call due after one period."""
+        """Schedule the next call after one period."""
         self.due = time.monotonic() + self._period_s
 
     def look(self) -> None:
-        """Call `do` when it is due."""
+        """Call `do` if the call is due."""
         now = time.monotonic()
         if now >= self.due:
             self.due += self._period_s * (1 + (now - self.due) // self._period_s)

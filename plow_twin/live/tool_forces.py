@@ -1,4 +1,4 @@
-"""Measured forces of the tools as one wrench."""
+"""Compute the load on the head from the measured forces of the tools."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ Wrench = tuple[float, float, float]
 
 
 class ToolForces:
-    """The wrench of measured forces along the directions of the scene's loads.
+    """Sum of measured forces, each of which acts in the direction of a load in the scene.
 
-    An effort of 1 N along a load's direction, at its point of action, gives a fixed wrench about the centre; the effort
-    of a pure moment is in N m. A table and a constant of zero have no direction: messages may name them, but their
-    effort is ignored.
+    The measured effort of a load is a force [N] or, for a pure moment, a moment [N m]. Loads without a direction are
+    tables and constants of zero. Messages may contain these loads, but their efforts are ignored.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -31,11 +30,14 @@ class ToolForces:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The loads that each message must name."""
+        """Names of the loads that each message must contain."""
         return tuple(self._directions)
 
     def wrench(self, names: Sequence[str], efforts: Sequence[float]) -> Wrench | None:
-        """Return the total wrench, or None unless the names give each measurable load exactly once."""
+        """Return the total wrench about the centre: Fx, Fy [N], M [N m].
+
+        Returns None if a load in `names` is missing, repeated or unknown.
+        """
         named = set(names)
         if len(efforts) != len(names) or len(named) != len(names):
             return None

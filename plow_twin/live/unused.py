@@ -1,4 +1,4 @@
-"""Messages that were not used, collected for the journal."""
+"""Collect unused messages for the journal."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Final
 
 from plow_twin.stream.journal import Unused
 
-#: Largest number of messages whose stamps and values an entry holds.
+#: Largest number of messages whose stamps and values a journal entry contains. Further messages are only counted.
 _MOST: Final = 500
 
 
@@ -20,14 +20,17 @@ class _Pending:
 
 
 class UnusedMessages:
-    """Collects unused messages, so that many messages give few entries of the journal; does nothing unless `wanted`."""
+    """Collector of unused messages, which combines many messages in one journal entry.
+
+    If `wanted` is False, messages are ignored.
+    """
 
     def __init__(self, wanted: bool) -> None:
         self._wanted = wanted
         self._pending: dict[tuple[str, bytes, str], _Pending] = {}
 
     def note(self, topic: str, sender: bytes, reason: str, stamp_ns: int, values: Sequence[float]) -> None:
-        """Note one message."""
+        """Add an unused message."""
         if not self._wanted:
             return
         pending = self._pending.setdefault((topic, sender, reason), _Pending())
@@ -37,12 +40,12 @@ class UnusedMessages:
             pending.values.append(tuple(map(float, values)))
 
     def note_lost(self, topic: str, sender: bytes, count: int) -> None:
-        """Note messages that have not arrived; a negative `count` takes back messages that arrived late."""
+        """Add messages that have not arrived. A negative `count` removes messages that have arrived late."""
         if self._wanted and count:
             self._pending.setdefault((topic, sender, "lost"), _Pending()).count += count
 
     def pop_all(self, name_of: Callable[[str, bytes], str]) -> list[Unused]:
-        """Return the collected entries; `name_of` names a sender of an input."""
+        """Return and remove the journal entries; `name_of` returns the name of a sender of an input."""
         pending, self._pending = self._pending, {}
         return [
             Unused(topic, name_of(topic, sender), reason, found.count, tuple(found.stamps_ns), tuple(found.values))

@@ -1,4 +1,4 @@
-"""The pads' wear, saved at intervals by a thread while the node runs, and at the stop."""
+"""Save the wear of the pads in a thread, at intervals and when the node stops."""
 
 from __future__ import annotations
 
@@ -25,9 +25,10 @@ from plow_twin.record.wear_state import (
 
 @dataclass(frozen=True)
 class KeptWear:
-    """Depths of wear that an earlier runtime of this process has left.
+    """Wear depths [m] at the end of an earlier runtime of this process.
 
-    `older_files` are contents of the file that the depths should have replaced but could not.
+    If the depths could not be saved, `older_files` contains the contents of the wear file that they should have
+    replaced.
     """
 
     depth_m: tuple[float, ...]
@@ -35,11 +36,15 @@ class KeptWear:
 
 
 class WearKeeper:
-    """The wear of one head in one scene, in a folder.
+    """Storage for the wear of one head in one scene, in a folder.
 
-    Only a file that this keeper has read or written is replaced. Another file, put there by hand, may hold wear that no
-    twin has used yet. A folder to which no file can be written, or in which another twin keeps its wear, raises
-    WearStateError.
+    Only a file that this object has read or written is replaced. Any other file may have been put there by the user,
+    and may contain wear that no twin has used.
+
+    Raises
+    ------
+    WearStateError
+        The folder cannot be written to, or another twin uses it.
     """
 
     def __init__(self, folder: Path, head: str, scene: Scene) -> None:
@@ -47,15 +52,17 @@ class WearKeeper:
         self._claim: int | None = claim_folder(folder)
         self._identity = scene_identity(scene)
         self._saved: tuple[float, ...] | None = None
-        self._own: tuple[bytes, ...] = ()  # contents that the file may have, as last read or written
+        self._own: tuple[bytes, ...] = ()  # contents that the file may have after the last read or write
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="wear")
         self._writing: Future[None] | None = None
-        #: why the wear could not be saved the last time
+        #: reason why the last attempt to save the wear failed; empty after a success
         self.error = ""
 
     def load(self, kept: KeptWear | None = None) -> tuple[float, ...] | None:
-        """Return the depths [m] to continue with, or None: those `kept` if they could not replace the file, else the
-        file's.
+        """Return the wear depths [m] with which the twin starts, or None without saved wear.
+
+        These are the depths in the file. If the depths `kept` could not be saved and the file has not changed since,
+        they are returned instead.
         """
         found = read_wear(self.folder)
         if found is not None:
@@ -64,11 +71,11 @@ class WearKeeper:
         return kept.depth_m if kept is not None and found in (None, *kept.older_files) else self._saved
 
     def kept(self, depth: NDArray[np.float64]) -> KeptWear:
-        """Return the depths [m] as the wear for the next runtime, after `close`."""
+        """Return the wear depths [m] for the next runtime of the process. `close` must be called before."""
         return KeptWear(tuple(depth.tolist()), self._own if self.error else ())
 
     def save(self, depth: NDArray[np.float64]) -> None:
-        """Save depths [m] unless they are saved already; do not wait for the disk."""
+        """Begin to save wear depths [m] in the thread, unless the same depths are already saved."""
         if self._writing is not None and not self._writing.done():
             return
         values = tuple(depth.tolist())
@@ -76,7 +83,7 @@ class WearKeeper:
             self._writing = self._writer.submit(self._save, values)
 
     def close(self, depth: NDArray[np.float64]) -> None:
-        """Save depths [m] and wait until they are on the disk."""
+        """Save wear depths [m], and wait until the file is on the disk."""
         if self._writing is not None:
             self._writing.result()
         self.save(depth)
@@ -84,7 +91,7 @@ class WearKeeper:
         self.release()
 
     def release(self) -> None:
-        """Release the folder without saving."""
+        """Unlock the folder without saving the wear."""
         claim, self._claim = self._claim, None
         if claim is not None:
             os.close(claim)
@@ -92,7 +99,7 @@ class WearKeeper:
     def _save(self, values: tuple[float, ...]) -> None:
         try:
             if not self._is_claimed():
-                # the folder was moved, removed or hidden by a mount
+                # the locked folder was moved or removed, or another file system was mounted over it
                 self.release()
                 self._claim = claim_folder(self.folder)
             found = read_wear(self.folder)
