@@ -1,4 +1,4 @@
-"""Address and credentials of a broker or server."""
+"""Address of an MQTT broker or OPC UA server, and the credentials for it."""
 
 from __future__ import annotations
 
@@ -23,12 +23,24 @@ _CREDENTIALS: Final = mapping(
 
 @dataclass(frozen=True)
 class Access:
-    """Address and credentials.
+    """Address of a broker or server, and the credentials for it.
 
-    `url` is `SCHEME://HOST:PORT`; a missing host means this machine. `ca` is the certificate of a trusted authority, or
-    the broker's or server's own. `certificate` and `key` identify the twin; `user_certificate` and `user_key` identify
-    its user, like `user` and `password`. `plain` allows an unencrypted connection to another machine. `client_id` names
-    the session at a broker.
+    Attributes
+    ----------
+    url : str
+        `SCHEME://HOST:PORT`. Without a host, this machine is meant.
+    user, password : str
+        Name and password of the user.
+    ca : Path
+        Certificate of a trusted authority, or certificate of the broker or server.
+    certificate, key : Path
+        Certificate and private key of the twin.
+    user_certificate, user_key : Path
+        Certificate and private key of the user, which replace the name and the password.
+    plain : bool
+        Whether an unencrypted connection to another machine is allowed.
+    client_id : str
+        Name of the session at an MQTT broker.
     """
 
     url: str
@@ -44,9 +56,12 @@ class Access:
 
 
 def host_and_port(access: Access, ports: Mapping[str, int], *, has_path: bool = False) -> tuple[str, str, int]:
-    """Return scheme, host and port of an address; `ports` are the default ports by scheme.
+    """Return scheme, host and port of an address. `ports` contains the default port of each scheme.
 
-    Raises BridgeError if the address is invalid, or contains a user, a password, or (without `has_path`) a path.
+    Raises
+    ------
+    BridgeError
+        The address is invalid or contains a user, a password, or a path although `has_path` is False.
     """
     expected = " or ".join(f"{scheme}://HOST:PORT" for scheme in ports)
     try:
@@ -62,12 +77,18 @@ def host_and_port(access: Access, ports: Mapping[str, int], *, has_path: bool = 
 
 
 def password(path: Path | None, source: str) -> str:
-    """Return the first line of a file, or without a file the environment variable PLOW_TWIN_`source`_PASSWORD."""
+    """Return the password: the first line of a file or, if `path` is None, the value of an environment variable.
+
+    For the source `OPCUA`, the variable is `PLOW_TWIN_OPCUA_PASSWORD`.
+    """
     return os.environ.get(f"PLOW_TWIN_{source}_PASSWORD", "") if path is None else read_secret(path)
 
 
 def read_access(url: str, path: Path | None) -> Access:
-    """Return the access to an OPC UA server with the credentials of a YAML file, to which its paths are relative."""
+    """Return the address of an OPC UA server with the credentials from a YAML file.
+
+    The paths in the file are relative to its folder.
+    """
     if path is None:
         return Access(url, password=password(None, "OPCUA"))
     given, found = read_yaml(path, "credentials", _CREDENTIALS["description"])

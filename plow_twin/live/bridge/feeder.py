@@ -1,7 +1,7 @@
-"""Messages of a bridge as inputs of a live twin.
+"""Pass the messages of a bridge to the inputs of a live twin.
 
-A mapping gives each value in a message its role, such as the excitation. Some senders number their messages; the feeder
-counts lost messages by these numbers, and continues the numbers for a sender that does not send them.
+Some senders number their messages, and the feeder counts lost messages by these numbers. If a message has no number,
+the feeder assigns the next number to it.
 """
 
 from __future__ import annotations
@@ -27,21 +27,30 @@ from plow_twin.record.sources import Arrived
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
 
-#: A jump of the message number by more than this means that the sender has restarted, if the next number confirms it.
+#: Largest jump of the message number within a sequence. After a larger jump that the next number confirms, the sender
+#: has restarted.
 _RESTART = 1000
 #: Largest number of samples that count as lost between two messages: a day at 10 kHz.
 _MOST_LOST = 10**9
-#: After at least this many messages, the number 0 or 1 means that the sender has restarted, not that a message is late.
+#: Number of messages after which the number 0 or 1 means a restart of the sender. Before, it may be a late message.
 _FIRST = 10
-#: Relative change of the load's standard deviation above which the new deviation is journalled.
+#: Relative change of the standard deviation of the load above which the new deviation is written to the journal.
 _NOTABLE = 0.02
 
 
 class Feeder:
-    """Passes messages to the runtime of a live twin.
+    """Feeder that passes messages to the runtime of a live twin.
 
-    Roles of the mapping that a live twin does not use are ignored. `send` gets each resulting message. With a `model`,
-    the load is computed from the drive's signals.
+    Parameters
+    ----------
+    roles
+        Roles of the topics. Roles that a live twin does not use are ignored.
+    runtime
+        Runtime of the twin.
+    send
+        Function that receives each message of the twin.
+    model
+        Load model, if the load is computed from the signals of the drive.
     """
 
     def __init__(
@@ -57,17 +66,17 @@ class Feeder:
         self._by_topic: dict[str, list[tuple[str, Role]]] = {}
         for name, role in roles.items():
             self._by_topic.setdefault(role.topic, []).append((name, role))
-        #: newest stamp of a source that has its own time [ns], except for a single stamp far ahead of the others
+        #: newest stamp [ns], without a single stamp far ahead of all other stamps
         self.newest_ns = 0
         self._far_ahead_ns: int | None = None
-        #: why the first unreadable load was refused
+        #: reason why the first invalid load was refused
         self.unfit = ""
         self._number = 0
-        #: number of messages without a number since the last message with a number
+        #: count of messages without a number since the last message with a number
         self._assumed = 0
-        #: number of messages to which the feeder has given a number that the sender then used again
+        #: count of assigned numbers that the sender used afterwards for other messages
         self._unnumbered = 0
-        #: number of the newest message if it does not continue the earlier numbers
+        #: number of the last message if it does not continue the earlier numbers, otherwise None
         self._odd: int | None = None
         self._counts = False
         self._sender = 0
@@ -79,7 +88,10 @@ class Feeder:
         inputs.senders.alive([self._name])
 
     def begin(self, messages: Iterable[Arrived]) -> None:
-        """Set the start time of a source with its own time: the first stamp that no jump back follows."""
+        """Set the start time for a source whose samples advance the time.
+
+        The start time is the first stamp after which the stamps do not jump back.
+        """
         read = (role.read(arrived) for arrived in messages for _, role in self._by_topic.get(arrived.topic, ()))
         stamps = (found[0] for found in read if found is not None)
         back_ns = round(self._runtime.settings.jump_back * 1e9)
@@ -88,7 +100,7 @@ class Feeder:
         self.newest_ns = next(goes_on, first_ns)
 
     def feed(self, messages: Messages) -> None:
-        """Process messages in order of arrival."""
+        """Process messages in the order of arrival."""
         if isinstance(messages, Table) and self._feed_table(messages):
             return
         samples: list[Arrival] = []
@@ -96,7 +108,7 @@ class Feeder:
             roles = self._by_topic.get(arrived.topic, ())
             for name, role in roles:
                 if len(roles) > 1 and role.empty(arrived):
-                    continue  # this row has values only of other roles
+                    continue  # the row contains only values of other roles
                 if name in ("excitation", "drive"):
                     samples += self._sample(role, arrived)
                 elif name in self._optional:
@@ -116,7 +128,10 @@ class Feeder:
             self._send(topic, message)
 
     def _feed_table(self, table: Table) -> bool:
-        """Process lines of a file as arrays; return False, without any effect, if they must be read one by one."""
+        """Process the lines of a file as arrays.
+
+        Returns False, without an effect, if the lines must be processed singly.
+        """
         roles, inputs = self._by_topic.get(table.topic, []), self._runtime.inputs
         role = next((role for name, role in roles if name == "excitation"), None)
         if role is None or role.sequence or not (self._at_once and inputs.active):
@@ -148,7 +163,7 @@ class Feeder:
             self._follow_time(stamp_ns)
 
     def _follow_time(self, stamp_ns: int) -> None:
-        """Advance the source's time; a stamp far ahead counts only if the next stamp is far ahead too."""
+        """Advance the time of the source. A stamp far ahead counts only if the next stamp is far ahead, too."""
         jump_ns = round(self._runtime.settings.jump_forward * 1e9)
         far_ns, self._far_ahead_ns = self._far_ahead_ns, None
         if far_ns is not None and stamp_ns >= far_ns - jump_ns:
@@ -190,7 +205,7 @@ class Feeder:
         wrench, deviation = load
         absurd = intake.limits is not None and intake.limits.exceeded(wrench)
         if absurd or not all(map(math.isfinite, (*wrench, *deviation))):
-            return [(stamp_ns, wrench)]  # the intake will refuse this sample, so its deviation is not journalled
+            return [(stamp_ns, wrench)]  # the intake will refuse this sample, so its deviation is not used
         if any(abs(new - old) > _NOTABLE * max(new, old) for new, old in zip(deviation, self._deviation, strict=True)):
             self._deviation = deviation
             self._runtime.driver.spread(stamp_ns, deviation)
@@ -199,7 +214,7 @@ class Feeder:
     def _numbered(self, role: Role, arrived: Arrived) -> tuple[bytes, int, bool]:
         number = role.number(arrived) if role.sequence else None
         if number is None:
-            # the next message with a number shows whether the sender counted this message
+            # the next message with a number will show whether the sender has counted this message
             self._assumed += 1
             self._number += 1
             return self._name, self._number + self._unnumbered, False
@@ -210,19 +225,22 @@ class Feeder:
             return self._name, number + self._unnumbered, False
         if not self._counts:
             self._counts = True
-            if self._number:  # earlier messages had no numbers
+            if self._number:  # the earlier messages had no numbers
                 self._begin_anew()
         elif number == self._odd:
             return self._name, number, True
         elif self._goes_on(number):
             self._odd = None
-        else:  # the next message shows whether the numbers jump or this number is wrong
+        else:  # the next message will show whether the numbers have jumped or this number is wrong
             self._odd, number = number, self._number + 1
         again, self._number = number == self._number, number
         return self._name, number + self._unnumbered, again
 
     def _goes_on(self, number: int) -> bool:
-        """Return whether a number continues the earlier numbers, or those that begin with the odd number before it."""
+        """Return whether a number continues a sequence of numbers.
+
+        The sequence is the earlier numbers, or a new sequence that begins with the last number, `_odd`.
+        """
         odd, before = self._odd, self._number
         if odd is not None and abs(number - odd) < abs(number - before):
             if not before < odd <= before + _MOST_LOST:
@@ -245,7 +263,7 @@ class Feeder:
         if found is None:
             intake.refuse(Verdict.MALFORMED)
         elif arrived.retained and name != "travel":
-            # a broker's retained speed still applies, a retained pose or gap does not
+            # a retained message is old: its speed is still valid, but its pose or gap is not
             intake.refuse(Verdict.INACTIVE, found[0], tuple(found[1].values()))
         elif not role.plausible(found[1]):
             intake.refuse(Verdict.IMPLAUSIBLE, found[0], tuple(found[1].values()))

@@ -1,4 +1,4 @@
-"""Tables in files or on standard input: CSV, JSON lines or Parquet, read once or followed while they grow."""
+"""Read tables (CSV, JSON lines or Parquet) from files or from standard input, once or while they grow."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from plow_twin.record.times import NO_TIME
 from plow_twin.scene_file.csv_rows import MOST_COLUMNS, check_text
 from plow_twin.scene_file.parquet_lines import ParquetLines, is_parquet
 
-#: Largest number of bytes that are read from a source at once.
+#: Largest number of bytes that are read in one call.
 _BLOCK: Final = 1 << 18
-#: Number of bytes, the last ones read, by which a rewritten file is recognised.
+#: Number of bytes before the read position that are compared to recognise a rewritten file.
 _REMEMBERED: Final = 256
 _LOOK_S: Final = 0.02
 _LOOK_FOR_FILES_S: Final = 0.2
@@ -34,24 +34,27 @@ STDIN_TOPIC: Final = "stdin"
 
 @dataclass
 class _Tail:
-    """A file. If it is cut or replaced, reading starts again at its beginning."""
+    """A file that is read while it grows. If it is truncated or replaced, it is read from its beginning again."""
 
     path: Path
-    #: topic of the rows; by default the file's name without its ending
+    #: topic of the rows; by default the file name without extension
     topic: str = ""
     lines: Lines = field(default_factory=Lines)
     rows: Rows = field(default_factory=Rows)
     _file: Any = None
-    #: the last bytes that were read
+    #: bytes before the read position
     _newest: bytes = b""
-    #: number of lines that stayed incomplete because the file was cut or replaced
+    #: number of lines that are incomplete because the file was truncated or replaced
     left: int = 0
 
     def __post_init__(self) -> None:
         self.topic = self.topic or self.path.stem
 
     def columns(self, *, grows: bool) -> list[str] | None:
-        """Return the columns in the first line, or None without a line; a line of a file that `grows` may be cut."""
+        """Return the columns in the first line, or None without a first line.
+
+        If the file `grows`, a line without an end is incomplete and does not count.
+        """
         rows = Rows()
         try:
             with _readable(self.path), _open(self.path) as stream:
@@ -77,7 +80,7 @@ class _Tail:
     def _block(self) -> bytes:
         if self._file is None or self._is_another():
             rest = b"" if self._file is None or self._is_anew() else self._read()
-            if rest:  # the end of a file that was moved away
+            if rest:  # the end of a file that was renamed
                 return rest
             try:
                 with _readable(self.path):
@@ -87,7 +90,7 @@ class _Tail:
             self.close()
             self._file, self._newest = file, b""
             self.rows = self.rows.of_another_file()
-            # the incomplete last line of the old file is not used, because a number in it may have been cut
+            # the incomplete last line of the old file is not used, because its last number may be truncated
             self.left += self.lines.begun
             self.lines = Lines()
         return self._read()
@@ -99,17 +102,17 @@ class _Tail:
         return data
 
     def _is_anew(self) -> bool:
-        """Return whether the file was rewritten, even if it has grown beyond its old size since then."""
+        """Return whether the file was rewritten, even if it is now longer than before."""
         begin = self._file.tell() - len(self._newest)
         return os.pread(self._file.fileno(), len(self._newest), begin) != self._newest
 
     def _is_another(self) -> bool:
-        if isinstance(self._file, ParquetLines):  # a Parquet file is read only once
+        if isinstance(self._file, ParquetLines):  # a Parquet file is never followed
             return False
         try:
             found = self.path.stat()
         except FileNotFoundError:
-            return False  # until a new file has this path, the file that was moved away may still grow
+            return False  # the file was renamed and may still grow until a new file has its path
         ours = os.fstat(self._file.fileno())
         return (found.st_dev, found.st_ino) != (ours.st_dev, ours.st_ino) or self._is_anew()
 
@@ -129,7 +132,7 @@ def _open(path: Path) -> Any:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Turn an error of the table's form into a `BridgeError`."""
+    """Convert an error in the format of a table to a `BridgeError`."""
     try:
         yield
     except csv.Error as error:
@@ -137,10 +140,10 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 class _Dated:
-    """The files that match a pattern of names, as one topic.
+    """Files whose names match a pattern, as one topic.
 
-    When files are followed, the topic begins with the newest file and continues with each new file; the file before the
-    newest file is still read.
+    When files are followed, reading begins with the newest file and continues with each new file. The second newest
+    file is read, too, because it may still grow.
     """
 
     def __init__(self, pattern: Path) -> None:
@@ -192,15 +195,20 @@ def _changed_ns(path: Path) -> tuple[int, Any]:
 
 
 def _numbered(path: Path) -> list[tuple[int, str]]:
-    """Return a key that sorts names by the numbers in them, load_9 before load_10."""
+    """Return a sort key that puts load_9 before load_10, by the numbers in the names."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
 class Files(Bridge):
-    """Files as topics, named without the ending; the files of a pattern (`load_*.csv`) are one topic.
+    """Files as topics. The name of a topic is the file name, or the pattern such as `load_*.csv`, without extension.
 
-    With `follow`, files may appear later and grow; otherwise their messages are sorted by their stamps. A file that
-    cannot be read raises BridgeError.
+    With `follow`, files are read while they grow, and may be created later. Without `follow`, the messages of several
+    files are merged by their stamps.
+
+    Raises
+    ------
+    BridgeError
+        A file cannot be read.
     """
 
     def __init__(self, paths: list[Path], *, follow: bool) -> None:
@@ -215,11 +223,11 @@ class Files(Bridge):
                 raise BridgeError(f"{tail.path.parent}: no such folder")
         self._merged: Iterator[Arrived] | None = None
         self._tables: Iterator[Messages] | None = None
-        #: total size of the files that are read once, and how much of it has been read [B]
+        #: total size of the files without `follow`, and number of bytes that have been read
         self._size = self._done = 0
 
     def topics(self) -> dict[str, TopicType]:
-        """Return the columns of each topic; wait for the first line of a followed file."""
+        """Return the columns of each topic. With `follow`, the method waits for the first line of each file."""
         found: dict[str, TopicType] = {}
         for tail in self._tails:
             columns = tail.columns(grows=not self.ends)
@@ -230,11 +238,11 @@ class Files(Bridge):
         return found
 
     def awaited(self) -> list[Path]:
-        """Return the files, or patterns, that do not yet have a whole line."""
+        """Return the files and patterns for which no complete line exists."""
         return [tail.path for tail in self._tails if tail.columns(grows=not self.ends) is None]
 
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
-        """Begin to read the files of these topics."""
+        """Begin to read the files of the topics."""
         self._tails = [tail for tail in self._tails if tail.topic in topics]
         if self.ends:
             files = [
@@ -264,7 +272,7 @@ class Files(Bridge):
 
     @property
     def share(self) -> float:
-        """Share of the files that has been read, from 0 to 1; 0 for followed files."""
+        """Share of the files that has been read, from 0 to 1. It is 0 with `follow`."""
         return self._done / self._size if self._size else 0.0
 
     def _next(self) -> Messages:
@@ -307,12 +315,12 @@ def _is_pattern(path: Path) -> bool:
 
 
 def _sent_ns(row: Arrived, stamp_ns: StampOf[Arrived] | None) -> int | None:
-    """Return the stamp in a row, or None; the time at which a row is read says nothing about the order of rows."""
+    """Return the stamp in a row, or None if the row contains no stamp; the receive time is not used."""
     return None if stamp_ns is None else stamp_ns(Arrived(row.topic, NO_TIME, row.content))
 
 
 class StandardInput(Bridge):
-    """Lines from standard input or another file descriptor, until its end."""
+    """Lines from standard input or from another file descriptor."""
 
     def __init__(self, descriptor: int = 0) -> None:
         if descriptor == 0 and sys.stdin is None:
@@ -323,7 +331,7 @@ class StandardInput(Bridge):
         self._first: list[Arrived] = []
 
     def topics(self) -> dict[str, TopicType]:
-        """Wait for the first line, and return its columns."""
+        """Wait for the first line, and return the columns in it."""
         while self._rows.columns is None and not self.finished:
             self._first += self._read(1.0)
         return {STDIN_TOPIC: self._rows.header("-")}
@@ -332,7 +340,7 @@ class StandardInput(Bridge):
         """Do nothing, because there is only one topic."""
 
     def poll(self, timeout_s: float) -> list[Arrived]:
-        """Return the messages that have come."""
+        """Return the messages that have arrived."""
         if self._first:
             first, self._first = self._first, []
             return first

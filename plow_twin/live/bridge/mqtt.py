@@ -1,4 +1,4 @@
-"""JSON payloads from an MQTT broker."""
+"""Receive messages with JSON payloads from an MQTT broker."""
 
 from __future__ import annotations
 
@@ -21,17 +21,20 @@ from plow_twin.live.bridge.source import LONGEST, Bridge, BridgeError, read_json
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived
 
-#: Largest number of messages that wait to be read; further messages are counted as lost.
+#: Largest number of messages in the queue. Further messages are counted as lost.
 _QUEUE: Final = 100_000
-#: Largest total size of the waiting messages [B]; further messages are counted as lost.
+#: Largest total size of the messages in the queue [B]. Further messages are counted as lost.
 _QUEUED_BYTES: Final = 2**26
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
 
 
 class Mqtt(Bridge):
-    """A session that a broker keeps while the connection is broken; messages of QoS 1 then arrive later.
+    """Persistent session at an MQTT broker. While the connection is broken, the broker stores messages with QoS 1.
 
-    Raises BridgeError if the address is invalid, no broker answers within `connect_s`, or it refuses the connection.
+    Raises
+    ------
+    BridgeError
+        The address is invalid, the broker refuses the connection, or no broker answers within `connect_s` [s].
     """
 
     def __init__(self, access: Access, connect_s: float = 10.0) -> None:
@@ -40,21 +43,21 @@ class Mqtt(Bridge):
         self.host, self.port, tls = _address(access)
         self._topics: list[str] = []
         self._subscribed = False
-        #: whether messages marked as retained are older than the subscription
+        #: whether a message with the flag `retain` is older than the subscription
         self._from_before = True
         self._queue: deque[tuple[str, bytes, int, bool]] = deque()
-        #: total sizes [B] of the payloads that entered and left the queue, each changed by one thread only
+        #: total sizes of the payloads that entered the queue and left it [B]; only one thread changes each number
         self._came = self._left = 0
         self._arrived = threading.Event()
         self._answer = threading.Event()
         self._client = self._make_client(tls)
 
     def topics(self) -> None:
-        """Return None, because the mapping may name any topic of the broker."""
+        """Return None, because the mapping may contain any topic of the broker."""
         return
 
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
-        """Connect and subscribe."""
+        """Connect to the broker and subscribe to the topics."""
         for topic in topics:
             if any(sign in topic for sign in "+#") or not topic:
                 raise BridgeError(f"topic: got {topic!r}, expected one topic, without + and #")
@@ -81,7 +84,7 @@ class Mqtt(Bridge):
         return [Arrived(topic, time_ns, read_json(payload), retained) for topic, payload, time_ns, retained in taken]
 
     def close(self) -> None:
-        """Disconnect; the broker keeps messages until the session is resumed."""
+        """Disconnect. The broker stores messages until the session is resumed."""
         self._client.disconnect()
         self._client.loop_stop()
 
@@ -104,7 +107,7 @@ class Mqtt(Bridge):
             self.trouble = f"refused: {refused}"
             self._answer.set()
             return
-        # in a resumed session, the mark `retained` can also be on messages that were kept for the session
+        # in a resumed session, messages that the broker stored for the session may have the flag `retain`, too
         resumed = is_resumed(flags)
         self._from_before = not resumed
         if self._subscribed and resumed:
@@ -124,7 +127,7 @@ class Mqtt(Bridge):
         self.trouble = self.trouble or f"the connection broke: {end_of(*facts)}; reconnecting"
 
     def _on_message(self, client: Any, data: Any, message: Any) -> None:
-        # a payload that is too long is emptied and counts as unreadable
+        # the empty payload, which replaces a payload that is too long, is counted as an invalid message later
         payload = message.payload if len(message.payload) <= LONGEST else b""
         if len(self._queue) >= _QUEUE or self._came - self._left + len(payload) > _QUEUED_BYTES:
             self.lost += 1

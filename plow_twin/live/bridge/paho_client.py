@@ -1,4 +1,4 @@
-"""MQTT clients by paho 1.6 and paho 2, whose callbacks get the same facts in different forms."""
+"""MQTT clients for paho 1.6 and paho 2, whose callbacks have different arguments."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import ssl
 from pathlib import Path
 from typing import Any, Final
 
-#: Longest wait before another attempt to connect [s].
+#: Longest interval between two attempts to connect [s].
 LONGEST_WAIT_S: Final = 30
-#: Smallest number with which a broker refuses a subscription (paho 1.6).
+#: Smallest reason code of a refused subscription in paho 1.6.
 _REFUSED: Final = 0x80
 
 
 def make_client(client_id: str, *, clean: bool) -> Any:
-    """Return a client of MQTT 3.1.1 that connects again after a break; `clean`: without a lasting session."""
+    """Return a client of MQTT 3.1.1 that reconnects automatically. With `clean`, the session is not persistent."""
     from paho.mqtt import client as paho
 
-    interface = getattr(paho, "CallbackAPIVersion", None)  # this exists from paho 2.0 on
+    interface = getattr(paho, "CallbackAPIVersion", None)  # this attribute exists in paho 2.0 and later
     make: Any = paho.Client
     version = () if interface is None else (interface.VERSION2,)
     client = make(*version, client_id, clean_session=clean, protocol=paho.MQTTv311)
@@ -25,12 +25,14 @@ def make_client(client_id: str, *, clean: bool) -> Any:
 
 
 def use_tls(client: Any, ca: Path | str | None, certificate: Path | str | None, key: Path | str | None) -> None:
-    """Encrypt, and check the broker's certificate and name against `ca` or the system's authorities.
+    """Configure a client to use TLS, and to check the certificate and the name of the broker.
+
+    The certificate is checked with the authority in `ca` or, if `ca` is None, with the authorities of the system.
 
     Raises
     ------
     OSError, ValueError
-        A file cannot be used.
+        A file cannot be read or is invalid.
     """
     if key and not certificate:
         raise ValueError("a key without its certificate")
@@ -41,13 +43,13 @@ def use_tls(client: Any, ca: Path | str | None, certificate: Path | str | None, 
 
 
 def is_resumed(flags: Any) -> bool:
-    """Return whether the broker has kept the session, by the flags that `on_connect` gets."""
+    """Return whether the broker has resumed the session. `flags` is the argument of the callback `on_connect`."""
     found = flags["session present"] if isinstance(flags, dict) else flags.session_present
     return bool(found)
 
 
 def refusal(reason: Any) -> str:
-    """Return why a connection was refused; empty if it was accepted."""
+    """Return the reason why a connection was refused, or an empty string if it was accepted."""
     if isinstance(reason, int):
         from paho.mqtt.client import connack_string
 
@@ -56,14 +58,14 @@ def refusal(reason: Any) -> str:
 
 
 def subscription_refusal(reason: Any) -> str:
-    """Return why a subscription was refused; empty if it was accepted."""
+    """Return the reason why a subscription was refused, or an empty string if it was accepted."""
     if isinstance(reason, int):
         return "not authorized, or no such topic" if reason >= _REFUSED else ""
     return str(reason) if reason.is_failure else ""
 
 
 def end_of(*facts: Any) -> str:
-    """Return why a connection has ended, by the further arguments of `on_disconnect`."""
+    """Return the reason why a connection ended. `facts` are the last arguments of the callback `on_disconnect`."""
     if len(facts) == 1:
         from paho.mqtt.client import error_string
 

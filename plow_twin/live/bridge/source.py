@@ -1,4 +1,4 @@
-"""Interface of the sources of messages, and parsers of lines and JSON payloads."""
+"""Interface of the sources of messages, and parsers for lines and JSON payloads."""
 
 from __future__ import annotations
 
@@ -14,48 +14,51 @@ from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived, Columns, TopicType, columns_of
 from plow_twin.scene_file.csv_rows import delimiter_of
 
-#: Largest number of messages that a source returns at once.
+#: Largest number of messages that a source returns in one call.
 BATCH: Final = 256
-#: Longest line or payload that is read [B].
+#: Largest length of a line or a payload [B].
 LONGEST: Final = 65536
 
 
 class BridgeError(PlowTwinError):
-    """A source cannot be opened or has failed for good."""
+    """A source cannot be opened, or has failed and cannot continue."""
 
 
 class Messages(Protocol):
-    """Messages in order of arrival, which some sources parse only during iteration."""
+    """Messages in the order of arrival. Some sources parse a message only when the iteration reaches it."""
 
     def __len__(self) -> int: ...
     def __iter__(self) -> Iterator[Arrived]: ...
 
 
 class Bridge(ABC):
-    """A source of messages."""
+    """Source of messages."""
 
     def __init__(self, *, ends: bool = False, connected: bool = False) -> None:
-        #: whether the source has an end and its own time, like a file that is read once
+        #: whether the source has an end, like a file that is read once; its stamps then replace the system time
         self.ends = ends
         #: whether the source has ended
         self.finished = False
         self.connected = connected
         #: number of messages that were dropped before they were read
         self.lost = 0
-        #: why no messages can come at present; empty if they can
+        #: reason why no messages can arrive now; empty if messages can arrive
         self.trouble = ""
 
     @abstractmethod
     def topics(self) -> Mapping[str, TopicType] | None:
-        """Return the type of each topic, or None if the mapping may name any topic."""
+        """Return the type of each topic, or None if the mapping may contain any topic."""
 
     @abstractmethod
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
-        """Subscribe to topics; a file that is read once orders its messages by `stamp_ns`."""
+        """Subscribe to topics. If the source has an end, messages of several files are merged by `stamp_ns`."""
 
     @abstractmethod
     def poll(self, timeout_s: float) -> Messages:
-        """Return messages after `timeout_s` at most; the content of an unreadable message is None."""
+        """Return the next messages, or no messages after `timeout_s` [s].
+
+        The content of a message that cannot be parsed is None.
+        """
 
     @abstractmethod
     def close(self) -> None:
@@ -64,14 +67,14 @@ class Bridge(ABC):
 
 @runtime_checkable
 class Reporting(Protocol):
-    """A source with its own part of the diagnostics."""
+    """Source that has a part in the diagnostics."""
 
     def part(self) -> Part:
         """Return the part `source` of the diagnostics."""
 
 
 def read_json(data: bytes) -> dict[str, Any] | None:
-    """Return the object in a JSON text; None if the text is too long or is no object."""
+    """Return the object that a JSON text represents, or None if the text is too long or not an object."""
     if len(data) > LONGEST:
         return None
     try:
@@ -82,14 +85,14 @@ def read_json(data: bytes) -> dict[str, Any] | None:
 
 
 class Lines:
-    """Splits bytes into lines; a line that is too long becomes None."""
+    """Splitter of bytes into lines. A line that is too long becomes None."""
 
     def __init__(self) -> None:
         self._rest = b""
         self._skipping = False
 
     def add(self, data: bytes) -> list[bytes | None]:
-        """Return the lines that are complete now."""
+        """Add bytes, and return the lines that are complete."""
         *whole, self._rest = (self._rest + data).split(b"\n")
         found: list[bytes | None] = []
         for line in whole:
@@ -101,51 +104,54 @@ class Lines:
 
     @property
     def begun(self) -> bool:
-        """Whether the last line is still incomplete."""
+        """Whether the last line is incomplete."""
         return self._skipping or bool(self._rest)
 
     def end(self) -> list[bytes | None]:
-        """Return the last line, which may lack its newline."""
+        """Return the last line, even if it has no newline character."""
         rest, self._rest = self._rest, b""
         return [None] if self._skipping else [rest] if rest else []
 
 
 class Rows:
-    """Parses lines; the first line shows whether they are JSON objects or CSV under a header."""
+    """Parser of lines. The first line determines whether the lines are JSON objects, or CSV with a header."""
 
     def __init__(self) -> None:
-        #: names of the columns, or keys of the first object; None before the first line
+        #: names of the columns, or keys of the first JSON object; None before the first line
         self.columns: list[str] | None = None
         self._json = False
         self.delimiter = ","
-        #: columns of the file that this file has replaced
+        #: columns of the previous file
         self._before: list[str] | None = None
 
     @property
     def under_header(self) -> bool:
-        """Whether further lines are CSV of known columns."""
+        """Whether the lines are CSV and the header has been read."""
         return self.columns is not None and not self._json
 
     def header(self, source: str) -> Columns:
-        """Return the columns; raise the errors of `columns_of`, which name the `source`."""
+        """Return the result of `columns_of` for the columns."""
         return columns_of(source, self.columns or ())
 
     def of_another_file(self) -> Rows:
-        """Return a parser for the next file, to which the present header applies if it has no header."""
+        """Return a parser for the next file. If that file has no header, its columns are those of the present file."""
         rows = Rows()
         rows._before = self.columns
         return rows
 
     def read(self, line: bytes | None) -> dict[str, Any] | bool | None:
-        """Return the content of a line; None if it is unreadable, False if it is empty or a header."""
+        """Return the content of a line.
+
+        Returns None if the line cannot be parsed, and False if it is empty, a comment, or a header.
+        """
         if line is None:
             return None
-        line = line.strip(b"\r \xef\xbb\xbf")  # a tab may separate empty cells, so it is kept
+        line = line.strip(b"\r \xef\xbb\xbf")  # tabs are not removed, because they may separate empty cells
         if not line.strip() or line.startswith(b"#"):
             return False
         if self.columns is None and (self._json or line.startswith(b"{")):
             self._json = True
-            self.columns = list(read_json(line) or ()) or None  # a cut or empty object has no keys
+            self.columns = list(read_json(line) or ()) or None  # a truncated or empty object has no keys
         if self._json:
             return read_json(line)
         cells = self._cells(line)
@@ -157,10 +163,10 @@ class Rows:
                 return False
             self.columns = self._before
         if [cell.strip() for cell in cells] == self.columns:
-            return False  # this line repeats the header
+            return False  # the line repeats the header
         if len(cells) != len(self.columns):
             return None
-        if self.delimiter != ",":  # numbers may have decimal commas
+        if self.delimiter != ",":  # with another delimiter, a comma is a decimal sign
             cells = [cell.replace(",", ".") for cell in cells]
         return dict(zip(self.columns, cells, strict=True))
 

@@ -1,4 +1,4 @@
-"""Lines of a CSV file as arrays, many lines at a time."""
+"""Read many lines of a CSV file at a time, as arrays."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from plow_twin.record.times import OF_NUMBERS, TIMES, times_ns
 
 
 class Table:
-    """Lines of a file (None: too long), read as single messages, or as the numbers of a role in all lines."""
+    """Lines of a file, which can be read as messages or as arrays of numbers. A line that is too long is None."""
 
     def __init__(self, topic: str, lines: Sequence[bytes | None], rows: Rows) -> None:
         self.topic, self._lines, self._rows = topic, lines, rows
@@ -32,10 +32,17 @@ class Table:
                 yield Arrived(self.topic, now_ns, content)
 
     def read(self, role: Role) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-        """Return stamps [ns], shape (n,), and numbers (n, k) of a role as `Role.read` does.
+        """Return the stamps and numbers of a role in all lines, which are equal to the results of `Role.read`.
 
-        The result is None if a line is not a row, or a number is missing or not plain decimal. Then the lines must be
-        read one by one.
+        Returns
+        -------
+        stamp_ns : ndarray of int64, shape (n,)
+            Stamps [ns].
+        values : ndarray, shape (n, k)
+            Numbers of the fields of the role.
+
+        None is returned if a line is not a row, or if a number is missing or not a decimal number. The lines must then
+        be read as messages.
         """
         names = self._rows.columns or []
         stamp = next((name for name in TIMES if name in names), None) if role.stamp == "header" else role.stamp
@@ -47,12 +54,12 @@ class Table:
         found = [number for number in numbers if number is not None]
         if stamps is None or len(found) < len(numbers):
             return None
-        with np.errstate(all="ignore"):  # a number out of range becomes infinite, and its sample is dropped
+        with np.errstate(all="ignore"):  # a number that overflows becomes infinite, and the intake drops its sample
             values = np.stack([role.in_si(name, number) for name, number in zip(role.fields, found, strict=True)], 1)
         return stamps + role.clock_offset_ns, values
 
     def _columns(self) -> list[tuple[bytes, ...]] | None:
-        """Return the cells of each column, or None if the lines differ in their number of cells."""
+        """Return the cells of each column, or None if the lines must be parsed singly."""
         if self._cells is None:
             comma = self._rows.delimiter.encode()
             whole = [line for line in self._lines if line is not None]
@@ -69,7 +76,7 @@ class Table:
         return self._cells
 
     def _numbers(self, cells: Sequence[bytes]) -> NDArray[np.float64] | None:
-        if self._rows.delimiter != ",":  # numbers may have decimal commas
+        if self._rows.delimiter != ",":  # with another delimiter, a comma is a decimal sign
             cells = b"\n".join(cells).replace(b",", b".").split(b"\n")
         if b"".join(cells).translate(None, OF_NUMBERS):
             return None

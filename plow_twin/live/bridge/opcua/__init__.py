@@ -1,1 +1,1 @@
-"""Values of an OPC UA server as messages."""
+"""Receive samples from an OPC UA server."""

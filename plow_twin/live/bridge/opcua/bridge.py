@@ -1,6 +1,6 @@
-"""Samples from an OPC UA server: from a subscription, and after a break from the server's history.
+"""Receive samples from an OPC UA server by a subscription, and read missed samples from the history of the server.
 
-The server sends single values, each with a node and a stamp; `Samples` combines them into samples.
+The server sends single values, each with a node and a stamp. The class `Samples` combines values into samples.
 """
 
 from __future__ import annotations
@@ -31,34 +31,49 @@ from plow_twin.record.mapping import Role
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived, TopicType
 
-#: Largest number of samples that wait to be read; further samples are counted as lost, except samples of the history.
+#: Largest number of samples in the queue. Further samples are counted as lost. Reading of the history waits instead.
 _QUEUE: Final = 100_000
 _PORTS: Final = {"opc.tcp": 4840}
-#: Longest wait [s] for all values with the same stamp, which come in one or two messages; the rest is a margin.
+#: Longest wait for all values with the same stamp [s]. They arrive in one or two messages; the factor 5 is a margin.
 _WAIT_S: Final = 5e-3 * PUBLISHING_MS
-#: The history is read in pieces of this length [ns].
+#: Time span of the history that is read at a time [ns].
 _PIECE_NS: Final = 10_000_000_000
-#: Longest assumed delay of one node's values behind the values of another node [ns].
+#: Largest assumed delay of the values of a node behind the values of another node [ns].
 _OVERLAP_NS: Final = 1_000_000_000
-#: A value whose stamp is further ahead of the system's time than this [ns] is not used in the search for gaps.
+#: Largest plausible lead of a stamp ahead of the system time [ns]. Other values are not used to find gaps.
 _AHEAD_NS: Final = 86_400_000_000_000
-#: Longest assumed delay [s] until a value that was sent is also in the history.
+#: Largest assumed delay until a sent value is available in the history [s].
 _HISTORY_LAG_S: Final = 5.0
-#: Longest wait for the first values of a subscription [s], which a server sends at once.
+#: Longest wait for the first values of a subscription [s]. A server sends these values immediately.
 _FIRST_VALUES_S: Final = 10.0
 _FIRST_WAIT_S: Final = 1.0
 _LONGEST_WAIT_S: Final = 30.0
 
 
 class OpcUa(Bridge):
-    """A subscription to the nodes of a mapping, which is renewed after a break.
+    """Subscription to the nodes of a mapping. After a broken connection, the subscription is renewed.
 
-    Each role of the mapping is a topic, and its fields are nodes. `rate_hz` is the expected rate of the samples; 0
-    requests the server's fastest sampling. With `waits`, `start` returns before there is a connection. `on_arrival` is
-    called from another thread when samples have arrived.
+    Each role of the mapping is a topic, and the fields of the role are nodes.
 
-    Raises BridgeError if the address, a node's identifier or the set of certificates is invalid, or if the connection
-    is not encrypted.
+    Parameters
+    ----------
+    access
+        Address of the server, and credentials.
+    roles
+        Roles of the mapping.
+    rate_hz
+        Expected rate of the samples [Hz]. With 0, the fastest sampling of the server is requested.
+    connect_s
+        Longest wait for the connection [s].
+    waits
+        Whether `start` returns immediately, without waiting for the connection.
+    on_arrival
+        Function that is called, in another thread, when samples have arrived.
+
+    Raises
+    ------
+    BridgeError
+        The address, the identifier of a node or the set of certificates is invalid, or the connection is not encrypted.
     """
 
     def __init__(
@@ -84,7 +99,7 @@ class OpcUa(Bridge):
         self._samples = {
             topic: Samples(sorted(set(role.fields.values())), _WAIT_S) for topic, role in self._roles.items()
         }
-        #: the topics that use each node, by the node's number
+        #: topics that use each node, by number of the node
         self._topics_of = [
             [topic for topic, role in self._roles.items() if node in role.fields.values()] for node in self._nodes
         ]
@@ -101,21 +116,21 @@ class OpcUa(Bridge):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._task: asyncio.Task[None] | None = None
         self._link: Link | None = None
-        #: values that came while the history was read, each list with a flag for lost earlier values; None if values
-        #: are used at once
+        #: values that arrived while the history was read, and for each list, whether earlier values were lost; None if
+        #: values are used immediately
         self._held_back: list[tuple[list[tuple[int, Any]], bool]] | None = None
-        #: steady time at which the connection broke [s]; None while there is a connection
+        #: monotonic time at which the connection broke [s], or None while it exists
         self._broken_s: float | None = None
-        #: why the history cannot be read
+        #: reason why the history cannot be read; empty if it can be read
         self._no_history = ""
         logging.getLogger("asyncua").addHandler(logging.NullHandler())
 
     def topics(self) -> dict[str, TopicType]:
-        """Return the roles as topics, all of the type `OPCUA`."""
+        """Return the roles as topics, which all have the type `OPCUA`."""
         return dict.fromkeys(self._roles, OPCUA)
 
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
-        """Connect and subscribe."""
+        """Connect to the server and subscribe to all nodes."""
         self._thread.start()
         if self._waits:
             return
@@ -139,13 +154,13 @@ class OpcUa(Bridge):
         """Disconnect."""
         self._stop.set()
         if self._loop is not None and self._task is not None:
-            with suppress(RuntimeError):  # the connection has ended by itself
+            with suppress(RuntimeError):  # the event loop has already ended
                 self._loop.call_soon_threadsafe(self._task.cancel)
         if self._thread.is_alive():
             self._thread.join()
 
     def part(self) -> Part:
-        """Return level, message and values of this source for the diagnostics."""
+        """Return the part `source` of the diagnostics."""
         revised, complaint = self._revised, ""
         values = {"server": self._access.url, "connected": str(self.connected).lower()}
         if revised is not None:
@@ -170,7 +185,7 @@ class OpcUa(Bridge):
             link = Link(self._access, self.host, self._ids, self._uris, self._sampling_ms, self._take, self._counts)
             try:
                 await self._follow(link)
-            except Exception as error:  # the library can raise any error for a malformed answer
+            except Exception as error:  # for a malformed answer, asyncua raises various errors
                 self.trouble = self._words(error)
             finally:
                 wait_s = _FIRST_WAIT_S if self.connected else wait_s
@@ -179,7 +194,7 @@ class OpcUa(Bridge):
                     self._counts.breaks += 1
                 self.connected, self._held_back = False, None
                 await link.close()
-            if not (self._waits or self._answer.is_set()):  # the first attempt decides whether the twin starts
+            if not (self._waits or self._answer.is_set()):  # if the first attempt fails, the twin does not start
                 self._answer.set()
                 return
             await asyncio.sleep(wait_s * random.uniform(0.5, 1.0))
@@ -202,7 +217,7 @@ class OpcUa(Bridge):
             self.trouble = f"the connection broke: {link.trouble}; reconnecting"
 
     async def _first_values(self) -> list[tuple[int, Any]]:
-        """Return the first values of the new subscription, up to which the history is read."""
+        """Return the first values of the new subscription. The history is read up to the stamps of these values."""
         give_up = time.monotonic() + _FIRST_VALUES_S
         while not self._held_back and time.monotonic() < give_up:
             await asyncio.sleep(0.01)
@@ -216,7 +231,7 @@ class OpcUa(Bridge):
         self._held_back = None
 
     async def _take(self, values: list[tuple[int, Any]], lost: bool) -> None:
-        """Use values; if values before them were lost, read the history first."""
+        """Use values from the server. If earlier values were lost, the history is read first."""
         if self._held_back is not None:
             self._held_back.append((values, lost))
             return
@@ -242,7 +257,10 @@ class OpcUa(Bridge):
         return 0 if found is None else found[0]
 
     def _is_known(self, number: int, value: Any) -> bool:
-        """Return whether the history had this value; a much older value is new, as the server's clock was set back."""
+        """Return whether a value has already been read from the history.
+
+        A much older value is new, because it means that the clock of the server was set back.
+        """
         stamp_ns = self._stamp_ns(number, value)
         return stamp_ns > 0 and 0 <= self._newest_ns(number) - stamp_ns < _PIECE_NS
 
@@ -260,13 +278,13 @@ class OpcUa(Bridge):
                 if found[0] > time.time_ns() + _AHEAD_NS:
                     samples.add_stray(node, *found, now_s)
                 elif samples.newest_ns[node] or topic == "travel":
-                    # a first speed is used at once, because a speed applies until the next speed
+                    # the first speed is used immediately, because it is valid until the next speed
                     samples.add(node, *found, now_s)
                 else:
                     samples.begin(node, *found)
 
     async def _fill(self, up_to: list[tuple[int, Any]]) -> bool:
-        """Fill the gap before these values from the history; return whether nothing is missing."""
+        """Read the values before the values `up_to` from the history; return whether no value is missing."""
         ends_ns: dict[int, int] = {}
         for number, value in up_to:
             stamp_ns = self._stamp_ns(number, value)
@@ -285,7 +303,7 @@ class OpcUa(Bridge):
         return False
 
     async def _read_history(self, ends_ns: Mapping[int, int]) -> None:
-        """Read the history until each node has a value as new as its time in `ends_ns`."""
+        """Read the history until the newest value of each node reaches the stamp of the node in `ends_ns`."""
         end_ns = max(ends_ns.values(), default=time.time_ns())
         reached_ns, found = 0, 0
         give_up = time.monotonic() + _HISTORY_LAG_S
@@ -307,7 +325,7 @@ class OpcUa(Bridge):
             self._no_history = "the server's history is empty"
 
     async def _take_piece(self, begin_ns: int, end_ns: int) -> int:
-        """Use the history's new values between two stamps [ns]; return their number."""
+        """Use the new values of the history between two stamps [ns], and return the number of these values."""
         assert self._link is not None
         values = await self._link.history(begin_ns, end_ns)
         new = [item for item in values if self._stamp_ns(*item) > self._newest_ns(item[0])]

@@ -1,4 +1,4 @@
-"""A connection to an OPC UA server, with one subscription and access to the history."""
+"""Connection to an OPC UA server, with a subscription and access to the history."""
 
 from __future__ import annotations
 
@@ -19,39 +19,39 @@ from plow_twin.live.bridge.opcua.readings import Counts, date_of
 from plow_twin.live.bridge.opcua.security import identify, secure
 from plow_twin.live.bridge.source import BridgeError
 
-#: Publishing interval requested from the server [ms]: two thirds of the age that a sample may have at the twin.
+#: Publishing interval that is requested from the server [ms]: two thirds of the allowed age of a sample.
 PUBLISHING_MS: Final = 10.0
-#: Number of values of a node that the server is asked to keep between two messages: 1 s at 10 kHz.
+#: Length of the queue that is requested for each node [values]: 1 s at 10 kHz.
 _QUEUE: Final = 10_000
-#: Interval in which a server without new values sends one message [s]; three silent intervals mean that it is gone.
+#: Interval between messages of a server without new values [s]. After three silent intervals, the connection is broken.
 _KEEPALIVE_S: Final = 2.0
-#: Time for which the server keeps a subscription without its client [s].
+#: Time after which the server deletes the subscription of a client that has disappeared [s].
 _LIFETIME_S: Final = 60.0
 _MOST_AGAIN: Final = 100
 _ANSWER_S: Final = 10.0
 _CLOSE_S: Final = 2.0
 _LARGEST_MESSAGE: Final = 64 << 20
-#: Largest part (chunk) of a message [B]; the OPC UA standard demands that a limit allows at least 8 KiB.
+#: Largest size of a chunk of a message [B]. By the OPC UA standard, a client must accept chunks of 8 KiB.
 _LARGEST_PART: Final = 1 << 20
-#: Largest number of values of the history that are read at once: 10 s of ten nodes at 10 kHz.
+#: Largest number of values that are read from the history at a time: 10 s of ten nodes at 10 kHz.
 _MOST_HISTORY: Final = 1_000_000
-#: Sequence numbers begin again at 1 after this number.
+#: Largest sequence number of a message. The next number is 1.
 _LAST_NUMBER: Final = 2**32 - 1
 
-#: Takes pairs of node number and value, and whether values before these pairs were lost.
+#: Function that receives pairs of node number and value, and whether values before these pairs were lost.
 Take = Callable[[list[tuple[int, Any]], bool], Awaitable[None]]
 
 
 @dataclass(frozen=True)
 class Revised:
-    """The intervals [ms] and the queue length that the server grants."""
+    """Intervals [ms] and queue length [values] that the server grants."""
 
     publishing_ms: float
     sampling_ms: float
     queue: int
 
     def complaint(self, sampling_ms: float) -> str:
-        """Return in words which requests the server does not meet; empty if it meets all."""
+        """Return a text about requests that the server does not grant, or an empty string if it grants all requests."""
         slow = self.sampling_ms > max(1.01 * sampling_ms, self.publishing_ms if sampling_ms == 0.0 else 0.0)
         found = [f"samples every {self.sampling_ms:g} ms, asked every {sampling_ms:g} ms"] * slow
         needed = self.publishing_ms / sampling_ms if sampling_ms else 1.0
@@ -60,10 +60,22 @@ class Revised:
 
 
 class Link:
-    """A connection with its subscription.
+    """Connection to a server with a subscription.
 
-    The namespace numbers in `nodes` refer to `uris`, or if these are empty, to the server's present namespaces. A
-    `sampling_ms` of 0 requests the server's fastest sampling. `take` receives the values, `counts` the losses.
+    Parameters
+    ----------
+    access, host
+        Address of the server, and credentials.
+    nodes
+        Identifiers of the nodes, whose namespace numbers are indexes of `uris`.
+    uris
+        Namespaces at the first connection. If it is empty, the current namespaces of the server are used.
+    sampling_ms
+        Requested sampling interval [ms]. With 0, the fastest sampling of the server is requested.
+    take
+        Function that receives the values.
+    counts
+        Counters of the losses.
     """
 
     def __init__(
@@ -80,7 +92,7 @@ class Link:
         #: namespaces of the server, by number
         self.uris = list(uris)
         self._sampling_ms, self._take, self._counts = sampling_ms, take, counts
-        # a late answer does not mean that the server has gone, so the watchdog waits for three intervals
+        # a single late answer is not a broken connection, so the watchdog waits for three intervals
         self._client = Client(access.url, timeout=_ANSWER_S, watchdog_intervall=3.0 * _KEEPALIVE_S)
         _bound(self._client)
         if access.user:
@@ -93,10 +105,14 @@ class Link:
         self._ended = ""
 
     async def open(self) -> Revised:
-        """Connect and subscribe; return what the server grants.
+        """Connect to the server, subscribe to the nodes, and return the granted intervals.
 
-        Raises BridgeError if the certificate is not trusted or a node cannot be subscribed to, and OSError, UaError or
-        TimeoutError if there is no server or it refuses the connection.
+        Raises
+        ------
+        BridgeError
+            The certificate is not trusted, or a node cannot be subscribed to.
+        OSError, UaError, TimeoutError
+            The server does not answer or refuses the connection.
         """
         if self._access.certificate is not None:
             await secure(self._client, self._access, self._host)
@@ -111,23 +127,26 @@ class Link:
         """Disconnect."""
         try:
             await asyncio.wait_for(self._client.disconnect(), _CLOSE_S)
-        except Exception:  # the connection may be in any state, so any error can occur here
+        except Exception:  # the type of the error depends on the state of the connection
             self._client.disconnect_socket()
 
     def _placed(self, node: ua.NodeId, uris: Sequence[str]) -> ua.NodeId:
-        """Return a node's identifier with its namespace's present number, which a restart of the server may change."""
+        """Return the identifier of a node with the current number of its namespace.
+
+        The number may have changed when the server restarted.
+        """
         uri = getattr(node, "NamespaceUri", None)
         if uri is None:
             uri = uris[node.NamespaceIndex] if node.NamespaceIndex < len(uris) else None
         if uri is None:
-            return node  # the server then reports an unknown node
+            return node  # the server will report an unknown node
         if uri not in self.uris:
             raise BridgeError(f"node: got namespace {uri}, expected one of the server: {', '.join(self.uris)}")
         return ua.NodeId(node.Identifier, ua.Int16(self.uris.index(uri)), node.NodeIdType)
 
     @property
     def trouble(self) -> str:
-        """Why no value can arrive; empty: the server answers."""
+        """Reason why no value can arrive; empty while the server answers."""
         if self._ended:
             return self._ended
         if not self._client.uaclient.has_transport:
@@ -136,9 +155,12 @@ class Link:
         return f"no sign of life for {silent_s:.0f} s" if silent_s > 3.0 * self._keepalive_s else ""
 
     async def history(self, begin_ns: int, end_ns: int) -> list[tuple[int, Any]]:
-        """Return pairs of node number and value for all values between two stamps [ns], both included.
+        """Return pairs of node number and value from `begin_ns` to `end_ns`, including both stamps [ns].
 
-        Raises UaError if the server keeps no history of some node, or its answers have no end.
+        Raises
+        ------
+        UaError
+            The server has no history of a node, or the answers do not end.
         """
         details = ua.ReadRawModifiedDetails(
             IsReadModified=False,
@@ -182,7 +204,7 @@ class Link:
         granted = await self._client.uaclient.create_subscription(asked, self._on_publish)
         self._subscription = granted.SubscriptionId
         self._keepalive_s = granted.RevisedPublishingInterval * granted.RevisedMaxKeepAliveCount * 1e-3
-        # an unchanged value with a new stamp is reported too, because it belongs to a sample of its own
+        # values with a new stamp are requested even if the value has not changed, because each stamp is a sample
         by_stamp = ua.DataChangeFilter(Trigger=ua.DataChangeTrigger.StatusValueTimestamp)
         results = await self._monitor(range(len(self._nodes)), by_stamp)
         refused = [
@@ -239,13 +261,13 @@ class Link:
 
     def _missing(self, number: int) -> range:
         expected = self._next_number
-        if expected is not None and number == expected - 1:  # the server has sent the newest message again
+        if expected is not None and number == expected - 1:  # the server has repeated the last message
             return range(0)
         self._next_number = number % _LAST_NUMBER + 1
         return range(0) if expected is None or number < expected else range(expected, number)
 
     async def _again(self, number: int) -> ua.NotificationMessage | None:
-        """Request a lost message again; return None if the server no longer has it."""
+        """Request a lost message, and return it, or None if the server has deleted it."""
         try:
             message = await self._client.uaclient.session.republish(self._subscription, number)
         except UaError:
@@ -263,7 +285,10 @@ class Link:
 
 
 def _bound(client: Client) -> None:
-    """Make a client disconnect from a server that sends oversized messages, which asyncua accepts."""
+    """Limit the size of the messages that a client accepts, because asyncua has no limit.
+
+    If a message is larger, the client disconnects.
+    """
     connection = client.uaclient
     make = connection._make_protocol
 

@@ -1,4 +1,4 @@
-"""Values of OPC UA as numbers with a stamp."""
+"""Convert values of OPC UA to numbers with stamps."""
 
 from __future__ import annotations
 
@@ -9,47 +9,47 @@ from typing import Any, Final
 from plow_twin.live.bridge.opcua.samples import NOT_MEASURED, Value
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
-#: A later time [ns] counts as missing, because servers without a time send a date in 1601 or 9999.
+#: Latest time that is accepted as a stamp [ns]. Servers without a time send a date in 1601 or 9999.
 _FARTHEST_NS: Final = 4_000_000_000_000_000_000
 _MICROSECOND: Final = timedelta(microseconds=1)
 _SEVERITY: Final = 0xC0000000
 _UNCERTAIN: Final = 0x40000000
-#: Bits of a status by which the server says that its queue dropped values before this value.
+#: Bits of a status that mean that the queue of the server dropped values before this value.
 _OVERFLOW: Final = 0x00000480
 
 
 @dataclass
 class Counts:
-    """Counts of a server's values, of lost messages and of broken connections."""
+    """Numbers of values from a server, of lost messages, and of broken connections."""
 
     values: int = 0
     bad: int = 0
     uncertain: int = 0
     not_numbers: int = 0
     unstamped: int = 0
-    #: messages that are missing in the server's numbers and could not be sent again
+    #: messages that are missing according to the sequence numbers and that the server could not repeat
     notifications_lost: int = 0
-    #: values before which the server's queue overflowed
+    #: values before which the queue of the server overflowed
     overflows: int = 0
     breaks: int = 0
     breaks_filled: int = 0
     values_filled: int = 0
-    #: values of the history from times that were not requested
+    #: values of the history with stamps that were not requested
     history_strays: int = 0
-    #: time for which neither the messages nor the history had values [s]
+    #: time without values in the messages and in the history [s]
     unfilled_s: float = 0.0
 
 
 def overflowed(value: Any) -> bool:
-    """Return whether the server dropped values before this one."""
+    """Return whether the server dropped values before this value."""
     return value.StatusCode is not None and value.StatusCode.value & _OVERFLOW == _OVERFLOW
 
 
 def reading(data: Any, by_server: bool, counts: Counts) -> tuple[int, Value] | None:
-    """Return stamp [ns] and value of a `DataValue`, or None without a stamp.
+    """Return the stamp [ns] and the value of a `DataValue`, or None if it has no stamp.
 
-    A value that is no number, or whose status is Bad or Uncertain, counts as not measured. The server's timestamp
-    replaces a missing source timestamp.
+    With `by_server`, the stamp is the timestamp of the server, which also replaces a missing source timestamp. If the
+    value is not a number, or its status is Bad or Uncertain, the result contains `NOT_MEASURED`.
     """
     counts.values += 1
     stamp_ns = None if by_server else _stamp_ns(data.SourceTimestamp, data.SourcePicoseconds)
@@ -71,7 +71,10 @@ def reading(data: Any, by_server: bool, counts: Counts) -> tuple[int, Value] | N
 
 
 def _stamp_ns(time: datetime | None, picoseconds: int | None) -> int | None:
-    """Return a time [ns]; `picoseconds` is what is left below OPC UA's unit of 100 ns."""
+    """Return a time as a stamp [ns], or None if the time is missing or invalid.
+
+    `picoseconds` is the remainder below the resolution of OPC UA, which is 100 ns.
+    """
     if time is None:
         return None
     time = time if time.tzinfo else time.replace(tzinfo=UTC)
@@ -80,5 +83,5 @@ def _stamp_ns(time: datetime | None, picoseconds: int | None) -> int | None:
 
 
 def date_of(stamp_ns: int) -> datetime:
-    """Return a stamp as a date, cut to microseconds."""
+    """Return a stamp as a date, truncated to microseconds."""
     return _EPOCH + stamp_ns // 1000 * _MICROSECOND

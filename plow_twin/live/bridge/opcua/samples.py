@@ -1,4 +1,4 @@
-"""Values of OPC UA nodes combined into samples by their stamps."""
+"""Combine the values of OPC UA nodes into samples by their stamps."""
 
 from __future__ import annotations
 
@@ -6,39 +6,40 @@ from bisect import insort
 from collections.abc import Sequence
 from typing import Final
 
-#: A value that was not measured, or that the twin does not use.
+#: Value of a node that was not measured, or that the twin must not use.
 NOT_MEASURED: Final = ""
 Value = float | str
 _MOST_WAITING: Final = 10_000
 
 
 class Samples:
-    """Samples of a role: the values of the role's nodes at one stamp.
+    """Samples of a role. A sample consists of the values of all nodes of the role at one stamp.
 
-    A server does not send an unchanged value again, so a node keeps its last value. A stamp is complete when each node
-    has a value at this stamp or at a later stamp; it waits for `wait_s` at most.
+    A server does not send a value that has not changed, so the last value of a node replaces a missing value. A sample
+    is complete when each node has a value at its stamp or at a later stamp. After `wait_s` [s], an incomplete sample is
+    returned, too.
     """
 
     def __init__(self, nodes: Sequence[str], wait_s: float) -> None:
         self._wait_s = wait_s
         self._stamps_ns: list[int] = []
-        #: for each stamp: the arrival of its first value [s], and the values by node
+        #: for each stamp, the arrival time of its first value [s], and the values by node
         self._waiting: dict[int, tuple[float, dict[str, Value]]] = {}
         self.newest_ns = dict.fromkeys(nodes, 0)
         self._held: dict[str, Value] = {}
-        #: nodes whose only value is older than the first sample
+        #: nodes that have only a value from before the first sample
         self._begun: set[str] = set()
         self._released_ns = 0
-        #: values by stamp, as in `_waiting`, with stamps too far ahead of the system's time
+        #: values with stamps too far ahead of the system time, in the form of `_waiting`
         self._strays: dict[int, tuple[float, dict[str, Value]]] = {}
-        #: number of late stamps that were dropped because values were missing
+        #: number of late samples that were dropped because values were missing
         self._incomplete = 0
 
     def add(self, node: str, stamp_ns: int, value: Value, now_s: float) -> None:
-        """Add a value; a second value of the same node at the same stamp is ignored."""
+        """Add a value. A second value of the same node with the same stamp is ignored."""
         if stamp_ns == self.newest_ns[node]:
             return
-        # the first value of a starting server may be stamped by another clock, so that later values have older stamps
+        # the first stamp after the start of a server may be wrong, so that the following stamps are older
         self.newest_ns[node] = stamp_ns if node in self._begun else max(stamp_ns, self.newest_ns[node])
         self._begun.discard(node)
         if stamp_ns not in self._waiting:
@@ -47,17 +48,20 @@ class Samples:
         self._waiting[stamp_ns][1].setdefault(node, value)
 
     def add_stray(self, node: str, stamp_ns: int, value: Value, now_s: float) -> None:
-        """Add a value with an impossible stamp, which is passed on apart and counted."""
+        """Add a value with an impossible stamp. It forms a separate sample, which the intake refuses and counts."""
         self._strays.setdefault(stamp_ns, (now_s, {}))[1].setdefault(node, value)
 
     def begin(self, node: str, stamp_ns: int, value: Value) -> None:
-        """Store the value that a node had before the first sample, which it completes."""
+        """Store the value of a node before the first sample. It replaces a missing value in later samples."""
         self.newest_ns[node] = stamp_ns
         self._begun.add(node)
         self._held[node] = value
 
     def take(self, now_s: float) -> list[tuple[int, dict[str, Value]]]:
-        """Return the stamps [ns] that wait no longer at `now_s`, in order, each with the values of all nodes."""
+        """Return the samples that are complete or have waited long enough at the time `now_s` [s], in order.
+
+        A sample is a stamp [ns] and the values of all nodes.
+        """
         found = []
         while self._stamps_ns and self._is_due(self._stamps_ns[0], now_s):
             stamp_ns = self._stamps_ns.pop(0)
@@ -65,7 +69,7 @@ class Samples:
             values = self._waiting.pop(stamp_ns)[1] if late else self._with_held(stamp_ns)
             if len(values) == len(self.newest_ns):
                 found.append((stamp_ns, values))
-            else:  # at the start, a sample that lacks values is no loss
+            else:  # an incomplete sample at the start is not a loss
                 self._incomplete += late
         return found + self._take_strays(now_s)
 
@@ -83,7 +87,7 @@ class Samples:
         return found
 
     def take_incomplete(self) -> int:
-        """Return the number of incomplete late stamps since the last call."""
+        """Return the number of late samples that were dropped since the last call."""
         found, self._incomplete = self._incomplete, 0
         return found
 
@@ -95,7 +99,7 @@ class Samples:
         return stamp_ns > self._released_ns and all(self.newest_ns[node] > stamp_ns for node in missing)
 
     def _with_held(self, stamp_ns: int) -> dict[str, Value]:
-        """Return the values at a stamp, and the last values of the other nodes."""
+        """Return the values at a stamp, and the last values of the nodes without a value at the stamp."""
         self._held |= self._waiting.pop(stamp_ns)[1]
         self._released_ns = stamp_ns
         return dict(self._held)

@@ -1,4 +1,4 @@
-"""Certificates for a connection to an OPC UA server."""
+"""Encrypt a connection to an OPC UA server, and check the certificate of the server."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cryptography.exceptions import InvalidSignature
 from plow_twin.live.bridge.access import Access
 from plow_twin.live.bridge.source import BridgeError
 
-#: Accepted policies, the strongest first.
+#: Accepted security policies, beginning with the strongest policy.
 _POLICIES: Final = (
     security_policies.SecurityPolicyAes256Sha256RsaPss,
     security_policies.SecurityPolicyAes128Sha256RsaOaep,
@@ -26,9 +26,12 @@ _MODE: Final = ua.MessageSecurityMode.SignAndEncrypt
 
 
 async def secure(client: Client, access: Access, host: str) -> None:
-    """Have a client sign and encrypt by the strongest policy that the server offers.
+    """Configure a client to sign and encrypt messages by the strongest policy that the server offers.
 
-    Raises BridgeError if the server offers no secure channel, its certificate is not trusted, or a file cannot be read.
+    Raises
+    ------
+    BridgeError
+        The server offers no encryption, the certificate of the server is not trusted, or a file cannot be read.
     """
     assert access.certificate and access.key and access.ca, "checked with the address"
     endpoints = await client.connect_and_get_server_endpoints()
@@ -53,7 +56,13 @@ async def secure(client: Client, access: Access, host: str) -> None:
 
 
 async def identify(client: Client, access: Access) -> None:
-    """Have a client sign in as the user of a certificate; raise BridgeError if a file cannot be read."""
+    """Configure a client to log in with the certificate of a user.
+
+    Raises
+    ------
+    BridgeError
+        A file cannot be read.
+    """
     assert access.user_key, "checked with the address"
     try:
         await client.load_client_certificate(str(access.user_certificate))
@@ -63,7 +72,10 @@ async def identify(client: Client, access: Access) -> None:
 
 
 def _first(chain: bytes) -> bytes:
-    """Return the first certificate of a chain, which is the server's own (DER, long form of the length)."""
+    """Return the first certificate of a chain in DER encoding, which is the certificate of the server.
+
+    The length in the certificate must have the long form of DER.
+    """
     return chain[: int.from_bytes(chain[2:4], "big") + 4]
 
 
@@ -76,7 +88,10 @@ def _read(path: Path) -> x509.Certificate:
 
 
 def _check_trust(server: x509.Certificate, trusted: x509.Certificate, host: str, access: Access) -> None:
-    """Refuse a server whose certificate is neither the trusted one nor issued by it for this host."""
+    """Raise a `BridgeError` if the certificate of the server is not trusted.
+
+    A certificate is trusted if it is `trusted` itself, or if `trusted` issued it for the host.
+    """
     now = datetime.now(UTC)
     if not server.not_valid_before_utc <= now <= server.not_valid_after_utc:
         raise BridgeError(
@@ -110,7 +125,7 @@ def _hosts(certificate: x509.Certificate) -> list[str]:
 
 
 def _application_uri(certificate: x509.Certificate, otherwise: str) -> str:
-    """Return the application URI in the certificate, which must be the client's."""
+    """Return the application URI in the certificate of the client, or `otherwise` if the certificate has none."""
     names = _names(certificate)
     uris = names.get_values_for_type(x509.UniformResourceIdentifier) if names else []
     return uris[0] if uris else otherwise
