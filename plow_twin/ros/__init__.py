@@ -1,1 +1,1 @@
-"""The twin as a ROS 2 node: parameters, messages, quality of service and diagnostics, without computations."""
+"""The ROS 2 node of the twin: parameters, messages, quality of service and diagnostics."""

@@ -1,7 +1,7 @@
-"""The publishers and subscribers on a node's topics, looked up in the ROS graph.
+"""Look up the publishers and subscribers on the topics of a node in the ROS graph.
 
-The middleware could report them by events, but rmw_fastrtps can deadlock then: it takes two locks in one order when an
-event is requested or taken, and in the other order when an event arises (ros2/rmw_fastrtps#890).
+The lookup replaces the events of the middleware, with which rmw_fastrtps can deadlock. It acquires two locks in one
+order when an event is requested or taken, and in the opposite order when an event occurs (ros2/rmw_fastrtps#890).
 """
 
 from __future__ import annotations
@@ -24,34 +24,35 @@ from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 
 LOOK_S: Final = 0.2
-#: Name of a node whose topics are discovered before the node itself (rmw_dds_common sends both in separate messages).
+#: Name of a node that is not yet known, although its topics are: rmw_dds_common announces the two in separate messages.
 _UNNAMED: Final = "_NODE_NAME_UNKNOWN_"
-#: Shortest time between two warnings about the time on `/clock` [s].
+#: Shortest interval between two error messages about `/clock` [s].
 _SAY_AGAIN_S: Final = 5.0
 _TYPES: Final = frozenset(kind.value for kind in Parameter.Type)
 
 
 class WithoutEvents(Node):
-    """A node without events of the middleware, also for the topics that rclpy makes.
+    """Node that uses no events of the middleware, not even for the topics that rclpy creates.
 
-    It refuses a time before 0 on `/clock`, and parameters that rclpy cannot read, at which rclpy would end the program.
+    The node refuses negative times on `/clock`, and parameters that rclpy cannot read. In rclpy, they would end the
+    program.
     """
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **options: Any) -> Service:
-        """Create a service as rclpy does; requests to set parameters are checked first."""
+        """Create a service like rclpy. Requests to set parameters are checked before rclpy processes them."""
         if srv_type in (SetParameters, SetParametersAtomically):
             callback = partial(_set_parameters, callback)
         return super().create_service(srv_type, srv_name, callback, **options)
 
     def create_publisher(self, *arguments: Any, **options: Any) -> Publisher:
-        """Create a publisher as rclpy does, without events."""
+        """Create a publisher like rclpy, but without events."""
         events = PublisherEventCallbacks(use_default_callbacks=False)
         return super().create_publisher(*arguments, **{"event_callbacks": events, **options})
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[[Any], None], *arguments: Any, **options: Any
     ) -> Subscription:
-        """Create a subscription as rclpy does, without events; times on `/clock` are checked first."""
+        """Create a subscription like rclpy, but without events. Times on `/clock` are checked before rclpy uses them."""
         if msg_type is Clock:
             callback = partial(self._take_clock, callback)
         events = SubscriptionEventCallbacks(use_default_callbacks=False)
@@ -85,7 +86,10 @@ def _set_parameters(callback: Callable[..., Any], request: Any, response: Any) -
 
 
 class Connections:
-    """Finds the peers on a node's topics, and reports each peer that cannot connect once."""
+    """Lookup of the publishers and subscribers on the topics of a node.
+
+    Each publisher or subscriber that cannot connect to the node is reported once.
+    """
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -93,7 +97,7 @@ class Connections:
         self._unnamed: set[tuple[str, bytes]] = set()
 
     def publishers(self, subscription: Subscription) -> tuple[list[Any], int]:
-        """Return the publishers that can connect to a subscription, and the number of new ones that cannot."""
+        """Return the publishers that can connect to a subscription, and the number of new publishers that cannot."""
         topic, found = subscription.topic_name, []
         kind, refused = type_name(subscription.msg_type), 0
         for publisher in self._node.get_publishers_info_by_topic(topic):
@@ -105,7 +109,7 @@ class Connections:
         return found, refused
 
     def look_for_subscribers(self, publishers: Iterable[Publisher]) -> None:
-        """Report the subscribers that cannot connect to this node's publishers."""
+        """Report the subscribers that cannot connect to the publishers of this node."""
         for publisher in publishers:
             topic, kind = publisher.topic_name, type_name(publisher.msg_type)
             for subscriber in self._node.get_subscriptions_info_by_topic(topic):
@@ -118,7 +122,7 @@ class Connections:
         if key in self._said:
             return False
         if other.node_name == _UNNAMED and key not in self._unnamed:
-            self._unnamed.add(key)  # the next look-up may find the name
+            self._unnamed.add(key)  # the name may be known at the next lookup
             return False
         self._said.add(key)
         self._node.get_logger().warning(f"{topic}: {text}")
@@ -126,13 +130,13 @@ class Connections:
 
 
 def type_name(message_class: Any) -> str:
-    """Return the name of a message type, as in the ROS graph."""
+    """Return the name of a message type in the form of the ROS graph."""
     package, folder = message_class.__module__.split(".")[:2]
     return f"{package}/{folder}/{message_class.__name__}"
 
 
 def _in_full(own: QoSProfile) -> QoSProfile:
-    """Return a profile of this node with its defaults resolved, as in the graph."""
+    """Return a profile of this node in which explicit values replace the defaults, as in the ROS graph."""
     return QoSProfile(
         depth=own.depth,
         reliability=own.reliability,

@@ -1,4 +1,4 @@
-"""The live twin on ROS 2: topics, timers and services of a runtime."""
+"""Connect the runtime of a live twin to ROS 2 by topics, timers and services."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 
 
 class RosFront:
-    """The topics, timers and services that configure makes around the runtime, and cleanup releases.
+    """Topics, timers and services of a configured node. It is created on configure and closed on cleanup.
 
-    `changed` is called when the state of the stream may have changed; `prepared`, `kept_wear` and errors are those of
-    `Runtime`.
+    The function `changed` is called when the state of the stream may have changed. The other arguments, and the errors,
+    are those of `Runtime`.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class RosFront:
         self.follows_samples: bool = node.get_parameter("use_sim_time").value
         self.sends_motion = True
         self._changed = changed
-        #: the lock of the twin, for which threads take turns
+        #: lock that protects the twin; see `Turns`
         self.turns = Turns()
         self._lost: list[str] = []
         self._server: OpcUaInput | None = None
@@ -64,7 +64,7 @@ class RosFront:
         made.callback(lambda: self._lost.extend(runtime.close()))
         wanted = (settings.estimate, settings.estimate_forces, any(settings.forecast_limits))
         without = [topic for topic, one in zip(ESTIMATES, wanted, strict=True) if not (settings.estimate and one)]
-        # the node itself publishes `status`, configured or not
+        # the topic `status` is published by the node, because it exists before configure
         if settings.follows != "full":
             without += FOLLOWED_TOPICS
         self._publishers = OutputPublishers(node, ["status", *without], runtime.publishing.memory)
@@ -89,7 +89,7 @@ class RosFront:
         loop.start()
 
     def _draw(self, settings: Settings, made: ExitStack) -> None:
-        """Publish markers; only then are their message types imported."""
+        """Publish markers. The message types are imported here, because they may not be installed."""
         from plow_twin.ros.markers import Markers
 
         markers = Markers(self._node, settings, self.runtime.scene)
@@ -103,7 +103,7 @@ class RosFront:
         self._loop.every(1.0 / settings.marker_rate, publish)
 
     def now_ns(self) -> int:
-        """Return the node's time [ns]."""
+        """Return the time of the node's clock [ns]."""
         return int(self._node.get_clock().now().nanoseconds)
 
     def send(self, topic: str, message: memoryview | Message) -> None:
@@ -115,7 +115,7 @@ class RosFront:
         self.subscriptions.look_for_senders(topic)
 
     def sender_name(self, topic: str, sender: bytes) -> str:
-        """Return node and identity of a publisher of an input."""
+        """Return the node name and the identifier of a publisher of an input."""
         return self.subscriptions.name_of(topic, sender)
 
     def say_alarm(self, level: int, text: str) -> None:
@@ -127,11 +127,11 @@ class RosFront:
             log.warning(text)
 
     def time_text(self, stamp_ns: int) -> str:
-        """Return a stamp in words."""
+        """Return a stamp as text."""
         return time_text(stamp_ns)
 
     def changed(self) -> None:
-        """Take notice that the state of the stream may have changed."""
+        """Update the status, because the state of the stream may have changed."""
         self._changed()
 
     def say_error(self, text: str) -> None:
@@ -140,41 +140,41 @@ class RosFront:
 
     @property
     def error(self) -> Exception | None:
-        """The error that ended the input thread, or None."""
+        """Error that ended the thread of the inputs, or None."""
         return self._loop.error
 
     def look_for_others(self) -> None:
-        """Check whether another node publishes on this twin's topics, and the connection to a server."""
+        """Check whether another node publishes on the output topics, and update the state of the OPC UA connection."""
         if self._server is not None:
             with self.turns:
                 self._server.look()
         self.runtime.others_publish = self._node.count_publishers(self.topics["contact_forces"]) > 1
 
     def parts(self) -> dict[str, Part]:
-        """Return the other parts of the diagnostics."""
+        """Return the part `source` of the diagnostics if the node has an OPC UA server."""
         return {} if self._server is None else {"source": self._server.part()}
 
     def activate(self) -> None:
-        """Start taking samples."""
+        """Begin to use samples."""
         with self.turns:
             self.runtime.activate()
         self._loop.run_timers(True)
 
     def deactivate(self) -> None:
-        """Stop taking samples."""
+        """Stop using samples."""
         with self.turns:
             self.runtime.deactivate()
         self._loop.run_timers(False)
 
     def answer(self, name: str) -> tuple[bool, str]:
-        """Carry out the service `name`; return success and an answer."""
+        """Call the service `name`; return success and an answer."""
         with self.turns:
             if self.runtime.waits_for_clock:
                 return False, "use_sim_time is set and nothing has come on /clock yet"
             return self._services.call(name)
 
     def close(self) -> list[str]:
-        """Release everything in reverse order; return the losses."""
+        """Destroy all topics, timers and services, close the runtime, and return texts about the losses."""
         self.deactivate()
         self._made.close()
         return self._lost

@@ -1,7 +1,8 @@
-"""The queue of one input, read in batches; each message has its publisher and the publisher's sequence number.
+"""Read the queue of a subscription in batches, with the publisher and the sequence number of each message.
 
-Both come from the C interface below rclpy, which also signals new messages through an eventfd without executor and
-interpreter. The subscription is removed from `Node._subscriptions`, so that no executor takes from its queue.
+The queue is read through rcl, the C interface below rclpy, because rclpy does not provide the publisher. rcl signals
+new messages through an eventfd, without an executor. The subscription is removed from `Node._subscriptions`, so that
+no executor reads its queue.
 """
 
 from __future__ import annotations
@@ -21,7 +22,11 @@ _FIRST_CAPACITY: Final = 1024
 
 
 class Taken(NamedTuple):
-    """One message: publisher, sequence number (from 1), time of reception [ns], CDR bytes, time of sending [ns]."""
+    """A received message.
+
+    `sender` is the identifier of the publisher. `number` is the sequence number of the message, counted from 1 for each
+    publisher. `data` contains the CDR bytes, and the times are in ns.
+    """
 
     sender: bytes
     number: int
@@ -31,7 +36,7 @@ class Taken(NamedTuple):
 
 
 class _Info(ctypes.Structure):
-    """`rmw_message_info_t`, with room at the end for the fields of other versions of ROS."""
+    """The C structure `rmw_message_info_t`, with spare bytes at the end for the fields of other versions of ROS."""
 
     _fields_ = [
         ("source_ns", ctypes.c_int64),
@@ -44,21 +49,24 @@ class _Info(ctypes.Structure):
     ]
 
 
-#: Layouts of `_Info` (times of sending and reception, sequence number, publisher), and of the address and length in
-#: `SerializedMessage`.
+#: Layouts of two structures. In `_Info`, these are the times of sending and reception, the sequence number and the
+#: publisher; in `SerializedMessage`, the address and the length of the bytes.
 _INFO, _PLACE = struct.Struct("=qqQ16x16s"), struct.Struct("=QQ")
-#: Answer of rcl for an empty queue.
+#: Return code of rcl for an empty queue.
 _NOTHING_TAKEN: Final = 401
 
 
 @cache
 def _count_up() -> ctypes.c_void_p:
-    """Return `eventfd_write` as a callback of rcl, which passes the eventfd as user data and the number of messages."""
+    """Return the address of the C function `eventfd_write`, which rcl calls for new messages.
+
+    The arguments of the call are the file descriptor, which is the user data, and the number of messages.
+    """
     return ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
 
 
 def _new_buffer() -> SerializedMessage:
-    """Return a buffer that rcl fills and grows."""
+    """Return a buffer that rcl fills, and enlarges if necessary."""
     _, rcutils = libraries()
     buffer, allocator = SerializedMessage(), rcutils.rcutils_get_default_allocator()
     if rcutils.rcutils_uint8_array_init(buffer, _FIRST_CAPACITY, allocator):
@@ -67,9 +75,10 @@ def _new_buffer() -> SerializedMessage:
 
 
 class InputQueue:
-    """A queue that is taken away from the executor and signals arrivals: `fd` becomes readable.
+    """Queue of a subscription that is read without an executor.
 
-    Node and subscription must be made in the thread of the executor; the subscription's own callback is never called.
+    The file descriptor `fd` becomes readable when a message has arrived. The node and the subscription must be created
+    in the thread of the executor. The callback of the subscription is never called.
     """
 
     def __init__(self, node: Node, subscription: Subscription) -> None:
@@ -85,10 +94,10 @@ class InputQueue:
             self._listen(subscription.handle.pointer, _count_up(), self.fd)
 
     def pop(self, most: int, *, all_there_are: bool = False) -> tuple[list[Taken], bool]:
-        """Return up to `most` waiting messages in order of arrival, and whether there are more.
+        """Return at most `most` messages in the order of arrival, and whether the queue contains more messages.
 
-        Only signalled messages are taken, unless `all_there_are`: reading an empty queue takes a fifth of the time of a
-        sample.
+        By default, the number of messages is the number of signals, which saves a read of the empty queue. With
+        `all_there_are`, the queue is read until it is empty.
         """
         try:
             signs = os.eventfd_read(self.fd)
@@ -97,12 +106,12 @@ class InputQueue:
         self._signs += signs
         wanted = most if all_there_are else min(most, self._signs)
         taken = self._taken(wanted)
-        # a queue that has overflowed had more signals than messages
+        # after an overflow of the queue, there are fewer messages than signals
         self._signs = max(0, self._signs - len(taken)) if len(taken) == wanted else 0
         return taken, self._signs > 0 or (all_there_are and len(taken) == most)
 
     def close(self) -> None:
-        """Remove the subscription from the node."""
+        """Destroy the subscription."""
         with self._subscription.handle:
             self._listen(self._subscription.handle.pointer, None, None)
         os.close(self.fd)

@@ -1,4 +1,4 @@
-"""The program `twin`: one node in one process, stopped cleanly by SIGINT and SIGTERM."""
+"""The program `twin`, which runs one node in one process and stops cleanly at SIGINT and SIGTERM."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from plow_twin.live.stop import StopRequested, StopSignals
 if TYPE_CHECKING:
     from rclpy.executors import Executor
 
-#: Longest wait for an event [s]; an unbounded wait of the events executor would not end at shutdown.
+#: Longest wait for an event [s]. Without a limit, the events executor would not return at shutdown.
 _SPIN_S: Final = 0.1
 
 
 def make_executor() -> Executor:
-    """Return the events executor, which needs a third of the time per message, if rclpy has it."""
+    """Return the events executor, which is the fastest, or a single-threaded executor if rclpy has no events executor."""
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:
@@ -29,7 +29,7 @@ def make_executor() -> Executor:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the node until it is asked to stop; return 0, or 2 when arguments or parameters cannot be used."""
+    """Run the node until a stop signal arrives; return 0, or 2 if the arguments or parameters are invalid."""
     _parser().parse_known_args(arguments)
     stop = StopSignals()
     try:
@@ -51,7 +51,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
-    # imported after the signal handlers are set, so that a stop during the imports ends without a traceback
+    # these imports follow the installation of the signal handlers: a signal during the imports causes no traceback
     import rclpy.utilities
 
     from plow_twin.live.parameters import ParameterError
@@ -72,7 +72,7 @@ def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
         while not stop.stopped and rclpy.utilities.ok():
             if starting and node.prepared:
                 starting = False
-                if node.lifecycle == "unconfigured":  # a lifecycle manager may have configured the node already
+                if node.lifecycle == "unconfigured":  # a lifecycle manager may have configured the node before
                     node.start()
             executor.spin_once(timeout_sec=_SPIN_S)
         executor.remove_node(node)

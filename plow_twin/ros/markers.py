@@ -1,4 +1,4 @@
-"""Markers for RViz: walls of the cavity, frame, worn pads and forces; and the head's pose on /tf."""
+"""Publish markers for RViz (walls of the cavity, frame, worn pads and forces), and the pose of the head on /tf."""
 
 from __future__ import annotations
 
@@ -24,16 +24,17 @@ _GREY: Final = (0.6, 0.6, 0.6)
 _BLUE: Final = (0.3, 0.55, 0.9)
 _ORANGE: Final = (0.9, 0.6, 0.1)
 _RED: Final = (0.9, 0.2, 0.2)
-#: Width of lines and arrows, as a share of the frame's height.
+#: Width of lines and arrows, as a share of the height of the frame.
 _LINE: Final = 0.015
-#: Length of the arrow for a force as large as the head's weight, as a share of the frame's height.
+#: Length of the arrow of a force that equals the weight of the head, as a share of the height of the frame.
 _ARROW: Final = 0.5
 
 
 class Markers:
-    """Publisher of the markers, all in the frame `frame_id`.
+    """Publisher of the markers. All coordinates are in the frame `frame_id`.
 
-    Namespaces are `frame`, `cavity`, `pads` (each behind the wall by the depth of its wear) and `forces` (on the head).
+    The namespaces of the markers are `frame`, `cavity`, `pads` and `forces`. A pad is drawn behind its wall at a
+    distance equal to its wear depth. The forces are those that act on the head.
     """
 
     def __init__(self, node: Node, settings: Settings, scene: Scene) -> None:
@@ -47,7 +48,7 @@ class Markers:
         self._weight = scene.head.mass_kg * max(scene.gravity.acceleration_m_s2, 1.0)
 
     def publish(self, stamp_ns: int, row: NDArray[np.void]) -> None:
-        """Send the state of a row of type `ROW`, shape ()."""
+        """Send the markers for the state in a row of the type `ROW`, shape ()."""
         assert row.dtype == ROW
         q = np.asarray(row["q"], float)
         block = 0.5 * np.array([self._scene.frame.width_m, self._scene.frame.height_m])
@@ -61,7 +62,7 @@ class Markers:
         normal = np.stack([NORMAL_X, NORMAL_Y], axis=1)
         along = np.stack([-NORMAL_Y, NORMAL_X], axis=1) * 0.1 * self._scale
         side = -1.0 if self._scene.head.carries == "corners" else 1.0  # sign of the force on the head
-        # a pad is drawn where its corner meets the wall
+        # a pad is drawn at the place where its corner touches the wall
         for pair in range(PAIR_COUNT):
             depth, force = float(row["wear_depth"][pair]), float(row["force"][pair])
             foot = self._corners[pair] + normal[pair] * (self._walls[pair] - normal[pair] @ self._corners[pair])
@@ -102,7 +103,7 @@ class Markers:
 
 
 class _Transforms:
-    """The head's pose on /tf, from `frame_id` to `child_frame_id`; needs tf2_msgs."""
+    """Publisher of the pose of the head on /tf, from `frame_id` to `child_frame_id`."""
 
     def __init__(self, node: Node) -> None:
         from tf2_msgs.msg import TFMessage
@@ -122,7 +123,10 @@ class _Transforms:
 
 
 def placed(points: Array, q: Array) -> Array:
-    """Return points of a body, shape (n, 2), in the slide's axes, given the body's x, y and theta."""
+    """Transform points, shape (n, 2), from the axes of a body at the pose `q` to the axes of the slide.
+
+    `q` is x, y [m] and theta [rad] of the body.
+    """
     c, s = np.cos(q[2]), np.sin(q[2])
     found: Array = points @ np.array([[c, s], [-s, c]]) + q[:2]
     return found

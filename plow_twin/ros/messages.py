@@ -1,4 +1,4 @@
-"""Conversion between ROS messages and plain numbers."""
+"""Convert ROS messages to numbers, and numbers to ROS messages."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ from std_msgs.msg import Header
 from plow_twin.record import messages as plain
 from plow_twin.stream.intake import NS_PER_S
 
-#: Stamp [ns], numbers, whether they are a load, and whether an out-of-plane component is not zero.
+#: Content of a message: stamp [ns], numbers, whether the numbers are a load, and whether the load has a component out of
+#: the plane.
 Read = tuple[int, tuple[float, ...], bool, bool]
-#: A message that cannot be read.
+#: Content of a message that cannot be decoded.
 UNREADABLE: Final[Read] = (0, (), False, False)
 
-#: Layouts in big and in little endian: stamp and length of the frame's name; force and torque.
+#: Layouts of a wrench message, in big-endian and little-endian order. Of each pair, the first layout contains the stamp
+#: and the length of the frame name, and the second layout contains the force and the torque.
 _WRENCH_LAYOUTS: Final = tuple((struct.Struct(f"{order}iII"), struct.Struct(f"{order}6d")) for order in "><")
 
 
@@ -28,9 +30,10 @@ def stamp_ns(header: Header) -> int:
 
 
 def deviations(covariance: Sequence[float]) -> tuple[float, ...]:
-    """Return the standard deviations of x, y [m] and theta [rad] of a covariance, row-major 6 x 6.
+    """Return the standard deviations of x, y [m] and theta [rad] from a row-major 6 x 6 covariance matrix.
 
-    A negative variance gives NaN, so that the message is refused. Variances of 0 mean unknown: the result is empty.
+    If the three variances are 0, they are unknown and the result is empty. The result of a negative variance is NaN, so
+    that the message is refused.
     """
     variances = [float(covariance[7 * axis]) for axis in (0, 1, 5)]
     found = tuple(math.sqrt(variance) if variance >= 0.0 else math.nan for variance in variances)
@@ -38,16 +41,19 @@ def deviations(covariance: Sequence[float]) -> tuple[float, ...]:
 
 
 def set_stamp(header: Header, stamp: int) -> None:
-    """Write a stamp [ns] into a header."""
+    """Write a stamp [ns] to a header."""
     header.stamp.sec, header.stamp.nanosec = divmod(stamp, NS_PER_S)
 
 
 def read_wrench(data: bytes) -> Read:
-    """Decode the CDR bytes of a `WrenchStamped` to Fx, Fy [N] and M [N m], ten times as fast as rclpy."""
+    """Return the stamp [ns] and Fx, Fy [N], M [N m] from the CDR bytes of a `WrenchStamped`.
+
+    The function is ten times as fast as rclpy.
+    """
     try:
         start, numbers = _WRENCH_LAYOUTS[data[1] & 1]
         seconds, nanoseconds, length = start.unpack_from(data, 4)
-        # numbers are aligned to 8 bytes, counted from the end of the encapsulation of 4 bytes
+        # the numbers are aligned to 8 bytes, counted from the end of the 4 bytes that identify the encoding
         fx, fy, fz, mx, my, mz = numbers.unpack_from(data, 4 + (start.size + length + 7) // 8 * 8)
     except (struct.error, IndexError):
         return UNREADABLE
@@ -55,7 +61,7 @@ def read_wrench(data: bytes) -> Read:
 
 
 def ros_status(status: plain.DiagnosticStatus) -> DiagnosticStatus:
-    """Return the ROS message of a status."""
+    """Return the ROS message of a status message of this package."""
     values = [KeyValue(key=key, value=value) for key, value in status.values]
     return DiagnosticStatus(
         level=bytes([status.level]),

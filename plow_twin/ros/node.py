@@ -1,4 +1,4 @@
-"""The lifecycle node `plow_twin`: transitions, status and diagnostics; `RosFront` does the work."""
+"""The lifecycle node `plow_twin`, with its transitions, status and diagnostics. `RosFront` processes the messages."""
 
 from __future__ import annotations
 
@@ -33,16 +33,26 @@ from plow_twin.ros.messages import ros_status
 from plow_twin.ros.parameter_server import ParameterServer
 from plow_twin.ros.qos import DIAGNOSTICS, OUTPUTS
 
-#: A lasting problem is logged once in this number of reports.
+#: Number of reports between two log messages about the same problem.
 _SAY_AGAIN: Final = 5
 
 
 class TwinNode(WithoutEvents, LifecycleNode):
-    """The twin on ROS 2.
+    """The ROS 2 node of the twin. Several nodes can use the same process and executor.
 
-    Several nodes can share a process and an executor; `options` are those of `rclpy.node.Node`. Code that makes a node
-    calls `start`. `stop_asked` is polled while the solver is compiled. Parameters that cannot be used at the start
-    raise ParameterError, which lists them all.
+    Parameters
+    ----------
+    node_name
+        Name of the node.
+    stop_asked
+        Function that returns True if a stop was requested. It is called repeatedly while the solver is compiled.
+    **options
+        Options of `rclpy.node.Node`.
+
+    Raises
+    ------
+    ParameterError
+        Parameters are invalid. The error lists all of them.
     """
 
     def __init__(
@@ -53,9 +63,9 @@ class TwinNode(WithoutEvents, LifecycleNode):
         self._connections = Connections(self)
         self._front: RosFront | None = None
         self.lifecycle = "unconfigured"
-        #: why the last configure failed
+        #: reason why the last configure failed
         self.reason = ""
-        #: wear of all scenes so far, which outlives cleanup
+        #: wear of each scene at its last cleanup
         self._kept_wear: dict[str, KeptWear] = {}
         self._preparation: Preparation | None = None
         self._health = diagnostics.Health()
@@ -66,9 +76,9 @@ class TwinNode(WithoutEvents, LifecycleNode):
         self._status = self.create_publisher(DiagnosticStatus, "status", OUTPUTS["status"])
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS)
         for name in SERVICES:
-            # never destroyed, because a waiting request to a destroyed service would end rclpy's executor
+            # the services exist in all states: a waiting request to a destroyed service would end the executor of rclpy
             self.create_service(Trigger, f"~/{name}", partial(self._answer, name))
-        # reports continue while /clock is paused
+        # the timers use the steady clock, so that reports continue while /clock is paused
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0, self._publish_diagnostics, clock=steady)
         self.create_timer(LOOK_S, self._look_for_publishers, clock=steady)
@@ -78,16 +88,16 @@ class TwinNode(WithoutEvents, LifecycleNode):
 
     @property
     def runtime(self) -> Runtime | None:
-        """The live twin, None while unconfigured."""
+        """The live twin, or None in the state unconfigured."""
         return None if self._front is None else self._front.runtime
 
     @property
     def autostart(self) -> bool:
-        """Whether the program should configure and activate the node."""
+        """Whether the program must configure and activate the node."""
         return self._table.settings.autostart
 
     def prepare(self) -> None:
-        """Compile the solver for the present parameters in a thread, unless this has been done."""
+        """Start to compile the solver for the current parameters in a thread, unless it has been started before."""
         settings = self._table.settings
         if self.runtime is None and (self._preparation is None or self._preparation.key != key(settings)):
             self.get_logger().info(f"scene {settings.scene}: preparing the solver (the first time it is compiled)")
@@ -95,7 +105,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
 
     @property
     def prepared(self) -> bool:
-        """Whether configuring need not wait for the solver."""
+        """Whether configure would not have to wait for the solver."""
         return self._preparation is None or self._preparation.done
 
     def _take_preparation(self) -> Preparation:
@@ -104,12 +114,12 @@ class TwinNode(WithoutEvents, LifecycleNode):
         return preparation
 
     def start(self) -> bool:
-        """Configure and activate; return False if either fails."""
+        """Configure and activate the node; return False if a transition fails."""
         done = TransitionCallbackReturn.SUCCESS
         return self.trigger_configure() == done and self.trigger_activate() == done
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Load the scene, open the recording, make all topics; on failure `reason` states why."""
+        """Load the scene, open the recording, and create all topics. After a failure, `reason` contains the cause."""
         settings = self._table.settings
         try:
             self.prepare()
@@ -127,39 +137,39 @@ class TwinNode(WithoutEvents, LifecycleNode):
         return TransitionCallbackReturn.FAILURE
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take samples from now on."""
+        """Begin to use samples."""
         super().on_activate(state)
-        # the garbage collector need not visit the present objects while samples arrive
+        # while samples arrive, the garbage collector then skips all objects that exist now
         gc.collect()
         gc.freeze()
         self._configured().activate()
         return self._entered("active")
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take no more samples; the state of the model is kept."""
+        """Stop using samples. The state of the model does not change."""
         super().on_deactivate(state)
         gc.unfreeze()
         self._configured().deactivate()
         return self._entered("inactive")
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Release all that configure made, and close the recording."""
+        """Close the live twin with its topics and its recording."""
         self.release()
         return self._entered("unconfigured")
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Do the same as cleanup."""
+        """Close the live twin with its topics and its recording."""
         self.release()
         return self._entered("finalized")
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Do the same as cleanup, so that the node can be configured again."""
+        """Close the live twin with its topics and its recording, so that the node can be configured again."""
         self.release()
         return self._entered("unconfigured")
 
     def release(self) -> None:
-        """Release everything and close the recording, in any state."""
-        # the runtime is part of reference cycles, which are not freed while its objects are frozen
+        """Close the live twin with its topics and its recording, if the node is configured."""
+        # without this call, the garbage collector would not free the runtime, which is part of reference cycles
         gc.unfreeze()
         front, self._front = self._front, None
         if front is None:
@@ -202,7 +212,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
                 self.runtime.parameter(name, value, self._table.settings)
 
     def _refuse_invalid_transitions(self) -> None:
-        """Answer a request for an impossible transition, at which rclpy's own callback would end the process."""
+        """Refuse invalid transitions by an answer. The callback of rclpy would raise an error that ends the process."""
         service = self._service_change_state
         change = service.callback
 
@@ -238,11 +248,11 @@ class TwinNode(WithoutEvents, LifecycleNode):
     def _publish_diagnostics(self) -> None:
         if self._front is not None:
             if self._front.error is not None:
-                raise self._front.error  # this ends the program, like an error of any callback
+                raise self._front.error  # the error ends the program, like an error in any callback
             self._connections.look_for_subscribers(self.publishers)
             self._front.look_for_others()
         elif self.lifecycle == "unconfigured" and not self.reason:
-            # a manager that configures later need not wait for the compiler then
+            # compile now, so that a lifecycle manager that configures the node later does not have to wait
             self.prepare()
         runtime = self.runtime
         if runtime is not None and runtime.without_clock and self._reports % _SAY_AGAIN == 0:

@@ -1,4 +1,4 @@
-"""Inputs of the node from an OPC UA server instead of topics."""
+"""Receive inputs of the node from an OPC UA server instead of topics."""
 
 from __future__ import annotations
 
@@ -22,11 +22,15 @@ from plow_twin.record.sources import Arrived
 
 
 class OpcUaInput:
-    """The nodes of a server, as both the queue and the receiver of some inputs.
+    """Inputs from an OPC UA server. The object is both the queue and the receiver of these inputs.
 
-    It waits for the server at the start and after a break, and `warn` receives a text for each problem of the
-    connection. Parameters name the server, the mapping and the credentials; BridgeError, RecordingError, InputError or
-    OSError say that one of them cannot be used.
+    The parameters of the node contain the server, the mapping and the credentials. At the start and after a broken
+    connection, the object waits for the server. The function `warn` receives a text for each problem of the connection.
+
+    Raises
+    ------
+    BridgeError, RecordingError, InputError, OSError
+        The address, the mapping or the credentials are invalid.
     """
 
     def __init__(self, runtime: Runtime, front: Front, warn: Callable[[str], None]) -> None:
@@ -40,29 +44,29 @@ class OpcUaInput:
         )  # fmt: skip
         model = read_load_model(mapping)
         roles = roles_of(self._bridge, mapping, "", model is not None)
-        #: inputs that the server replaces
+        #: inputs that come from the server
         self.names = frozenset("excitation" if name == "drive" else name for name in roles)
         self._feeder = Feeder(roles, runtime, front.send, model if "drive" in roles else None)
         self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
 
     def start(self) -> None:
-        """Connect."""
+        """Begin to connect to the server."""
         self._bridge.start(list(self._bridge.topics()))
 
     def pop(self, most: int, *, all_there_are: bool = False) -> tuple[list[Arrived], bool]:
-        """Return messages that wait, and whether there may be more."""
+        """Return messages that have arrived, and whether more messages may be waiting."""
         with suppress(BlockingIOError):
             os.eventfd_read(self.fd)
         found = self._bridge.poll(0.0)
         return found, len(found) == BATCH
 
     def receive(self, topic: str, batch: list[Arrived]) -> None:
-        """Pass messages to the twin."""
+        """Pass a batch of messages to the twin."""
         self._inputs.waited(len(batch), (time.time_ns() - batch[0].log_time_ns) * 1e-9)
         self._feeder.feed(batch)
 
     def look(self) -> None:
-        """Update losses and state of the connection, at intervals."""
+        """Update the losses and the state of the connection. The method is called periodically."""
         bridge = self._bridge
         self._inputs.lost += bridge.lost - self._lost
         self._lost = bridge.lost

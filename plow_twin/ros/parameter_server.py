@@ -1,4 +1,4 @@
-"""The table of parameters on a ROS node."""
+"""Declare the parameters of a ROS node, and check changes of them."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def descriptor(spec: Field[Any]) -> ParameterDescriptor:
 
 
 def _converted(parameter: Parameter) -> Parameter:
-    """Return a parameter with its value in the type of the table, if possible.
+    """Return a parameter whose value is converted to the declared type, if possible.
 
-    Without a type, rclpy would take an empty list for bytes, so it is not converted.
+    An empty list is not converted, because rclpy would read it as bytes.
     """
     if parameter.name not in SPECS or parameter.type_ is Parameter.Type.NOT_SET:
         return parameter
@@ -45,13 +45,27 @@ def _converted(parameter: Parameter) -> Parameter:
 
 
 class ParameterServer:
-    """Declares all parameters on a node and holds their current values in `settings`.
+    """Declaration of all parameters on a node. The attribute `settings` contains the current values.
 
-    The node must have `automatically_declare_parameters_from_overrides=True`, so that the given values are read before
-    any type check: a double can then be given as an integer, and one ParameterError can list all bad values.
+    The node must be created with `automatically_declare_parameters_from_overrides=True`. The initial values can then be
+    read before rclpy checks their types. An integer is thus accepted for a double, and one error lists all invalid
+    values.
 
-    `unconfigured` returns whether parameters for configure may change. `changed` receives name and value of each
-    changed parameter that takes effect at once. `refusals` returns why settings cannot be accepted now.
+    Parameters
+    ----------
+    node
+        The node.
+    unconfigured
+        Function that returns whether parameters that take effect on configure may change.
+    changed
+        Function that receives the name and the value of a changed parameter that takes effect immediately.
+    refusals
+        Function that returns the reasons why the twin cannot use new settings.
+
+    Raises
+    ------
+    ParameterError
+        Initial values are invalid.
     """
 
     def __init__(
@@ -81,7 +95,7 @@ class ParameterServer:
         node.add_post_set_parameters_callback(self._after)
 
     def _before(self, asked: list[Parameter]) -> list[Parameter]:
-        """Convert integers to doubles, and log all bad values, since rclpy's checks stop at the first."""
+        """Convert integers to doubles, and log all invalid values, because rclpy reports only the first of them."""
         found = parameters.problems({parameter.name: parameter.value for parameter in asked})
         if found:
             self._node.get_logger().warning(str(parameters.ParameterError(found, "parameters refused")))
@@ -91,7 +105,7 @@ class ParameterServer:
         values = {parameter.name: parameter.value for parameter in asked}
         reasons = [str(problem) for problem in parameters.problems(values)]
         if not self._unconfigured():
-            # a file may set all parameters, so an unchanged value is not refused
+            # an unchanged value is accepted, because a parameter file may set all parameters
             reasons += [
                 f"{name}: takes effect {Effect.CONFIGURE.value}"
                 for name, value in values.items()

@@ -1,4 +1,4 @@
-"""The outputs on ROS topics, with the same bytes as in a recording."""
+"""Publish the outputs on ROS topics. The bytes of a message are equal to those in a recording."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ CLASSES: Final[dict[str, type]] = {JOINT_STATE: JointState, ODOMETRY: Odometry, 
 
 
 class OutputPublishers:
-    """Publishers of the outputs, except those `without`.
+    """Publishers of all outputs except the topics in `without`.
 
-    `memory` has the buffers of messages that are sent often, by base name of their topic.
+    `memory` contains, by base name of the topic, the buffers of messages that are sent after each sample.
     """
 
     def __init__(self, node: Node, without: Collection[str], memory: Mapping[str, memoryview]) -> None:
@@ -35,14 +35,14 @@ class OutputPublishers:
         self._senders = {topic: Sender(self._publishers[topic], data) for topic, data in memory.items()}
 
     def send(self, topic: str, message: memoryview | Message) -> None:
-        """Send a message, or the bytes in the buffer of its topic."""
+        """Send a message, or the content of the buffer of the topic if `message` is a buffer."""
         if isinstance(message, memoryview):
             self._senders[topic].send()
         else:
             self._publishers[topic].publish(encode(message))
 
     def close(self) -> None:
-        """Remove the publishers from the node."""
+        """Destroy the publishers."""
         self._senders.clear()
         for publisher in self._publishers.values():
             self._node.destroy_publisher(publisher)

@@ -9,19 +9,19 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from plow_twin.stream.topics import TOPICS, Topic
 
-#: Policies of inputs that parameters `qos_overrides.<topic>.subscription.<policy>` may override.
+#: Policies of inputs that the parameters `qos_overrides.<topic>.subscription.<policy>` can change.
 OVERRIDABLE: Final = QoSOverridingOptions(
     policy_kinds=(QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
 )
 
 
 def sensor_input(depth: int) -> QoSProfile:
-    """Return a profile that connects to reliable and best-effort publishers."""
+    """Return a best-effort profile, which can connect to reliable and to best-effort publishers."""
     return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def offered(topic: Topic) -> QoSProfile:
-    """Return the quality of service of an output, which is reliable."""
+    """Return the reliable profile of an output topic."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=topic.depth,

@@ -1,6 +1,6 @@
-"""The public, stable C interface below rclpy for serialised messages.
+"""Send and receive serialized messages through rcl, the public C interface below rclpy.
 
-rclpy delivers messages one by one without the publisher's identity, and checks the type of each message sent.
+With rclpy, the publisher of a received message is unknown, and each message is converted to a Python object.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from typing import Any
 
 
 class Allocator(ctypes.Structure):
-    """`rcutils_allocator_t`."""
+    """The C structure `rcutils_allocator_t`."""
 
     _fields_ = [(name, ctypes.c_void_p) for name in ("allocate", "deallocate", "reallocate", "zero_allocate", "state")]
 
 
 class SerializedMessage(ctypes.Structure):
-    """`rcutils_uint8_array_t`."""
+    """The C structure `rcutils_uint8_array_t`."""
 
     _fields_ = [
         ("buffer", ctypes.c_void_p),
@@ -29,7 +29,7 @@ class SerializedMessage(ctypes.Structure):
 
 @cache
 def libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
-    """Return rcl and rcutils, which rclpy has loaded already."""
+    """Return the libraries rcl and rcutils, which rclpy has loaded before."""
     rcl, rcutils = ctypes.CDLL("librcl.so"), ctypes.CDLL("librcutils.so")
     rcutils.rcutils_get_default_allocator.restype = Allocator
     rcutils.rcutils_uint8_array_init.argtypes = [
@@ -44,15 +44,16 @@ def libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
 
 @cache
 def _publish() -> Any:
-    # PyDLL keeps the interpreter's lock, because releasing and taking it takes longer than sending
+    # PyDLL does not release the interpreter lock: to release and acquire it takes longer than to send a message
     publish = ctypes.PyDLL("librcl.so").rcl_publish_serialized_message
     publish.argtypes = [ctypes.c_void_p] * 3
     return publish
 
 
 class Sender:
-    """Sends the CDR message that a buffer contains at the time of the call; once the publisher is destroyed, nothing is
-    sent.
+    """Sender of the CDR message in a buffer. It sends the content that the buffer has at the time of the call.
+
+    After the publisher is destroyed, nothing is sent.
     """
 
     def __init__(self, publisher: Any, data: memoryview) -> None:
@@ -62,6 +63,6 @@ class Sender:
         self._publish = _publish()
 
     def send(self) -> None:
-        """Send the bytes."""
+        """Send the message in the buffer."""
         if self._publish(*self._arguments):
-            self._publisher.publish(bytes(self._data))  # this raises an error with the reason
+            self._publisher.publish(bytes(self._data))  # rclpy raises an error with the reason of the failure

@@ -1,4 +1,4 @@
-"""Start of the ROS 2 programs."""
+"""Initialize ROS 2 in a program."""
 
 from __future__ import annotations
 
@@ -10,12 +10,18 @@ from plow_twin.errors import PlowTwinError
 
 
 class RosArgumentsError(PlowTwinError):
-    """The arguments after `--ros-args`, or a file that they name, cannot be used."""
+    """The arguments after `--ros-args`, or a file in these arguments, are invalid."""
 
 
 def start_ros(arguments: Sequence[str] | None) -> None:
-    """Make the default context of ROS with the given arguments, or those of the process; the program handles signals
-    itself.
+    """Initialize the default context of ROS with arguments, by default with those of the process.
+
+    ROS installs no signal handlers, because the program handles signals itself.
+
+    Raises
+    ------
+    RosArgumentsError
+        The arguments for ROS are invalid.
     """
     import rclpy
     from rclpy.signals import SignalHandlerOptions
@@ -26,7 +32,7 @@ def start_ros(arguments: Sequence[str] | None) -> None:
 
 @contextmanager
 def ros() -> Iterator[None]:
-    """Join the ROS graph; the program handles signals itself."""
+    """Initialize ROS without signal handlers, and shut it down when the context ends."""
     import rclpy.utilities
 
     start_ros([])
@@ -37,7 +43,13 @@ def ros() -> Iterator[None]:
 
 
 def without_ros(arguments: Sequence[str]) -> list[str]:
-    """Return the program's own arguments of a command line; raise RosArgumentsError if those for ROS cannot be used."""
+    """Return the arguments of a command line that are not arguments for ROS.
+
+    Raises
+    ------
+    RosArgumentsError
+        The arguments for ROS are invalid.
+    """
     from rclpy.utilities import remove_ros_args
 
     with _said_plainly():
@@ -47,7 +59,7 @@ def without_ros(arguments: Sequence[str]) -> list[str]:
 
 @contextmanager
 def _said_plainly() -> Iterator[None]:
-    """Turn rclpy's exception into an error without places in rcl's sources."""
+    """Convert an exception of rclpy to an error whose message contains no line numbers of the source code of rcl."""
     try:
         yield
     except RuntimeError as error:

@@ -1,4 +1,4 @@
-"""The subscriptions of a node, whose messages become plain numbers for the runtime."""
+"""Subscribe to the inputs of a node, and pass the numbers in the messages to the runtime."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from plow_twin.stream.intake import Intake, Verdict
 
 #: Depth of the queues of the optional inputs.
 _SLOW_DEPTH: Final = 200
-#: Largest number of publishers that are remembered.
+#: Largest number of publishers whose names and sequence numbers are stored.
 _MOST_PUBLISHERS: Final = 256
-#: Number of samples from which a publisher's rate is estimated.
+#: Number of samples from which the rate of a publisher is estimated.
 _RATE_KNOWN: Final = 20
 _PAIR_NUMBERS: Final = {name: number for number, name in enumerate(PAIR_NAMES)}
 
 
 class Subscriptions:
-    """All subscriptions of a configured node, except to inputs that come from `elsewhere`."""
+    """All subscriptions of a configured node. Inputs in `elsewhere` have no subscription."""
 
     def __init__(
         self,
@@ -51,15 +51,15 @@ class Subscriptions:
         self._inputs, self._intake = runtime.inputs, runtime.driver.intake
         self._connections = Connections(node)
         self._taken_from: dict[str, Subscription] = {}
-        #: publishers of each input at the last look-up
+        #: publishers of each input at the last lookup
         self._found: dict[str, list[bytes]] = {}
         self._tool_forces = ToolForces(runtime.scene)
         self._source, depth = runtime.settings.excitation_source, self._inputs.depth
         self._names: dict[tuple[str, bytes], str] = {}
-        #: next sequence number by topic and publisher
+        #: next expected sequence number, by topic and publisher
         self._following: dict[tuple[str, bytes], int] = {}
-        self._since_ns = time.time_ns()  # when the excitation was subscribed to
-        #: first message of each publisher that appeared after the subscription, and the losses counted before it
+        self._since_ns = time.time_ns()  # time of the subscription to the load
+        #: for each publisher that appeared after the subscription, its first message and the losses before this message
         self._appeared: dict[bytes, tuple[Taken, int]] = {}
         self._before: frozenset[bytes] = frozenset()
         with_covariance = runtime.settings.head_pose_type == "pose_with_covariance"
@@ -71,7 +71,7 @@ class Subscriptions:
         self._subscribe(JointState, "gaps", _SLOW_DEPTH)
 
     def look(self) -> None:
-        """Look up the publishers of the inputs, without the lock, for which samples would have to wait."""
+        """Update the publishers of all inputs. The lookup does not hold the lock, so that samples do not wait."""
         found = {topic: self._connections.publishers(taken) for topic, taken in self._taken_from.items()}
         present = {topic: self._noted(topic, publishers) for topic, (publishers, _) in found.items()}
         refused = sum(count for _, count in found.values())
@@ -82,7 +82,7 @@ class Subscriptions:
             self._inputs.refused_publishers += refused
             self._inputs.publishers |= {topic: len(publishers) for topic, publishers in present.items()}
             for topic in present:
-                # messages may have been taken since the publishers were counted
+                # messages of a new publisher may have arrived since the lookup
                 self.look_for_senders(topic)
         self._front.changed()
 
@@ -108,7 +108,7 @@ class Subscriptions:
         return present
 
     def name_of(self, topic: str, sender: bytes) -> str:
-        """Return node and identity of a publisher, or only the identity if it was never looked up."""
+        """Return the node name and the identifier of a publisher, or only the identifier if the name is unknown."""
         if topic in self._elsewhere:
             return sender.decode(errors="replace")
         if (topic, sender) not in self._names:
@@ -133,7 +133,7 @@ class Subscriptions:
         self._loop.add(InputQueue(self._node, subscription), self, topic)
 
     def receive(self, topic: str, batch: list[Taken]) -> None:
-        """Receive messages of an input; gaps in the publishers' numbers are counted first."""
+        """Count the gaps in the sequence numbers of a batch, and process its messages."""
         inputs, following = self._inputs, self._following
         for message in batch:
             key, number = (topic, message.sender), message.number
@@ -168,10 +168,10 @@ class Subscriptions:
             self._not_selected(topic, batch)
 
     def _count_before_first(self, batch: list[Taken]) -> None:
-        """Count messages that were sent after the subscription but before their publisher's first received message.
+        """Count lost messages that a publisher sent after the subscription but before its first received message.
 
-        Discovery takes time, and a publisher that is new to the node may have been sending for long. Its rate shows
-        whether it began before the subscription.
+        A publisher that is new to the node may have started before the subscription, because discovery takes time. The
+        start is estimated from the rate of the publisher. If it is before the subscription, no message is counted.
         """
         newest = {message.sender: message for message in batch}
         for sender, (first, counted) in list(self._appeared.items()):
@@ -195,7 +195,7 @@ class Subscriptions:
             stamp, values, fits, out_of_plane = self._read(topic, message.data)
             wanted = inputs.wanted(message.sender, message.number, stamp, values, fits)
             if inputs.senders.followed != followed:
-                # the samples collected so far came from another publisher
+                # the samples in `arrived` are from the publisher that was followed before
                 self._step(arrived)
                 arrived, followed = [], inputs.senders.followed
             if wanted:
@@ -244,7 +244,7 @@ class Subscriptions:
             with_covariance = self._pose is PoseWithCovarianceStamped
             pose = message.pose.pose if with_covariance else message.pose
             turn, stamp = pose.orientation, stamp_ns(message.header)
-            # z and w are zero if the sender never filled the field, or if the head is upside down
+            # z and w are both zero if the sender did not set the orientation, or if it is no rotation about z
             if turn.z == turn.w == 0.0:
                 self._inputs.head_pose.refuse(Verdict.MALFORMED, stamp, (pose.position.x, pose.position.y))
                 continue

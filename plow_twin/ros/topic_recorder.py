@@ -1,4 +1,4 @@
-"""Recorder of the received bytes of any topics, beside a twin's run: `plow-twin record`."""
+"""Record the bytes of messages on any topics in the folder of a run, for the command `plow-twin record`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from plow_twin.ros.main import make_executor
 from plow_twin.ros.start import ros
 from plow_twin.scene_file.yaml_text import dump_yaml
 
-#: Number of messages of each topic that may wait for a slow disk.
+#: Length of the queue of each topic, in which messages wait for a slow disk.
 _DEPTH: Final = 5000
 _LOOK_S: Final = 0.5
 _FLUSH_S: Final = 1.0
@@ -45,26 +45,26 @@ def _quality(profile: Any) -> _Quality:
 
 
 def message_class(message_type: str) -> type:
-    """Return the class of a message type that is installed."""
+    """Return the class of an installed message type."""
     package, folder, kind = message_type.split("/")
     found: type = getattr(import_module(f"{package}.{folder}"), kind)
     return found
 
 
 class TopicRecorder:
-    """Records topics as they appear, if `wanted` returns true for their names."""
+    """Recorder of all topics for whose names `wanted` returns True, including topics that appear later."""
 
     def __init__(self, node: Node, writer: BagWriter, wanted: Callable[[str], bool]) -> None:
         self._node, self._writer, self._wanted = node, writer, wanted
-        #: type, number in the file, and subscribed qualities of service of each topic
+        #: type, channel number in the file, and qualities of service of the subscriptions, for each topic
         self._topics: dict[str, tuple[str, int, set[_Quality]]] = {}
-        #: quality of service of the subscription that takes a publisher's messages
+        #: quality of service of the subscription that records the messages of each publisher
         self._taken_as: dict[tuple[str, bytes], _Quality] = {}
         self._turns = Turns()
         self._loop = InputLoop(self._turns, lambda error: None)
-        #: why topics are not recorded
+        #: reason why a topic is not recorded, by topic
         self.skipped: dict[str, str] = {}
-        #: number of messages that were never received, by the publishers' sequence numbers
+        #: number of messages that were not received according to the sequence numbers, by topic
         self.missed: dict[str, int] = {}
         self._newest: dict[tuple[str, bytes], int] = {}
         self._loop.every(_FLUSH_S, writer.flush)
@@ -74,7 +74,7 @@ class TopicRecorder:
 
     @property
     def topics(self) -> list[str]:
-        """The recorded topics."""
+        """Names of the recorded topics."""
         return sorted(self._topics)
 
     def look(self) -> None:
@@ -90,7 +90,7 @@ class TopicRecorder:
                     self.skipped[name] = f"{', '.join(types)}: {error}"
 
     def _subscribe(self, name: str, types: Sequence[str], publishers: Sequence[Any]) -> None:
-        """Subscribe with each quality of service that the publishers of a topic offer."""
+        """Subscribe to a topic, once for each quality of service that its publishers offer."""
         if name not in self._topics:
             if len(types) != 1:
                 raise LookupError("expected one type")
@@ -134,10 +134,10 @@ class TopicRecorder:
         self._loop.add(InputQueue(self._node, subscription), _Subscription(self, quality, number), name)
 
     def add(self, name: str, quality: _Quality, number: int, taken: list[Taken]) -> None:
-        """Write messages of a subscription, each message once."""
+        """Write the messages that a subscription received, without duplicates."""
         for message in taken:
             key = (name, message.sender)
-            # the topic's weaker subscription gets the messages of a stronger publisher too
+            # a best-effort subscription receives the messages of reliable publishers, too
             if self._taken_as.setdefault(key, quality) != quality:
                 continue
             before = self._newest.get(key, message.number - 1)
@@ -147,7 +147,7 @@ class TopicRecorder:
             self._writer.add(number, message.number, received_ns, message.sent_ns or received_ns, message.data)
 
     def close(self) -> None:
-        """Take the waiting messages, and end the subscriptions."""
+        """Write the messages in the queues, and end the subscriptions."""
         self._loop.flush()
         self._loop.close()
 
@@ -172,11 +172,32 @@ def record_topics(
     on_started: Callable[[Path], object] = lambda folder: None,
     on_trouble: Callable[[str], object] = lambda text: None,
 ) -> Mapping[str, Any]:
-    """Record topics to a new folder until `stopped`; return the counts written, lost and skipped by topic.
+    """Record topics to a new folder until `stopped` returns True.
 
-    If the folder exists and is not empty, `<folder>_2`, ... is made. With `every`, all topics are recorded except
-    hidden ones, those in `but`, and those that match `exclude`. `complete` is true if nothing was lost and every topic
-    requested by name was recorded.
+    Parameters
+    ----------
+    folder
+        Folder to create. If it exists and is not empty, `<folder>_2`, `<folder>_3`, ... is created.
+    topics
+        Names of topics to record.
+    every
+        Whether to record all topics, except hidden topics.
+    exclude
+        Regular expression for names of topics that `every` does not include.
+    but
+        Names of topics that `every` does not include.
+    stopped
+        Function that returns True when the recording must end.
+    on_started
+        Function that receives the created folder.
+    on_trouble
+        Function that receives a text when the disk is full, and when it has space again.
+
+    Returns
+    -------
+    dict
+        Numbers of written and lost messages by topic, and the topics that were not recorded. `complete` is True if no
+        message was lost and all topics in `topics` were recorded.
     """
     named = {name if name.startswith("/") else f"/{name}" for name in topics}
     left_out = {*but, "/parameter_events"}
@@ -217,7 +238,10 @@ def record_topics(
 
 
 def schema_of(message_type: str) -> str:
-    """Return the `ros2msg` text of a type and of the types that it uses, from their packages or from ROS 2 Jazzy."""
+    """Return the `ros2msg` text of a message type, including the types of its fields.
+
+    The text is read from the installed packages or, if a package is missing, from the types of ROS 2 Jazzy.
+    """
     from ament_index_python.packages import get_package_share_directory
 
     found: dict[str, str] = {}
