@@ -1,7 +1,7 @@
-"""The command `plow-twin`, whose verbs call the library.
+"""The command `plow-twin`, whose subcommands (verbs) call the library.
 
-Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss. Results go to standard output, progress
-and errors to standard error.
+Results are written to standard output. Progress and errors are written to standard error. The exit codes are 0 (done),
+1 (failed), 2 (wrong usage or scene) and 3 (done, but data were lost and counted).
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from typing import NoReturn
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run the command line and leave with its exit code."""
+    """Run the command line, and exit with its exit code."""
     _open_what_is_closed()
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
         sys.exit("plow-twin: NUMBA_DISABLE_JIT is set, expected it unset, as the solver is compiled")
     with _ending_at_once():
-        # an interrupted import may raise another error
+        # the cause of an ImportError is reported if it exists, because it is more precise
         try:
             import plow_twin.run.twin  # noqa: F401
             from plow_twin.cli.app import main as run
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def _open_what_is_closed() -> None:
-    """Open /dev/null for closed standard streams, so that no file gets their descriptors."""
+    """Open /dev/null for closed standard streams, so that no other file receives the descriptors 0 to 2."""
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(descriptor)
@@ -47,13 +47,13 @@ def _open_what_is_closed() -> None:
 
 @contextmanager
 def _ending_at_once() -> Iterator[None]:
-    """End the process on Ctrl-C without a traceback; no work has begun."""
+    """End the process at Ctrl-C without a traceback. Nothing must be saved, because no work has begun."""
 
     def end(*_: object) -> None:
         os.write(2, b"plow-twin: interrupted\n")
         os._exit(1)
 
-    # a caller may ignore or handle Ctrl-C
+    # the handler is not replaced if the calling program ignores or handles Ctrl-C
     ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if not ours or threading.current_thread() is not threading.main_thread():
         yield

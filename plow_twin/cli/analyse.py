@@ -1,4 +1,4 @@
-"""`plow-twin analyse`: recordings compared with the predictions of the model."""
+"""The command `plow-twin analyse`, which compares recordings with the predictions of the model."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from plow_twin.cli.options import FOLDER, PLACE, POSITIVE, json_option, map_opti
 @map_option
 @unit_option
 @click.option("--with", "others", multiple=True, help="A further scene for predictions; may be repeated.")
-@click.option("--out", type=FOLDER, help="Folder for report.html and Parquet.")
+@click.option("--out", type=FOLDER, help="Folder for report.html and Parquet files.")
 @click.option("--workers", type=click.IntRange(1), help="Processes for many recordings; by default one per core.")
 @click.option(
     "--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster for many recordings, e.g. tcp://host:8786."
@@ -85,13 +85,13 @@ def analyse(
 
 
 def found_recordings(recordings: Sequence[Path], out: Path | None = None) -> tuple[list[Path], tuple[Path, ...]]:
-    """Return the recordings at paths and in folders; report other items in the folders."""
+    """Return the recordings at paths and in folders, and the other items in the folders, which are also reported."""
     from plow_twin.study.analysis.recordings import counted_once, expand, left_out
 
     for path in recordings:
         if not path.exists():
             raise click.BadParameter(f"{path}: does not exist", param_hint="RUN...")
-    # results of an earlier analysis are not reported as left out
+    # results of an earlier analysis are not reported as other items
     results_before = () if out is None else (out.resolve(), (out / "run").resolve())
     left = {item: path for path in recordings for item in left_out(path, results_before)}
     left = {item: path for item, path in left.items() if item.resolve() not in results_before}
@@ -119,7 +119,7 @@ def _alone(task: Any, quiet: bool) -> dict[str, Any]:
 
 
 def _run(tasks: list[Any], workers: int, dask: str | None, quiet: bool) -> list[dict[str, Any]]:
-    """Analyse on all cores or a cluster; existing results are kept, so that the command can be continued."""
+    """Analyse recordings on all cores or on a cluster. Results of an interrupted command are used."""
     from plow_twin.study.analysis.many import run_many
 
     with progress("analysing", quiet) as on_progress:
@@ -150,7 +150,7 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
             sys.stdout.flush()
         else:
             _show([facts], False, False, quiet)
-        # summing up takes at most a tenth of the time
+        # the reports take at most a tenth of the time
         due = time.monotonic() + max(every, 9.0 * (time.monotonic() - begin))
 
     with interruptible() as stopped:
@@ -173,7 +173,7 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
 
 def _show_contacts(console: Console, results: Sequence[dict[str, Any]]) -> None:
     shown = table("Contacts computed", "run", "time [s]", "impacts [1/min]", "largest force [kN]", "at")
-    # a long name of a run is wrapped
+    # the name of a run may be long, so it is wrapped
     shown.columns[0].no_wrap, shown.columns[0].overflow = False, "fold"
     for facts in results:
         loads = facts["loads"]

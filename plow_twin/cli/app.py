@@ -1,4 +1,4 @@
-"""The command group, which runs verbs and turns errors into exit codes."""
+"""The command group, which runs the verbs and converts errors to exit codes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from plow_twin.cli.telemetry import telemetry
 from plow_twin.cli.view import view
 from plow_twin.errors import ExcessError, InputError, PlowTwinError, RunInterrupted, UnitError
 
-#: The extra of the package that installs each module.
+#: Extra of the package that installs each optional module.
 EXTRA_OF_MODULE: Final = {
     "rclpy": "ros",
     "rcl_interfaces": "ros",
@@ -66,7 +66,7 @@ EXTRA_OF_MODULE: Final = {
     "distributed": "dask",
 }
 
-#: Longest message [characters]; a message may list names, of which a file may have a million.
+#: Largest length of an error message [characters]. A message may list the names in a file, which may be a million.
 _LONGEST: Final = 16_000
 
 
@@ -113,23 +113,23 @@ for _verb in (
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run the command line and leave with its exit code."""
+    """Run the command line, and exit with its exit code."""
     code = run(arguments)
     if threading.current_thread() is threading.main_thread():
-        # a terminal and a launch may each send a signal, and the second would change the exit code
+        # a terminal and `ros2 launch` may both send a signal, and the second signal would change the exit code
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
     try:
         if sys.stdout is not None:  # standard output is None if it was closed at the start
             sys.stdout.flush()
     except BrokenPipeError:
-        # Python must not report at exit that the reader is gone
+        # with this replacement, Python does not report a broken pipe at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(code)
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code; an error is one message on standard error."""
+    """Run the command line, and return its exit code. An error is printed as a message on standard error."""
     try:
         code = commands.main(args=arguments, prog_name="plow-twin", standalone_mode=False)
         return code if isinstance(code, int) else 0
@@ -140,7 +140,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except RunInterrupted as error:
         return _fail(str(error))
     except (click.Abort, KeyboardInterrupt) as error:
-        # click replaces a KeyboardInterrupt by an Abort, whose cause it is
+        # click replaces a KeyboardInterrupt by an Abort; the KeyboardInterrupt is the cause of the Abort
         stopped = error.__cause__
         return _fail(str(stopped) if isinstance(stopped, RunInterrupted) else "interrupted")
     except (InputError, UnitError, ExcessError) as error:

@@ -1,4 +1,4 @@
-"""`plow-twin call`: a service of a twin that runs without ROS."""
+"""The command `plow-twin call`, which calls a service of a twin that runs without ROS."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ from plow_twin.live.service_names import SERVICES, mark_problem
 @click.argument("service", type=click.Choice(SERVICES))
 @click.argument("text", required=False)
 def call(socket: Path, service: str, text: str | None) -> int:
-    """Call a SERVICE of the twin that `plow-twin live --control SOCKET` runs; TEXT is the text of a mark."""
+    """Call a SERVICE of the twin that was started by `plow-twin live --control SOCKET`.
+
+    TEXT is the text of a mark.
+    """
     from plow_twin.live.control import call as ask
 
     if text is not None and service != "mark":

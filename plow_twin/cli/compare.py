@@ -1,4 +1,4 @@
-"""`plow-twin compare`: comparison of the runs of one machine by run, day or shift."""
+"""The command `plow-twin compare`, which compares the runs of one machine by run, day or shift."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 )
 @click.argument("recordings", metavar="RUN...", type=PLACE, nargs=-1, required=True)
 @click.option(
-    "--by", type=click.Choice(["run", "day", "shift"]), default="run", show_default=True, help="What makes a group."
+    "--by", type=click.Choice(["run", "day", "shift"]), default="run", show_default=True, help="Kind of the groups."
 )
 @click.option("--shifts", default="06:00,14:00,22:00", show_default=True, help="Times at which shifts begin.")
 @click.option("--zone", default="UTC", show_default=True, help="Time zone of days and shifts, e.g. Europe/Berlin.")
-@click.option("--window", type=POSITIVE, metavar="S", help="Length of a window; by default the load's period.")
-@click.option("--out", type=FOLDER, help="Folder for compare.html and Parquet.")
+@click.option("--window", type=POSITIVE, metavar="S", help="Length of a window [s]; by default the load's period.")
+@click.option("--out", type=FOLDER, help="Folder for compare.html and Parquet files.")
 @click.option("--workers", type=click.IntRange(1), help="Processes; by default one per core.")
 @click.option("--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster, e.g. tcp://host:8786.")
 @json_option
@@ -46,7 +46,10 @@ def compare(
     as_json: bool,
     quiet: bool,
 ) -> int:
-    """Compare runs, or folders of runs, with the first run: peaks, impacts, contact, impulse, dissipation, wear."""
+    """Compare runs, or folders of runs, with the first run.
+
+    The compared quantities are peaks, impacts, contact, impulse, dissipation and wear.
+    """
     from plow_twin.cli.analyse import found_recordings
     from plow_twin.study.analysis.many import run_many
     from plow_twin.study.analysis.task import names_apart
@@ -133,7 +136,7 @@ def _show(found: Comparison) -> None:
     console.print(_KEY, highlight=False)
 
 
-#: The sign of each cause of a change, and the explanation of the signs.
+#: Sign of each cause of a change in a table, and an explanation of the signs.
 _SIGNS: Final = {"chance": "", "machine": "M", "load": "L", "load or machine": "?"}
 _KEY: Final = (
     "M: the machine changed, L: the load changed, ?: either; no letter: may be chance. All numbers of a table are "
@@ -142,7 +145,7 @@ _KEY: Final = (
 
 
 def _text(change: Change | None) -> str:
-    """Return a change in percent with the sign of its cause."""
+    """Return a change in percent, followed by the sign of its cause."""
     if change is None:
         return "-"
     percent = round(100.0 * change.share, 1) + 0.0

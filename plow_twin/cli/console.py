@@ -1,4 +1,4 @@
-"""Common parts of the verbs: exit codes, consoles, progress, tables, sentences about losses."""
+"""Functions that several verbs use for exit codes, progress, tables and messages about losses."""
 
 from __future__ import annotations
 
@@ -32,24 +32,24 @@ FAILED: Final = 1
 WRONG_INPUT: Final = 2
 DONE_WITH_LOSS: Final = 3
 
-#: Receives the share of the work that is done, from 0 to 1.
+#: Function that receives the share of the work that is done, from 0 to 1.
 OnProgress = Callable[[float], None]
 
 
 def say_error(text: str) -> None:
-    """Print a line on standard error; a full disk or a closed terminal raises no error."""
+    """Print a line on standard error. Errors of a full disk or a closed terminal are ignored."""
     with suppress(OSError):
         click.echo(printable(text), err=True)
 
 
 class PlainConsole(Console):
-    """A console that shows texts of files literally: no markup, no emoji codes, no control characters."""
+    """Console that prints texts literally, without interpretation of markup, emoji codes and control characters."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, **options)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        """Yield the parts to show; only the console's own control characters remain."""
+        """Yield the segments to print. Control characters in texts are replaced by printable characters."""
         for part in super().render(renderable, options):
             yield part if part.control else Segment(printable(part.text), part.style)
 
@@ -60,7 +60,7 @@ def output_console() -> Console:
 
 
 def error_console() -> Console:
-    """Return the console for progress, apart from results."""
+    """Return the console for progress, which writes to standard error."""
     return PlainConsole(stderr=True)
 
 
@@ -71,7 +71,10 @@ class _RateColumn(ProgressColumn):
 
 @contextmanager
 def progress(title: str, quiet: bool) -> Iterator[OnProgress]:
-    """Show a progress bar on standard error while the work reports its progress."""
+    """Show a progress bar on standard error, and yield the function that receives the progress.
+
+    After Ctrl-C, this function raises KeyboardInterrupt.
+    """
     with progress_bar(title, quiet) as update, _interruption() as interrupted:
 
         def on_progress(share: float) -> None:
@@ -84,7 +87,10 @@ def progress(title: str, quiet: bool) -> Iterator[OnProgress]:
 
 @contextmanager
 def progress_bar(title: str, quiet: bool) -> Iterator[OnProgress]:
-    """Show a progress bar on standard error without a change of the handlers of signals."""
+    """Show a progress bar on standard error, and yield the function that receives the progress.
+
+    Signal handlers are not changed.
+    """
     columns = (
         TextColumn("{task.description}"),
         BarColumn(bar_width=30),
@@ -101,7 +107,10 @@ def progress_bar(title: str, quiet: bool) -> Iterator[OnProgress]:
 
 @contextmanager
 def _interruption() -> Iterator[Callable[[], bool]]:
-    """Note Ctrl-C beside its exception, which is lost in a destructor."""
+    """Yield a function that returns whether Ctrl-C was pressed.
+
+    The KeyboardInterrupt alone is not sufficient, because it is lost if it is raised in a destructor.
+    """
     before, asked = signal.getsignal(signal.SIGINT), False
 
     def note(number: int, frame: FrameType | None) -> None:
@@ -121,7 +130,7 @@ def _interruption() -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def busy(title: str, quiet: bool) -> Iterator[None]:
-    """Show progress of unknown length on standard error."""
+    """Show on standard error that work of unknown duration is in progress."""
     if quiet:
         yield
         return
@@ -130,7 +139,7 @@ def busy(title: str, quiet: bool) -> Iterator[None]:
 
 
 def table(title: str, *columns: str) -> Table:
-    """Return a table whose first column is text, and whose other columns are numbers."""
+    """Return a table with a column of text and further columns of numbers."""
     result = Table(title=title, title_justify="left")
     for index, name in enumerate(columns):
         result.add_column(name, justify="left" if index == 0 else "right", no_wrap=index == 0)
@@ -138,7 +147,7 @@ def table(title: str, *columns: str) -> Table:
 
 
 def show_facts(console: Console, facts: Mapping[Any, Any], indent: int = 0) -> None:
-    """Print a fact per line, with the facts of a mapping indented below its name; long texts are not wrapped."""
+    """Print each fact on a line, without wrapping of long texts. The facts in a mapping are indented below its name."""
     for key, value in facts.items():
         name = " " * indent + str(key)
         if isinstance(value, Mapping) and value:
@@ -159,12 +168,12 @@ def _plain(value: Any) -> str:
 
 
 def counts(found: Mapping[str, int]) -> str:
-    """Return counts with their names as a line of text."""
+    """Return a line of text with names and counts."""
     return ", ".join(f"{name}: {count}" for name, count in found.items())
 
 
 def say_end(recording: object, status: str) -> None:
-    """Print that a recording has no proper end, and which verb completes it."""
+    """Print the status of an incomplete recording, and the verb that repairs it."""
     from plow_twin.record.reader import FileStatus
 
     if status not in (FileStatus.COMPLETE.value, FileStatus.UNREAD.value):
@@ -174,7 +183,7 @@ def say_end(recording: object, status: str) -> None:
 
 
 def say_lost(recording: object, lost: Mapping[str, int]) -> None:
-    """Print the losses of a recording, including an early end."""
+    """Print the losses of a recording, and its status if it is incomplete."""
     from plow_twin.record.reader import FileStatus
 
     ends = {status.value for status in FileStatus}

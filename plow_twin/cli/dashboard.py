@@ -1,4 +1,4 @@
-"""Options of the screen, and `plow-twin dashboard`, the screen for a node or a recording."""
+"""The command `plow-twin dashboard`, which shows a node or a recording in the browser, and the options of the page."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def access_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--token-file",
             type=FILE,
-            help="File whose first line is the token of the screen; by default PLOW_TWIN_DASHBOARD_TOKEN.",
+            help="File whose first line is the token of the page; by default PLOW_TWIN_DASHBOARD_TOKEN.",
         ),
         click.option(
             "--listen",
             metavar="HOST:PORT",
             default="127.0.0.1:8070",
             show_default=True,
-            help="Address of the screen; other machines need a token. Port 0: any free port.",
+            help="Address of the page; other machines need a token. With port 0, a free port is chosen.",
         ),
     ):
         command = option(command)
@@ -44,7 +44,10 @@ dashboard_option = click.option("--dashboard", is_flag=True, help="Show the run 
 
 
 def access_of(options: dict[str, Any]) -> PageAccess:
-    """Return the access that the options request; raise the errors of `PageAccess.of` and `listening`."""
+    """Return the address and the token of the page from the options.
+
+    The errors are those of `PageAccess.of` and `listening`.
+    """
     from plow_twin.dashboard.access import PageAccess, listening
 
     access = PageAccess.of(options["listen"], options["token_file"])
@@ -53,7 +56,10 @@ def access_of(options: dict[str, Any]) -> PageAccess:
 
 
 def access_if_shown(options: dict[str, Any]) -> PageAccess | None:
-    """Return the access to the screen, or None without `--dashboard`, which its other options need."""
+    """Return the result of `access_of`, or None without the option `--dashboard`.
+
+    Without `--dashboard`, the other options of the page are errors.
+    """
     if options["dashboard"]:
         return access_of(options)
     context = click.get_current_context()
@@ -69,7 +75,7 @@ def say_where(screen: Screen, access: PageAccess) -> None:
 
 
 def stay(screen: Screen, stopped: Callable[[], bool]) -> None:
-    """Keep the page until a stop is requested or its server ends."""
+    """Serve the page until a stop is requested or the server ends."""
     say_error("the input has ended; the page stays until Ctrl-C")
     while not (stopped() or screen.has_ended):
         screen.feed.turn()
@@ -88,7 +94,10 @@ def stay(screen: Screen, stopped: Callable[[], bool]) -> None:
 def dashboard(
     run: Path | None, ros: bool, namespace: str, name: str, scene: str | None, wait: float, **options: Any
 ) -> int:
-    """Show RUN (a recording, also while it is written) or a node (--ros) until interrupted."""
+    """Show a recording or a node (--ros) on a page until interrupted.
+
+    RUN is the recording, which may still be written.
+    """
     if ros == (run is not None):
         raise click.UsageError("expected a recording or --ros")
     if scene is not None and not ros:
@@ -98,7 +107,7 @@ def dashboard(
     access = access_of(options)
     with interruptible() as stopped:
         if run is None:
-            # where wheels of ROS have the message definitions
+            # if ROS was installed from wheels, the message definitions are in this folder
             os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
             from plow_twin.dashboard.node import show_node
 

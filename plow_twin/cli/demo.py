@@ -1,4 +1,4 @@
-"""`plow-twin demo`: publisher, node and recorder together."""
+"""The command `plow-twin demo`, which runs a publisher, the node and the recorder together."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from plow_twin.cli.options import FOLDER, POSITIVE, quiet_option
 
 
 @click.command(
-    short_help="Run publisher, node and recorder for some seconds.",
+    short_help="Run a publisher, the node and the recorder for some seconds.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done with counted loss.",
 )
 @click.option(
@@ -20,7 +20,7 @@ from plow_twin.cli.options import FOLDER, POSITIVE, quiet_option
     type=click.Choice(["real", "fast"]),
     default="real",
     show_default=True,
-    help="real: in real time; fast: under /clock, as fast as possible.",
+    help="Run in real time (real), or as fast as possible under /clock (fast).",
 )
 @click.option("--seconds", type=POSITIVE, default=20.0, show_default=True, help="Duration in the machine's time [s].")
 @click.option(
@@ -34,7 +34,7 @@ from plow_twin.cli.options import FOLDER, POSITIVE, quiet_option
 @access_options
 @quiet_option
 def demo(speed: str, seconds: float, out: Path, quiet: bool, dashboard: bool, **options: Any) -> int:
-    """Run the twin on the paper's load: a publisher process and a node with its recorder."""
+    """Run the twin under the load of the paper, which a publisher process sends to the node and its recorder."""
     from plow_twin.demo.demo import run_demo
 
     if access_if_shown({**options, "dashboard": dashboard}) is None:

@@ -1,4 +1,4 @@
-"""`plow-twin doctor`: content and losses of a recording, and its repair."""
+"""The command `plow-twin doctor`, which reports the content and losses of a recording, and repairs it."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from plow_twin.cli.options import EXISTING, json_option
 
 
 @click.command(
-    short_help="Report content and losses of a recording; repair it.",
+    short_help="Report the content and losses of a recording, and repair it.",
     epilog="Exit codes: 0 complete, 1 failed or no recording, 2 wrong usage, 3 incomplete.",
 )
 @click.argument("recording", type=EXISTING)
-@click.option("--repair", is_flag=True, help="Rewrite parts that were cut off or damaged; the old files are kept.")
+@click.option("--repair", is_flag=True, help="Rewrite truncated and damaged files; the old files are renamed.")
 @json_option
 def doctor(recording: Path, repair: bool, as_json: bool) -> int:
-    """Report content and losses of RECORDING; with --repair complete its parts."""
+    """Report the content and losses of RECORDING. With --repair, truncated and damaged files are rewritten."""
     from plow_twin.record.doctor import examine
     from plow_twin.record.doctor import repair as make_whole
 

@@ -1,4 +1,4 @@
-"""`plow-twin estimate`: clearances and contact from a measured motion, with intervals."""
+"""The command `plow-twin estimate`, which estimates clearances and contact parameters from a measured motion."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     "members",
     metavar="N",
     type=click.IntRange(20, 4096),
-    help="Compute each pair's forces with 90 % intervals, from N twins drawn from the estimate (256 are enough).",
+    help="Compute the forces of each pair with 90 % intervals, from N twins drawn from the estimate (256 are enough).",
 )
 @click.option(
     "--follow",
@@ -65,7 +65,7 @@ if TYPE_CHECKING:
 @click.option(
     "--plot",
     type=NEW_FILE,
-    help="Picture of the fit: measured and fitted motion, residuals, intervals. PNG, or .rrd for rerun.",
+    help="Picture of the fit, with measured and fitted motion, residuals and intervals, as PNG or as .rrd for rerun.",
 )
 @quiet_option
 def estimate(
@@ -81,17 +81,19 @@ def estimate(
     plot: Path | None,
     quiet: bool,
 ) -> int:
-    """Estimate clearances, contact, load gains, bias and delay from INPUT, with 90 % intervals.
+    """Estimate clearances, contact parameters, load gains, bias and delay from INPUT, with 90 % intervals.
 
-    INPUT is a folder with scene.yaml (the nominal scene), load.csv (t, fx, fy, m: the measured load) and pose.csv (t,
-    x, y, theta: the measured pose; a cell is empty if it was not measured). It may also have gaps.csv (t, and columns
-    named after pairs: measured gaps), with or without pose.csv, and contact_forces.csv (the same columns: measured
-    forces). Each table may be .parquet. INPUT may also be a run of plow_twin or another recording (MCAP, rosbag2's
-    sqlite3, CSV, Parquet). If the node of a run made estimates, the newest is computed again from the journal and
-    compared bit for bit; otherwise the measured pose must be recorded beside the run.
+    INPUT is a folder with the nominal scene, scene.yaml, and tables in CSV or Parquet. The table load.csv (t, fx, fy,
+    m) contains the measured load. The table pose.csv (t, x, y, theta) contains the measured pose; its cells may be
+    empty. The optional table gaps.csv (t and columns named after pairs) contains measured gaps, and may replace
+    pose.csv. The optional table contact_forces.csv (columns as in gaps.csv) contains measured forces.
 
-    With --follow, each row of followed.csv has forces and clearances with 90 % intervals, from the measurements up to
-    the time of the row.
+    INPUT may also be a run of plow_twin or another recording (MCAP, sqlite3 of rosbag2, CSV, Parquet). If the node of a
+    run made estimates, the last estimate is computed again from the journal, and the result is compared bit for bit.
+    Otherwise the measured pose must be recorded in the folder of the run.
+
+    With --follow, each row of followed.csv contains forces and clearances with 90 % intervals. They are computed from
+    the measurements up to the time of the row.
     """
     import numpy as np
 
@@ -151,7 +153,7 @@ def estimate(
 
 @dataclass(frozen=True)
 class _Task:
-    """An estimate to compute; `first_ns` is the stamp of the measurements' time 0, if known."""
+    """An estimate to compute. `first_ns` is the stamp of the time 0 of the measurements, or None if it is unknown."""
 
     scene: Scene
     load: Load
@@ -162,7 +164,7 @@ class _Task:
 
 @dataclass(frozen=True)
 class _Given:
-    """All measurements, and the number of unusable rows."""
+    """All measurements, and the number of rows that could not be used."""
 
     measured: Measured
     load: Load
@@ -210,12 +212,12 @@ def _followed(given: _Given, members: int, dt: float | None) -> tuple[list[str],
     return offline.table(stretch.rows)
 
 
-#: Advice to a user whose numbers have another unit.
+#: Advice to a user whose numbers are not in SI units.
 _REMEDY: Final = "convert the file, or state the unit in a mapping (--map)"
 
 
 def _check_units(source: Path, measured: Measured) -> None:
-    """Refuse impossible poses; warn about a load in what seems to be another unit."""
+    """Raise a `UnitError` for impossible poses, and print a warning about a load that seems to be in another unit."""
     from plow_twin.record.unit_check import unit_doubts
 
     values = {("excitation", name): measured.load[:, 1 + place] for place, name in enumerate(("fx", "fy", "m"))}
@@ -227,7 +229,7 @@ def _check_units(source: Path, measured: Measured) -> None:
 
 
 def _repeated(source: Path) -> _Task | None:
-    """Return the computation of a live node's newest estimate, or None without an estimate."""
+    """Return the task to compute the last estimate of a live node again, or None if there is no estimate."""
     from plow_twin.estimate.answer import answer
     from plow_twin.live.estimation import asked_of
     from plow_twin.live.parameters import settings
@@ -286,7 +288,7 @@ def _labels(scene: Scene) -> dict[str, str]:
 
 
 def _forces(task: _Task, result: Estimate, members: int) -> Forces | None:
-    """Return the forces under the measured load, or None if no twins can be drawn from the estimate."""
+    """Return the contact forces under the measured load, or None if no twins can be drawn from the estimate."""
     from plow_twin.estimate.forces import forces_of
     from plow_twin.estimate.result import State
 

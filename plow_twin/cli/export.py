@@ -1,4 +1,4 @@
-"""`plow-twin export`: a recording as CSV, Parquet or NPZ."""
+"""The command `plow-twin export`, which writes a recording as CSV, Parquet or NPZ."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ from plow_twin.cli.options import EXISTING, PLACE, quiet_option
 @click.option("--out", type=PLACE, required=True, help="Folder (csv, parquet) or file (npz).")
 @quiet_option
 def export(recording: Path, kind: str, out: Path, quiet: bool) -> int:
-    """Write load, measured poses, forces, peaks, motion, clearances and wear rates of RUN as tables in SI."""
+    """Write the data of RUN as tables in SI units.
+
+    The tables contain the load, measured poses, forces, peaks, the motion, clearances and wear rates.
+    """
     from plow_twin.record.recording import export as write
     from plow_twin.record.recording import read_recording
 

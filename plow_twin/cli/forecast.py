@@ -1,4 +1,4 @@
-"""`plow-twin forecast`: time to a clearance limit."""
+"""The command `plow-twin forecast`, which predicts the time until a clearance reaches its limit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
 
 
-#: A limit below this share of the clearance was probably given in m instead of mm.
+#: Smallest plausible ratio of a limit to the clearance. A smaller limit was probably given in m instead of mm.
 _METRES: Final = 1e-2
 
 
@@ -38,7 +38,7 @@ _METRES: Final = 1e-2
     "--stop",
     metavar="H",
     type=POSITIVE,
-    help="Planned stop [h]; prints the probability of reaching the limit before it.",
+    help="Time of a planned stop [h]; the probability that the limit is reached before the stop is printed.",
 )
 @click.option(
     "--face-length", metavar="M", type=POSITIVE, default=250.0, show_default=True, help="Length of a pass [m]."
@@ -47,22 +47,22 @@ _METRES: Final = 1e-2
     "--estimate",
     "estimated",
     type=FILE,
-    help="estimate.json of `plow-twin estimate --out`: the present clearances with their intervals, and the contact.",
+    help="The file estimate.json of `plow-twin estimate --out`, with the present clearances and contact parameters.",
 )
 @click.option(
     "--history",
     type=FILE,
-    help="CSV of clearances over time (km, horizontal_mm, horizontal_sd_mm, vertical_mm, vertical_sd_mm): gives "
-    "the wear coefficient and the present clearances; --estimate then gives only the contact.",
+    help="CSV of clearances over the travel (km, horizontal_mm, horizontal_sd_mm, vertical_mm, vertical_sd_mm). The "
+    "wear coefficient and the present clearances are computed from it, and --estimate gives only the contact.",
 )
 @click.option(
     "--scenario",
     "scenarios",
     metavar="NAME:load=X,coefficient=Y",
     multiple=True,
-    help="A forecast for multiples of load and wear coefficient; may be repeated.",
+    help="A further forecast with factors of the load and the wear coefficient; may be repeated.",
 )
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="The same seed gives the same bits.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the random numbers.")
 @click.option("--plot", type=NEW_FILE, help="PNG of clearances and probability.")
 @json_option
 @quiet_option
@@ -83,8 +83,8 @@ def forecast(
 ) -> int:
     """Forecast when a clearance of SCENE, which has a section `wear`, reaches its limit.
 
-    SCENE is a scene file, a preset, or a run of plow_twin. For a run, the forecast uses the run's scene with the wear
-    at the run's end, and the newest estimate that its node has made since the pads were set.
+    SCENE is a scene file, a preset, or a run of plow_twin. For a run, the forecast uses the scene and the wear at the
+    end of the run. It also uses the last estimate of the node after the last setting of the wear.
     """
     from plow_twin.estimate.coefficient import coefficient
     from plow_twin.estimate.forecast import Plan, Scenario, with_clearances
@@ -137,7 +137,7 @@ def forecast(
 
 
 def _check_limits(limits_m: tuple[float, float], scene: Scene) -> None:
-    """Refuse limits that seem to be in m, and report a clearance that has passed its limit."""
+    """Raise a usage error for limits that seem to be in m, and report a clearance that has passed its limit."""
     import numpy as np
 
     from plow_twin.stream.outputs import clearances
@@ -153,7 +153,10 @@ def _check_limits(limits_m: tuple[float, float], scene: Scene) -> None:
 
 
 def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
-    """Return the scene (of a run: at its end), the newest estimate of its pads, and the journal's losses."""
+    """Return the scene, the last estimate, and the losses of the journal.
+
+    For a run, the scene is that at the end of the run. Without a run, there is no estimate.
+    """
     from plow_twin.record.estimated import left_by
     from plow_twin.record.reader import RunReader, own_run
     from plow_twin.scene_file import load_scene
@@ -168,7 +171,7 @@ def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
 
 
 def _estimate(path: Path) -> Any:
-    """Return the content of the JSON file of an estimate, which is not checked."""
+    """Return the unchecked content of the JSON file of an estimate."""
     try:
         facts = json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:
@@ -179,7 +182,7 @@ def _estimate(path: Path) -> Any:
 
 
 def _history(path: Path) -> History:
-    """Read a history; raise RecordingError or LifeError if it cannot be used."""
+    """Return the clearances in a CSV file; RecordingError and LifeError mean that the file is invalid."""
     from plow_twin.estimate.coefficient import History
     from plow_twin.estimate.life import LifeError
     from plow_twin.record.sources import read_columns

@@ -1,4 +1,4 @@
-"""`plow-twin info`: content of a scene, a recording or this installation."""
+"""The command `plow-twin info`, which describes a scene, a recording or the installation."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from plow_twin.scene_file.presets import PRESETS
 @unit_option
 @json_option
 def info(target: str | None, unused: bool, mapping: Path | None, units: dict[str, str], as_json: bool) -> int:
-    """Describe TARGET: a scene (file or preset) or a recording; without TARGET, this installation."""
+    """Describe TARGET, which is a scene (file or preset) or a recording. Without TARGET, describe this installation."""
     if target is not None and (mapping is not None or units):
         from plow_twin.record.foreign_facts import foreign_facts
 

@@ -1,4 +1,4 @@
-"""End of a verb by a signal in bounded time, even while it waits in the code of a library."""
+"""End a verb in bounded time after a signal, even if the code of a library is waiting."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from typing import Final
 
 from plow_twin.live.stop import stop_signals
 
-#: Time that an interrupted verb has to end by itself [s].
+#: Time after a signal in which a verb must end [s]. After this time, the process is ended.
 PATIENCE_S: Final = 3.0
 
 
 @contextmanager
 def interruptible(on_overdue: Callable[[], object] = lambda: None) -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns whether the process was asked to end.
+    """Yield a function that returns whether a stop signal has arrived.
 
-    If the block has not ended after `PATIENCE_S`, `on_overdue` is called and the process ends with exit code 1, because
-    a library that waits for a viewer cannot be interrupted in another way.
+    If the context has not ended `PATIENCE_S` seconds after the signal, `on_overdue` is called and the process ends with
+    exit code 1. A library that waits for a viewer cannot be interrupted in another way.
     """
     asked, done = threading.Event(), threading.Event()
     receive, send = os.pipe()
     os.set_blocking(send, False)
 
     def watch() -> None:
-        # the handler of a signal writes a byte, for which this thread waits apart from the main thread
+        # a signal writes a byte to the pipe, which wakes this thread even if the main thread is blocked
         os.read(receive, 1)
         asked.set()
         if not done.wait(PATIENCE_S):

@@ -1,4 +1,4 @@
-"""`plow-twin live`: the live twin without ROS."""
+"""The command `plow-twin live`, which runs the live twin without ROS."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from plow_twin.live.stop import StopSignals
 
 _PROGRESS_S = 0.2
-#: Names of the counters of unused input.
+#: Pattern of the names of counters that count unused messages.
 _LOST = re.compile(r"dropped_.*|.*_dropped|.*_lost")
 
 
@@ -44,36 +44,37 @@ _LOST = re.compile(r"dropped_.*|.*_dropped|.*_lost")
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.",
 )
 @click.argument("source")
-@click.option("--scene", help="Scene file or preset; by default that of the parameter `scene`.")
+@click.option("--scene", help="Scene file or preset; by default the parameter `scene`.")
 @map_option
 @unit_option
-@click.option("--params", type=FILE, help="YAML file of parameters, as for the node.")
-@click.option("--set", "given", multiple=True, metavar="NAME=VALUE", help="One parameter; may be repeated.")
+@click.option("--params", type=FILE, help="YAML file with parameters, in the form of a parameter file of the node.")
+@click.option("--set", "given", multiple=True, metavar="NAME=VALUE", help="Value of a parameter; may be repeated.")
 @click.option("--record", type=FOLDER, help="Folder for the recording.")
 @click.option("--follow", is_flag=True, help="Continue while the files grow.")
 @click.option(
     "--seconds",
     type=POSITIVE,
     default=None,
-    help="Stop this long [s] after the start of the twin, even without samples.",
+    help="Time after the start of the twin [s] at which it stops, even without samples.",
 )
 @click.option(
     "--user",
     default="",
-    help="User at the broker or server; password in a file, PLOW_TWIN_MQTT_PASSWORD or PLOW_TWIN_OPCUA_PASSWORD.",
+    help="User at the broker or server. The password is in --password-file, PLOW_TWIN_MQTT_PASSWORD or "
+    "PLOW_TWIN_OPCUA_PASSWORD.",
 )
 @click.option("--password-file", type=FILE, help="File whose first line is the password.")
 @click.option("--user-cert", type=FILE, help="Certificate of the user at an OPC UA server, instead of --user.")
 @click.option("--user-key", type=FILE, help="Private key of --user-cert.")
-@click.option("--tls-ca", type=FILE, help="Certificate authority for the broker's or server's certificate.")
+@click.option("--tls-ca", type=FILE, help="Authority that issued the certificate of the broker or server.")
 @click.option("--tls-cert", type=FILE, help="Certificate of this client.")
 @click.option("--tls-key", type=FILE, help="Private key of --tls-cert.")
 @click.option(
-    "--client-id", default="plow_twin", show_default=True, help="Client name under which the broker keeps messages."
+    "--client-id", default="plow_twin", show_default=True, help="Client name for which the broker stores messages."
 )
 @click.option("--plain", is_flag=True, help="Allow brokers and servers on other machines without encryption.")
-@click.option("--lines", is_flag=True, help="Status, alarms and diagnostics as JSON lines on standard output.")
-@click.option("--control", type=PLACE, help="Open this socket, through which plow-twin call reaches the twin.")
+@click.option("--lines", is_flag=True, help="Print status, alarms and diagnostics as JSON lines on standard output.")
+@click.option("--control", type=PLACE, help="Socket to open for `plow-twin call`.")
 @click.option(
     "--metrics", type=click.IntRange(1, 65535), help="Serve the diagnostics to Prometheus on this port of this machine."
 )
@@ -83,7 +84,11 @@ _LOST = re.compile(r"dropped_.*|.*_dropped|.*_lost")
 @json_option
 @quiet_option
 def live(source: str, as_json: bool, quiet: bool, lines: bool, seconds: float | None, **options: Any) -> int:
-    """Run the twin on SOURCE: CSV or Parquet (a folder, or one file), -, mqtt[s]://HOST:PORT, opc.tcp://HOST:PORT."""
+    """Run the twin on the samples of SOURCE.
+
+    SOURCE is a CSV or Parquet file, a folder of such files, - (standard input), mqtt[s]://HOST:PORT or
+    opc.tcp://HOST:PORT.
+    """
     from plow_twin.live.stop import StopSignals
 
     with StopSignals() as stop:
@@ -168,7 +173,7 @@ def _live(
 
 
 def _say_what_differs(front: BridgeFront, settings: Settings) -> None:
-    """Report where the recording is if its folder was in use, and thresholds that seem wrong."""
+    """Report the folder of the recording if it is not the requested folder, and thresholds that seem to be wrong."""
     from plow_twin.record.unit_check import small_thresholds
 
     recording = front.runtime.recording
@@ -180,7 +185,7 @@ def _say_what_differs(front: BridgeFront, settings: Settings) -> None:
 
 
 def _say_pace(settings: Settings, quiet: bool) -> None:
-    """Say, before a file is read, why reading takes long."""
+    """Report, before a file is read, that reading takes long."""
     if settings.follows == "full" and not quiet:
         say_error(
             f"plow-twin: {settings.follow_members} twins follow the machine, which takes about as long as the "
@@ -213,7 +218,7 @@ def _show_estimate(front: BridgeFront) -> None:
 
 
 def _settings(options: dict[str, Any]) -> Settings:
-    """Return the parameters of the file, overridden by --set and then by other options."""
+    """Return the parameters from the file, from `--set` and from other options; later sources have priority."""
     from plow_twin.live import parameters
 
     values = parameters.read_parameters(options["params"]) if options["params"] else {}
@@ -277,7 +282,7 @@ def _bridge(source: str, options: dict[str, Any], rate_hz: float) -> Bridge:
 
 
 def _tables(folder: Path, *, growing: bool) -> list[Path]:
-    """Return the tables of a folder; Parquet files cannot grow."""
+    """Return the tables in a folder, without Parquet files if the tables are growing."""
     from plow_twin.scene_file.csv_rows import tables
     from plow_twin.scene_file.parquet_lines import is_parquet
 

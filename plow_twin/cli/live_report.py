@@ -1,4 +1,4 @@
-"""Reports of `plow-twin live`: lines for a person, or JSON lines for a program."""
+"""Print the reports of `plow-twin live` as text, or as JSON lines for a program."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _LEVELS = ("OK", "WARN", "ERROR")
 
 
 class Report:
-    """Reports status and alarms when they change, and with `lines` all parts as JSON lines; `quiet` leaves out the text
-    for a person.
+    """Printer of reports.
 
-    An alarm is reported when it is raised and when it is acknowledged. A hanging reader does not delay the twin: lines
-    are dropped and counted.
+    Status and alarms are printed as text when they change, unless `quiet` is true. With `lines`, all parts are printed
+    as JSON lines. An alarm is reported when it is raised and when it is acknowledged. A slow reader does not delay the
+    twin; lines are dropped and counted instead.
     """
 
     def __init__(self, *, lines: bool, quiet: bool, stamp_ns: Callable[[], int]) -> None:
@@ -35,30 +35,30 @@ class Report:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is not None:  # otherwise the caller has closed both outputs
+        if kind is not None:  # without an error, the caller has closed both outputs
             with suppress(BrokenPipeError):
                 self.close_lines()
             self.close()
 
     @property
     def lost(self) -> int:
-        """Number of lines that standard output has refused."""
+        """Number of JSON lines that could not be written."""
         return self._out.lost
 
     def error(self, text: str) -> None:
-        """Report an error, perhaps from another thread."""
+        """Report an error. The method may be called from another thread."""
         self._errors.put(f"plow-twin: {text}")
 
     def close_lines(self) -> bool:
-        """Write the last JSON lines; return False if their reader hangs."""
+        """Write the last JSON lines; return False if their reader does not read them."""
         return self._out.close()
 
     def close(self) -> bool:
-        """Write the last lines for a person; return False if their reader hangs."""
+        """Write the last lines of text; return False if their reader does not read them."""
         return self._errors.close()
 
     def say(self, name: str, part: Part) -> None:
-        """Report a part."""
+        """Report `status`, `alarms`, or a part of the diagnostics."""
         level, message, values = part
         if name == "alarms":
             from plow_twin.record.alarms import alarm_texts
@@ -87,11 +87,11 @@ def _typed(value: str) -> int | float | str:
 
 
 def _printed(line: str) -> bool:
-    """Print a line; return False if standard output fails, as on a full disk."""
+    """Print a line; return False if standard output fails, for example on a full disk."""
     try:
         click.echo(line)
         sys.stdout.flush()
-    except BrokenPipeError:  # the reader is gone
+    except BrokenPipeError:  # the reader has ended
         raise
     except OSError:
         return False

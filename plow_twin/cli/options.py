@@ -1,4 +1,4 @@
-"""Options and types of arguments that several verbs have."""
+"""Options and argument types that several verbs use."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ quiet_option = click.option(
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on standard output.")
 map_option = click.option(
     "--map", "mapping", type=FILE,
-    help="YAML mapping: which topics, columns or nodes are load, travel, pose, gaps, forces, and their units.",
+    help="YAML mapping file, which assigns topics, columns or nodes to load, travel, pose, gaps and forces.",
 )  # fmt: skip
 
 
 def wait_option(text: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return the option `--wait` [s] with a help text."""
+    """Return the option `--wait` [s] with the help text `text`."""
     return click.option("--wait", type=click.FloatRange(0.0), default=10.0, show_default=True, help=text)
 
 
 def node_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options that name a running node."""
+    """Add the options that identify a running node."""
     for option in (
-        click.option("--scene", help="Scene of the node, if the node's path to it cannot be read here."),
+        click.option("--scene", help="Scene of the node; needed if its path on the node's machine cannot be read."),
         click.option("--name", default="plow_twin", show_default=True, help="Name of the node."),
         click.option("--namespace", default="", help="Namespace of the node."),
     ):
@@ -42,7 +42,7 @@ def node_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def unit_option(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add `--unit NAME=UNIT`, whose parameter `units` has the units by name."""
+    """Add the option `--unit NAME=UNIT`. The parameter `units` of the command receives the units by name."""
 
     def parsed(context: click.Context, parameter: click.Parameter, given: tuple[str, ...]) -> dict[str, str]:
         units = dict(text.partition("=")[::2] for text in given)
@@ -58,12 +58,12 @@ def unit_option(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class PositiveNumber(click.ParamType):  # type: ignore[type-arg]  # generic from click 8.3 on
-    """A finite number above zero."""
+    """Type of a finite number above zero."""
 
     name = "number"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Return the number."""
+        """Return the number in a text."""
         try:
             number = float(value)
         except ValueError:

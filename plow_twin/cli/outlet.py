@@ -1,4 +1,4 @@
-"""Lines for a reader that may be slow or hang, and that the writer does not wait for."""
+"""Write lines to a reader that may be slow, without waiting for the reader."""
 
 from __future__ import annotations
 
@@ -7,16 +7,17 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-#: Largest number of lines that wait for the reader; the oldest are dropped.
+#: Largest number of lines in the queue. The oldest lines are dropped.
 MOST_WAITING: Final = 1000
-#: Longest wait at the end for a reader that takes no line [s].
+#: Longest wait at the end for a reader that does not read a line [s].
 _PATIENCE_S: Final = 2.0
 
 
 class Outlet:
-    """Writes lines in order, in a thread of its own.
+    """Queue of lines that a separate thread writes in order.
 
-    `write` returns whether a line was taken, and `on_loss` is called when the first line is dropped.
+    The function `write` writes a line and returns whether this succeeded. The function `on_loss` is called when the
+    first line is dropped.
     """
 
     def __init__(self, write: Callable[[str], bool], on_loss: Callable[[], object] = lambda: None) -> None:
@@ -25,11 +26,11 @@ class Outlet:
         self._news = threading.Condition()
         self._thread: threading.Thread | None = None
         self._closed = self._broken = False
-        #: number of lines that were dropped or not taken
+        #: number of lines that were dropped or could not be written
         self.lost = 0
 
     def put(self, line: str) -> None:
-        """Queue a line; raise `BrokenPipeError` once the reader is gone."""
+        """Add a line to the queue; raise `BrokenPipeError` if the reader has ended."""
         if self._broken:
             raise BrokenPipeError
         with self._news:
@@ -46,7 +47,13 @@ class Outlet:
             self._thread.start()
 
     def close(self) -> bool:
-        """Wait as long as the reader takes lines; return False if it hangs, and raise the errors of `put`."""
+        """Wait until all lines are written; return False if the reader does not read them.
+
+        Raises
+        ------
+        BrokenPipeError
+            The reader has ended.
+        """
         with self._news:
             self._closed = True
             self._news.notify()
@@ -54,7 +61,7 @@ class Outlet:
             left = len(self._waiting)
             self._thread.join(_PATIENCE_S)
             if self._thread.is_alive() and len(self._waiting) == left:
-                self.lost += left + 1  # and the line that is being written
+                self.lost += left + 1  # the lines in the queue, and the line that is being written
                 return False
         if self._broken:
             raise BrokenPipeError

@@ -1,4 +1,4 @@
-"""`plow-twin record`: other topics beside a run."""
+"""The command `plow-twin record`, which records other topics in the folder of a run."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from plow_twin.cli.options import FOLDER, json_option, quiet_option, wait_option
 
 
 @click.command(
-    short_help="Record other topics beside a run.",
+    short_help="Record other topics in the folder of a run.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done with loss or without a named topic.",
 )
 @click.argument("run", type=FOLDER)
 @click.argument("topics", metavar="[TOPIC]...", nargs=-1)
-@click.option("--all", "every", is_flag=True, help="All topics except hidden ones and the run's own.")
-@click.option("--exclude", metavar="REGEX", help="With --all: leave out these topics.")
+@click.option("--all", "every", is_flag=True, help="Record all topics except hidden topics and topics of the run.")
+@click.option("--exclude", metavar="REGEX", help="Topics that --all does not include.")
 @wait_option("Time to wait for a run [s].")
 @json_option
 @quiet_option
 def record(
     run: Path, topics: tuple[str, ...], every: bool, exclude: str | None, wait: float, as_json: bool, quiet: bool
 ) -> int:
-    """Record topics into the folder of RUN, beside the twin's recording, until interrupted.
+    """Record topics to a subfolder of RUN until interrupted.
 
-    RUN is the recording that the twin is making (its `record_path`, or the newest of RUN_2, ...); without such a
-    recording the folder is made, and the twin uses it later.
+    RUN is the folder in which the twin is recording: its `record_path`, or the newest of RUN_2, RUN_3, .... If the twin
+    is not recording, the folder is created, and the twin can use it later.
     """
     if not topics and not every:
         raise click.UsageError("got no topic, expected topics or --all")
@@ -41,7 +41,7 @@ def record(
         raise click.BadParameter(
             f"got {exclude!r}, expected a regular expression: {error}", param_hint="--exclude"
         ) from None
-    # where wheels of ROS have the message definitions
+    # if ROS was installed from wheels, the message definitions are in this folder
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
     from plow_twin.cli.interruption import interruptible
     from plow_twin.record.reader import RunReader

@@ -1,4 +1,4 @@
-"""Facts of a recording: content, end and losses."""
+"""Summarize the content, the end and the losses of a recording."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from plow_twin.stream.journal import Failed
 
 
 def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
-    """Return the facts of a recording, and whether it has losses or failed advances.
+    """Return a summary of a recording, and whether it is incomplete or has losses or failed advances.
 
     Raises
     ------
     RecordingError
-        The file is not a recording.
+        The file is not a recording of plow_twin.
     """
     reader = RunReader(path)
     inputs, failed = InputCounts(reader.header.excitation_source), 0

@@ -1,4 +1,4 @@
-"""`plow-twin replay`: run a recording again and compare."""
+"""The command `plow-twin replay`, which computes a recording again and compares the results."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 @click.option(
     "--write",
     type=FOLDER,
-    help="New folder for a full recording made from the journal, with all outputs after each advance.",
+    help="New folder for a recording with the journal and all outputs after each advance.",
 )
 @json_option
 @quiet_option
 def replay(recording: Path, digests_only: bool, write: Path | None, as_json: bool, quiet: bool) -> int:
-    """Run the model again by the journal of RECORDING and compare it with the recorded outputs; needs no ROS."""
+    """Run the model again with the journal of RECORDING, and compare the results with the recorded outputs."""
     from plow_twin.record.replay import replay as run
 
     with progress("replaying", quiet) as on_progress:

@@ -1,4 +1,4 @@
-"""Facts of a scene: all numbers with their marks, and derived quantities."""
+"""List the numbers of a scene with their marks, and quantities that are derived from them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Fact = dict[str, Any]
 
 
 def numbers(scene: Scene) -> list[Fact]:
-    """Return key, value, unit, mark and source of every number of a scene, also of each item of a list."""
+    """Return the key, value, unit, mark and source of each number of a scene. Each item of a list is a number."""
     rows = [row for key in SECTIONS for row in _numbers_of(getattr(scene, key), key, scene)]
     for index, load in enumerate(scene.loads):
         rows += _numbers_of(load, f"loads[{index}]", scene)
@@ -43,7 +43,7 @@ def _numbers_of(part: Any, path: str, scene: Scene) -> Iterator[Fact]:
 
 
 def damping_unit(scene: Scene) -> str:
-    """Return the unit of `contact.damping`: of C in an additive law, of lambda in others."""
+    """Return the unit of the key `contact.damping`, which is C in an additive contact law, and lambda otherwise."""
     return "N s/m" if LAWS[scene.contact.law].additive else "s/m"
 
 
@@ -54,7 +54,7 @@ def _row(key: str, value: float, unit: str, scene: Scene, paths: tuple[str, ...]
 
 
 def derived(scene: Scene) -> list[Fact]:
-    """Return quantities that follow from a scene's numbers."""
+    """Return quantities that are derived from the numbers of a scene."""
     mass, gravity = scene.head.mass_kg, scene.gravity
     weight = mass * gravity.acceleration_m_s2
     facts = [

@@ -1,4 +1,4 @@
-"""`plow-twin setup`: a mapping and a stub of a scene for a user's CSV or Parquet file."""
+"""The command `plow-twin setup`, which writes a mapping and a stub of a scene for a CSV or Parquet file."""
 
 from __future__ import annotations
 
@@ -18,17 +18,20 @@ if TYPE_CHECKING:
 
 
 @click.command(
-    short_help="Guess the columns of a CSV or Parquet file; write a mapping and a stub of a scene.",
+    short_help="Guess the columns of a CSV or Parquet file, and write a mapping and a stub of a scene.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, or a column that cannot be assigned.",
 )
 @click.argument("file", type=FILE)
-@click.option("--scene", help="Scene file or preset of the machine; without it a stub is written.")
+@click.option("--scene", help="Scene file or preset of the machine; by default a stub of a scene is written.")
 @click.option("--column", "given", multiple=True, metavar="NAME=COLUMN", help="Column of a quantity, e.g. fx=Load_1.")
 @unit_option
 @click.option("--out", type=FOLDER, default=Path(), help="Folder for the files.")
 @quiet_option
 def setup(file: Path, scene: str | None, given: tuple[str, ...], units: dict[str, str], out: Path, quiet: bool) -> int:
-    """Guess separator, time, columns and units of FILE, ask in a terminal about the rest, and write map and scene."""
+    """Guess the separator, time, columns and units of FILE, and write a mapping and a stub of a scene.
+
+    In a terminal, the command asks for columns that it cannot guess.
+    """
     from plow_twin.record.column_guess import guess_columns
     from plow_twin.record.sources import Columns
     from plow_twin.scene_file import load_scene
@@ -61,7 +64,7 @@ def setup(file: Path, scene: str | None, given: tuple[str, ...], units: dict[str
 
 
 def _check_sizes(guess: Guess, scene: Scene, stated: dict[str, str]) -> None:
-    """Refuse loads that are too large for the scene, unless the user has stated their unit."""
+    """Raise a `UnitError` for loads that are too large for the scene, unless the user has stated their unit."""
     from plow_twin.record.unit_check import large_loads
 
     large = large_loads(guess.values, guess.units, scene)

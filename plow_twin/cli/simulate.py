@@ -1,4 +1,4 @@
-"""`plow-twin simulate`: one scene, offline."""
+"""The command `plow-twin simulate`, which simulates a scene offline."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from plow_twin.run.sensitivity import Sensitivity
     from plow_twin.run.simulate import Result
 
-#: Largest number of rows, of some 200 B each.
+#: Largest number of output rows. A row takes about 200 B.
 MOST_ROWS: Final = 10_000_000
 
 
@@ -29,23 +29,25 @@ MOST_ROWS: Final = 10_000_000
 @click.option("--t-end", metavar="T", type=POSITIVE, required=True, help="Time to simulate [s].")
 @click.option("--output-dt", type=POSITIVE, help="Time between output rows [s]; by default a thousandth of --t-end.")
 @click.option("--tol", type=POSITIVE, default=1e-9, show_default=True, help="Tolerance, relative to the clearance.")
-@click.option("--out", type=NEW_FILE, help="Write the output rows to this .csv or .npz file.")
+@click.option("--out", type=NEW_FILE, help="File for the output rows, .csv or .npz.")
 @json_option
 @click.option(
     "--method",
     type=click.Choice(["events", "rk4", "euler"]),
     default="events",
     show_default=True,
-    help="events: every touch is located; rk4, euler: fixed steps, for comparison.",
+    help="Solver with event detection (events), or with fixed steps for comparison (rk4, euler).",
 )
 @click.option("--dt", type=POSITIVE, help="Step of rk4 and euler [s].")
 @click.option(
-    "--energy-balance", is_flag=True, help="Compute the balance of energy and momentum; takes some four times as long."
+    "--energy-balance",
+    is_flag=True,
+    help="Compute the balance of energy and momentum, which takes about four times as long.",
 )
 @click.option(
     "--trust",
     is_flag=True,
-    help="Report the growth of errors and how long the tolerance is met; takes some ten times as long.",
+    help="Report the growth of errors and the time for which the tolerance is met, which takes ten times as long.",
 )
 @click.option(
     "--max-steps", type=click.IntRange(min=1), default=10**8, show_default=True, help="Largest number of steps."
@@ -71,7 +73,7 @@ def simulate(
 ) -> int:
     """Simulate SCENE, a file or one of the presets paper, bench_kv, bench_hc.
 
-    After Ctrl-C or at a limit, files and JSON have the results so far, and the exit code is 1.
+    After Ctrl-C or at a limit, files and JSON contain the results up to this time, and the exit code is 1.
     """
     _check_usage(out, method, dt)
     _check_rows(t_end, output_dt)
@@ -105,7 +107,10 @@ def simulate(
 def _run(
     scene: str, quiet: bool, t_end: float, *settings: Any, **limits: Any
 ) -> tuple[Result, LimitError | RunInterrupted | None]:
-    """Run the scene; at a limit or after Ctrl-C, return the motion so far and the reason."""
+    """Simulate the scene, and return the result and None.
+
+    At a limit or after Ctrl-C, return the result up to this time and the reason.
+    """
     from plow_twin.errors import LimitError, RunInterrupted, SceneError, ToleranceWarning
     from plow_twin.run.simulate import simulate as run
     from plow_twin.scene_file import load_scene
@@ -143,7 +148,7 @@ def _check_rows(t_end: float, output_dt: float | None) -> None:
 
 
 def write_samples(result: Result, path: Path) -> None:
-    """Write the samples at once as .csv (numbers of 17 digits) or .npz (with all contact events)."""
+    """Write the output rows as .csv, with 17 digits, or as .npz, with all contact events."""
     from plow_twin.record.durable import whole_file
 
     with whole_file(path) as stream:
@@ -182,7 +187,7 @@ def _write_npz(result: Result, stream: BinaryIO) -> None:
 
 
 def as_plain(result: Result, scene: str, t_end: float) -> dict[str, Any]:
-    """Return the result, without its samples, as plain numbers, texts and mappings for JSON."""
+    """Return the result without the output rows as a dictionary for JSON."""
     return {
         "scene": scene,
         "t_end": t_end,
@@ -197,7 +202,7 @@ def as_plain(result: Result, scene: str, t_end: float) -> dict[str, Any]:
 
 
 def balance_of(balance: EnergyBalance) -> dict[str, Any]:
-    """Return the balance as plain numbers and lists, with the imbalance relative to the turnover."""
+    """Return the balance, with the imbalance relative to the turnover, as a dictionary for JSON."""
     from dataclasses import asdict
 
     import numpy as np

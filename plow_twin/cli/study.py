@@ -1,4 +1,4 @@
-"""`plow-twin study`: questions that take many runs."""
+"""The command group `plow-twin study`, whose commands simulate many runs."""
 
 from __future__ import annotations
 
@@ -21,11 +21,14 @@ CLONE: Final = Path(__file__).resolve().parents[2] / "studies" / "paper"
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.",
 )
 def study() -> None:
-    """Ask questions that take many runs: sweeps, calibration, the paper."""
+    """Run studies that need many simulations: sweeps, calibration, the paper."""
 
 
 def paper_command() -> click.Command:
-    """Return the verb `paper` of `plow_twin_paper`, installed or in a clone, or a verb that says how to install it."""
+    """Return the verb `paper` of the package `plow_twin_paper`, which may be installed or in a clone.
+
+    Without the package, return a verb whose error explains the installation.
+    """
     if CLONE.is_dir() and str(CLONE) not in sys.path:
         sys.path.append(str(CLONE))
     try:
@@ -41,7 +44,7 @@ def _absent_paper() -> click.Command:
     @click.command("paper", short_help="Not installed.", context_settings={"ignore_unknown_options": True})
     @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
     def paper(arguments: tuple[str, ...]) -> int:
-        """Compute the paper's figures and numbers again (not installed, see `studies/paper` of the repository)."""
+        """Compute the figures and numbers of the paper again (not installed, see `studies/paper` of the repository)."""
         raise PlowTwinError(
             "study paper: plow_twin_paper is not installed; run it from a clone, or there: pip install ./studies/paper"
         )

@@ -1,4 +1,4 @@
-"""`plow-twin study calibrate`: find unknown parameters of a scene."""
+"""The command `plow-twin study calibrate`, which fits unknown parameters of a scene."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @click.command(
-    short_help="Fit unknowns to published figures or a recorded motion.",
+    short_help="Fit unknown parameters to published figures or to a recorded motion.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, scene or targets.",
 )
 @click.argument("scene")
@@ -31,38 +31,43 @@ if TYPE_CHECKING:
     "unknowns",
     multiple=True,
     metavar="RANGE",
-    help="PATH=LOW:HIGH[:log], PATH=CHOICE,CHOICE.. or, for a sign, PATH; may be repeated. By default the unknowns of "
-    "the target file.",
+    help="Unknown parameter: PATH=LOW:HIGH[:log], PATH=CHOICE,CHOICE.. or, for a sign, PATH. May be repeated; by "
+    "default the unknowns of the target file.",
 )
-@click.option("--target", metavar="FILE", help="Figures to fit: a target file, or `paper` for those of the paper.")
 @click.option(
-    "--without", multiple=True, metavar="PATTERN", help="Leave out targets by name, e.g. 'max at*'; may be repeated."
+    "--target", metavar="FILE", help="Target file with the figures to fit, or `paper` for those of the paper."
+)
+@click.option(
+    "--without", multiple=True, metavar="PATTERN", help="Names of targets to omit, e.g. 'max at*'; may be repeated."
 )
 @click.option(
     "--recording",
     type=FILE,
     help="Motion to fit: .csv, .parquet or .npz with t, x, y, theta, or a recording of the node (.mcap).",
 )
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="The same seed gives the same bits.")
-@click.option("--starts", type=click.IntRange(1), default=8, show_default=True, help="Independent random starts.")
-@click.option("--screen", type=click.IntRange(1), default=200, show_default=True, help="Random points per start.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the random numbers.")
+@click.option("--starts", type=click.IntRange(1), default=8, show_default=True, help="Number of random starts.")
+@click.option("--screen", type=click.IntRange(1), default=200, show_default=True, help="Random points of a start.")
 @click.option("--population", type=click.IntRange(5), default=30, show_default=True, help="Population of a start.")
 @click.option("--generations", type=click.IntRange(0), default=40, show_default=True, help="Generations of a start.")
 @click.option(
-    "--simplex", type=click.IntRange(0), help="Evaluations of the final simplex; 200 with --target, 0 with --recording."
+    "--simplex",
+    type=click.IntRange(0),
+    help="Evaluations of the final simplex search; by default 200 with --target, 0 with --recording.",
 )
-@click.option("--t-end", metavar="T", type=POSITIVE, help="Time to simulate [s]; by default that of the target file.")
-@click.option("--tol", type=POSITIVE, help="Tolerance; by default that of the target file, or 1e-8 with --recording.")
+@click.option("--t-end", metavar="T", type=POSITIVE, help="Time to simulate [s]; by default from the target file.")
+@click.option("--tol", type=POSITIVE, help="Tolerance; by default from the target file, or 1e-8 with --recording.")
 @click.option(
     "--excess",
     type=POSITIVE,
-    help="Largest excess over the best objective of a point that is near optimal; by default 10 % of the best.",
+    help="Largest difference from the best objective at which a point is near-optimal; by default 10 % of the best.",
 )
 @click.option("--out", type=FOLDER, required=True, help="Folder of the results.")
 @click.option(
     "--plot",
     type=NEW_FILE,
-    help="Picture of the fit: measured, fitted, residuals, ranges. PNG, or with --recording .rrd for rerun.",
+    help="Picture of the fit, with measured and fitted values, residuals and ranges, as PNG. With --recording, it may "
+    "be .rrd for rerun.",
 )
 @set_option
 @click.option("--workers", type=click.IntRange(1), help="Threads; all cores by default.")
@@ -76,7 +81,10 @@ def calibrate(
     unknowns: tuple[str, ...],
     **options: Any,
 ) -> int:
-    """Fit unknowns of SCENE to published figures or to a recorded motion; writes fit.yaml and calibration.json."""
+    """Fit unknown parameters of SCENE to published figures or to a recorded motion.
+
+    The results are written to fit.yaml and calibration.json.
+    """
     from plow_twin.study.calibration.calibrate import Search
     from plow_twin.study.calibration.fit import write_fit
     from plow_twin.study.calibration.unknowns import Space, check_usable, parse_unknown
@@ -104,9 +112,10 @@ def calibrate(
 
 
 def _merged(proposed: Sequence[str], given: Sequence[str]) -> tuple[str, ...]:
-    """Return the unknowns of the target file, replaced by given ones of the same parameter.
+    """Return the unknowns in the target file, `proposed`, with changes by the unknowns of the user, `given`.
 
-    Damping and restitution count as one parameter; `PATH=fixed` removes an unknown.
+    An unknown of the user replaces the unknown of the same parameter; damping and restitution count as one parameter.
+    The text `PATH=fixed` removes an unknown.
     """
     paths = {text.partition("=")[0] for text in given}
     if paths & {"contact.damping", "contact.restitution"}:
@@ -148,7 +157,7 @@ def _check_options(options: dict[str, Any]) -> None:
 def _objective(
     scene: str, settings: Sequence[str], options: dict[str, Any]
 ) -> tuple[Scene, Objective, str, tuple[str, ...]]:
-    """Return the scene, the objective, its name, and the unknowns of the target file."""
+    """Return the scene, the objective function, a name of the fitted data, and the unknowns in the target file."""
     from dataclasses import replace
 
     from plow_twin.record.unit_check import check_poses

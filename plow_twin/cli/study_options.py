@@ -1,4 +1,4 @@
-"""Common options of the verbs of `plow-twin study`."""
+"""Options that several verbs of `plow-twin study` use."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ set_option = click.option(
     "settings",
     multiple=True,
     metavar="PATH=VALUE",
-    help="Change a number or word of the scene; may be repeated.",
+    help="New value of a number or a word in the scene; may be repeated.",
 )
 
 
 @contextmanager
 def usage_errors() -> Iterator[None]:
-    """Turn errors of a study's arguments into a usage error, exit code 2."""
+    """Convert errors in the arguments of a study to usage errors, which have the exit code 2."""
     from plow_twin.study.parameters import StudyError
 
     try:
@@ -32,7 +32,13 @@ def usage_errors() -> Iterator[None]:
 
 
 def study_scene(name: str, settings: Sequence[str]) -> Scene:
-    """Load a scene and make the changes of `--set`; raise StudyError or SceneError if one cannot be used."""
+    """Load a scene, and apply the changes of the option `--set`.
+
+    Raises
+    ------
+    StudyError, SceneError
+        The scene or a change is invalid.
+    """
     from plow_twin.scene_file import load_scene
     from plow_twin.study.parameters import parse_settings, with_parameters
 

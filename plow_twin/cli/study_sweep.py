@@ -1,4 +1,4 @@
-"""`plow-twin study sweep`: statistics of a scene's motion over one or two of its parameters."""
+"""The command `plow-twin study sweep`, which computes statistics of the motion over one or two parameters."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from plow_twin.study.store import Store
     from plow_twin.study.sweep.table import Axis, Table
 
-#: Largest number of rows of a table on the terminal; files have all rows.
+#: Largest number of rows of a table on the terminal. The files contain all rows.
 MOST_ROWS: Final = 24
-#: Widths of a column of numbers, and of the first column with its frame [characters].
+#: Width of a column of numbers, and additional width of the first column [characters].
 _COLUMN, _FIRST_COLUMN = 12, 8
 
 
@@ -50,7 +50,7 @@ _COLUMN, _FIRST_COLUMN = 12, 8
     type=click.IntRange(1),
     help="Number of members stored together; by default 16, or twice the number of cores if larger.",
 )
-@click.option("--resume/--fresh", default=True, show_default=True, help="Keep or discard the results in the folder.")
+@click.option("--resume/--fresh", default=True, show_default=True, help="Use or discard the results in the folder.")
 @quiet_option
 def sweep(
     scene: str,
@@ -67,7 +67,10 @@ def sweep(
     resume: bool,
     quiet: bool,
 ) -> int:
-    """Sweep one or two parameters of SCENE, a file or a preset; writes sweep.parquet and sweep.png."""
+    """Sweep one or two parameters of SCENE, a file or a preset.
+
+    The results are written to sweep.parquet and sweep.png.
+    """
     from plow_twin.scene_file import dump_scene
     from plow_twin.study.report import require
     from plow_twin.study.store import Store
@@ -92,7 +95,7 @@ def sweep(
 
 
 def _list_failed(result: Table) -> None:
-    """Report the failed members by reason; the Parquet file has all."""
+    """Report the failed members by reason. The Parquet file contains all of them."""
     reasons: dict[str, list[str]] = {}
     for member in result.failed:
         values = ", ".join(f"{path}={_text(value)}" for path, value in result.sweep.values(member).items())

@@ -1,4 +1,4 @@
-"""Options of the outputs, and `plow-twin telemetry`, which sends the outputs of a node."""
+"""The command `plow-twin telemetry`, which sends the results of a node, and the options for the receivers."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
 
 
 def telemetry_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of the outputs."""
+    """Add the options for the receivers of results."""
     for option in (
         click.option(
             "--out-access",
             type=FILE,
-            help="YAML file that names users, certificates and secret files of the outputs.",
+            help="YAML file with users, certificates and secret files for the receivers.",
         ),
         click.option(
             "--out-rate",
             type=POSITIVE,
             default=1.0,
             show_default=True,
-            help="Updates per second [Hz]; peaks are those since the previous update.",
+            help="Rate of the updates [Hz]; peaks are those since the previous update.",
         ),
         click.option("--opcua-acknowledge", is_flag=True, help="Allow clients of --opcua to acknowledge alarms."),
         click.option(
@@ -53,7 +53,7 @@ def telemetry_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def ways_of(options: dict[str, Any]) -> list[WayOut]:
-    """Return the outputs that the options request; raise the errors of `telemetry.access`."""
+    """Return the receivers that the options request. The errors are those of the module `telemetry.access`."""
     if options["sparkplug"] and not options["mqtt_out"]:
         raise click.UsageError("--sparkplug: expected --mqtt-out with the broker")
     if not any(options[name] for name in ("mqtt_out", "influx", "opcua")):
@@ -81,14 +81,14 @@ def ways_of(options: dict[str, Any]) -> list[WayOut]:
 @click.option("--plain", is_flag=True, help="Allow receivers on other machines without encryption.")
 @telemetry_options
 def telemetry(namespace: str, name: str, scene: str | None, wait: float, **options: Any) -> int:
-    """Send the results of a running node, read from its topics, until interrupted."""
+    """Send the results of a running node until interrupted. The results are read from the topics of the node."""
     ways = ways_of(options)
     if not ways:
         raise click.UsageError("expected --mqtt-out, --influx or --opcua")
     from plow_twin.live.stop import StopRequested, StopSignals
 
     with StopSignals() as stop:
-        # where wheels of ROS have the message definitions
+        # if ROS was installed from wheels, the message definitions are in this folder
         os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
         from plow_twin.telemetry.node import send_node
 

@@ -1,4 +1,4 @@
-"""`plow-twin view`: a recording as a rerun file, in a browser, or as a picture."""
+"""The command `plow-twin view`, which shows a recording as a rerun file, in a browser, or as a picture."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from plow_twin.view.rrd import ViewSummary
 
 
-#: Largest factor by which the drawing enlarges the clearance, so that the cavity stays near the frame.
+#: Largest factor by which a drawing enlarges the clearance. With larger factors, the cavity is far from the frame.
 _MOST_EXAGGERATED = 1e4
 
 
@@ -31,31 +31,31 @@ _MOST_EXAGGERATED = 1e4
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, but parts of the recording are missing.",
 )
 @click.argument("recording", type=PLACE)
-@click.option("--out", type=NEW_FILE, help="The .rrd file; by default beside the .mcap.")
-@click.option("--exaggerate", type=POSITIVE, help="Factor by which a second cross-section widens the clearance.")
+@click.option("--out", type=NEW_FILE, help="The .rrd file; by default in the folder of the .mcap file.")
+@click.option("--exaggerate", type=POSITIVE, help="Factor by which a second cross-section enlarges the clearance.")
 @click.option(
     "--with",
     "others",
     multiple=True,
     metavar="SCENE",
-    help="A further scene whose forces under the run's load are also drawn; may be repeated.",
+    help="A further scene, whose forces under the load of the run are drawn, too; may be repeated.",
 )
 @click.option("--scene", help="Scene file or preset for a recording of another program.")
 @map_option
 @unit_option
-@click.option("--png", type=NEW_FILE, help="Write a picture instead; needs no viewer.")
+@click.option("--png", type=NEW_FILE, help="Write a picture instead, which needs no viewer.")
 @click.option(
     "--html",
     type=NEW_FILE,
-    help="Write one page instead, with picture, curves and tables; needs neither viewer nor network.",
+    help="Write a page with picture, curves and tables instead, which needs neither viewer nor network.",
 )
-@click.option("--web", is_flag=True, help="Serve rerun's own web viewer on this machine until interrupted.")
+@click.option("--web", is_flag=True, help="Serve the web viewer of rerun on this machine until interrupted.")
 @click.option(
     "--web-port",
     type=click.IntRange(0, 65535),
     default=9090,
     show_default=True,
-    help="Port of the web viewer; 0: any free port.",
+    help="Port of the web viewer; with 0, a free port is chosen.",
 )
 @click.option("--follow", is_flag=True, help="Show a run while it is recorded: in a window, with --web, or into --out.")
 @wait_option("Time that --follow waits for a run [s].")
@@ -76,9 +76,9 @@ def view(
     wait: float,
     quiet: bool,
 ) -> int:
-    """Make a .rrd of RECORDING: the cross-section in motion, force and clearance curves, the event log.
+    """Write a .rrd file of RECORDING with the moving cross-section, curves of forces and clearances, and events.
 
-    For a recording of another program (--scene, --map), the motion that the model computes is drawn, as in analyse.
+    For a recording of another program (--scene, --map), the motion is computed by the model, as in `plow-twin analyse`.
     """
     from plow_twin.record.reader import mcap_path
 
@@ -148,7 +148,10 @@ def _still(run: Path, png: Path | None, html: Path | None) -> tuple[FileStatus, 
 def _made_run(
     recording: Path, scene: str | None, mapping: Path | None, units: dict[str, str], quiet: bool
 ) -> Iterator[tuple[Path, bool]]:
-    """Yield the run that the model makes of another recording, and whether some of it could not be used."""
+    """Yield a run that the model computes from a recording of another program.
+
+    The second value is True if a part of the recording could not be used.
+    """
     from tempfile import TemporaryDirectory
 
     from plow_twin.study.analysis.analyse import analyse
@@ -195,7 +198,7 @@ def _print_losses(recording: Path, status: FileStatus, lost: Mapping[str, int], 
 
 
 def _serve(file: Path, port: int) -> int:
-    """Serve a .rrd by the viewer's program on the loopback address until interrupted."""
+    """Serve a .rrd file on the loopback address by the program of the viewer, until interrupted."""
     from plow_twin.view.viewer import LOOPBACK, free_port, page_address, page_port, viewer_program
 
     program, data_port = viewer_program(), free_port()
@@ -203,8 +206,8 @@ def _serve(file: Path, port: int) -> int:
     command = [program, str(file), "--serve-web", "--bind", LOOPBACK, "--port", str(data_port)]
     click.echo(f"serving until interrupted: {page_address(port, data_port)}")
     sys.stdout.flush()
-    # the program replaces this process, so that signals reach it; it logs errors only, and not the address of the light
-    # theme, whose labels cannot be read
+    # The program replaces this process, so that it receives the signals. Only errors are logged, because the log would
+    # contain an address of the page with the light theme, whose labels cannot be read.
     os.execve(program, [*command, "--web-viewer-port", str(port)], {"RUST_LOG": "error", **os.environ})
 
 
@@ -217,7 +220,7 @@ def _follow(
     wait: float,
     quiet: bool,
 ) -> int:
-    """Show a run while it is recorded; a viewer that the command starts ends with it."""
+    """Show a run while it is recorded. If the command starts a viewer, the viewer ends with the command."""
     from plow_twin.cli.interruption import interruptible
     from plow_twin.record.running import find_run
     from plow_twin.view.live import follow
@@ -241,7 +244,7 @@ def _follow(
                 summary = show(file.attach, lambda: stopped() or file.failed)
         code = _show(run, out or run, summary, quiet)
         sys.stdout.flush()
-        # the run has ended, but the viewer stays open
+        # after the end of the run, the viewer stays open until the user closes it
         while viewer is not None and viewer.process.poll() is None and not stopped():
             time.sleep(0.2)
     return code

@@ -39,7 +39,7 @@ class WithoutEvents(Node):
     """
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **options: Any) -> Service:
-        """Create a service like rclpy. Requests to set parameters are checked before rclpy processes them."""
+        """Create a service like rclpy. Requests to set parameters are checked first."""
         if srv_type in (SetParameters, SetParametersAtomically):
             callback = partial(_set_parameters, callback)
         return super().create_service(srv_type, srv_name, callback, **options)
@@ -52,7 +52,7 @@ class WithoutEvents(Node):
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[[Any], None], *arguments: Any, **options: Any
     ) -> Subscription:
-        """Create a subscription like rclpy, but without events. Times on `/clock` are checked before rclpy uses them."""
+        """Create a subscription like rclpy, but without events. Times on `/clock` are checked first."""
         if msg_type is Clock:
             callback = partial(self._take_clock, callback)
         events = SubscriptionEventCallbacks(use_default_callbacks=False)

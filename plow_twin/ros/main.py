@@ -18,7 +18,7 @@ _SPIN_S: Final = 0.1
 
 
 def make_executor() -> Executor:
-    """Return the events executor, which is the fastest, or a single-threaded executor if rclpy has no events executor."""
+    """Return the events executor, which is the fastest, or a single-threaded executor if rclpy does not have it."""
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:

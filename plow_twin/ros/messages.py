@@ -13,8 +13,8 @@ from std_msgs.msg import Header
 from plow_twin.record import messages as plain
 from plow_twin.stream.intake import NS_PER_S
 
-#: Content of a message: stamp [ns], numbers, whether the numbers are a load, and whether the load has a component out of
-#: the plane.
+#: Content of a message: stamp [ns], numbers, whether the numbers are a load, and whether the load has a component that
+#: is not in the plane.
 Read = tuple[int, tuple[float, ...], bool, bool]
 #: Content of a message that cannot be decoded.
 UNREADABLE: Final[Read] = (0, (), False, False)
