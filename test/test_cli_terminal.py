@@ -55,7 +55,7 @@ def test_a_scene_s_numbers_stand_in_one_line_each(printed: Callable[..., list[st
         re.fullmatch(r"│ +stiffness +│ +9\.6975e\+06 │ N/m\^exponent │ +reconstructed +\d+ │", line) for line in lines
     )
     # no row continues on a second line: each line is a heading or contains a value
-    numbers, _ = "\n".join(lines).split("what follows")
+    numbers, _ = "\n".join(lines).split("derived quantities")
     rows = [line for line in numbers.splitlines() if line.startswith("│")]
     assert all(re.match(r"│ (\w+(\[\d\])? +│ +│|  \w+(\[\d\])? +│ +\S)", line) for line in rows)
     assert any("paper, parameters of the model" in line for line in lines)

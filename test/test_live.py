@@ -537,7 +537,7 @@ def test_an_alarm_is_reported_once_with_value_pad_threshold_and_time_and_acknowl
         mark, acknowledge = ["call", str(control), "mark", "new pads"], ["call", str(control), "acknowledge_alarms"]
         assert [run_cli(mark), run_cli(acknowledge)] == [0, 0]
         answer = capsys.readouterr().out
-        assert "still there: force" in answer and f"kN at {values['force_place']}, warning threshold 20 kN" in answer
+        assert "still active: force" in answer and f"kN at {values['force_place']}, warning threshold 20 kN" in answer
         assert re.search(r", now [\d.]+ kN$", answer.strip())
         for text, got in (
             (" ", "got 0 characters"),
@@ -856,7 +856,7 @@ def test_poses_gaps_and_speeds_that_cannot_be_are_not_used() -> None:
 @pytest.mark.parametrize(
     ("text", "code", "said"),
     [
-        ("t,fx,fy,m\n", 3, "no sample came on load"),
+        ("t,fx,fy,m\n", 3, "no sample arrived on load"),
         ("t,fx,fy,m\n" + "1.0,inf,2.0,3.0\n" * 40, 3, "40 loads have a number that is not finite (nan or inf)"),
         ("0.0,1.0,2.0,3.0\n0.1,1.0,2.0,3.0\n", 1, "columns 0.0, 1.0, 2.0, 3.0 (no header row?)"),
     ],
@@ -877,7 +877,7 @@ def test_failed_advances_are_no_success_in_any_view_of_a_run(
     assert run_cli(["live", str(path), "--scene", "paper", "--record", str(run)]) == 3
     said = capsys.readouterr().err
     assert "10 advances failed, without forces from 0.681 s to 0.690 s: the head turned to -45.3 degrees" in said
-    assert "the model is valid up to 45; then the head began again in the initial position, with its wear" in said
+    assert "the model is valid up to 45; then the head was set to the initial position, with its wear" in said
     for arguments in (["info"], ["doctor"]):
         code = run_cli([*arguments, str(run), "--json"])
         assert (code, json.loads(capsys.readouterr().out)["failed_advances"]) == (3 * (arguments == ["info"]), 10)
@@ -916,7 +916,7 @@ def test_a_silence_in_a_file_is_named_in_every_view_and_no_loss(
     text = page.read_text(encoding="utf-8")
     assert named in text and "No loss was counted" not in text
     assert run_cli(["analyse", str(run)]) == 0
-    assert f"{named}; there the load is interpolated linearly" in capsys.readouterr().out.replace("\n", "")
+    assert f"{named}; in these intervals the load is interpolated linearly" in capsys.readouterr().out.replace("\n", "")
 
 
 @pytest.mark.parametrize(("given", "said"), [("follow=full", True), ("follow=parameters", False)])
@@ -930,7 +930,7 @@ def test_a_file_that_ends_is_read_at_the_pace_of_the_twins_that_follow_and_this_
     assert ("20 twins follow the machine" in capsys.readouterr().err) == said
     if not said:
         assert run_cli(["live", str(path), "--scene", "paper", *options, "--follow", "--seconds", "0.5"]) == 0
-        assert "no estimate was made: the run ended before the first" in capsys.readouterr().err
+        assert "no estimate was made, because the run ended too early" in capsys.readouterr().err
 
 
 def _mistaken(name: str) -> str:
@@ -959,7 +959,7 @@ def _mistaken(name: str) -> str:
         ("decimal commas", 3, "3000 malformed; the first: load has a line without the 4 cells of its header"),
         ("local dates", 3, "load has no time at 't': got '25.10.2026 02:59:00.000', expected a number or a date"),
         ("milliseconds since 1970", 3, "got '1764000000000.0', expected seconds; they look like ms: state the unit"),
-        ("coarse times", 3, "samples came twice, by stamp or number: do the times have too few digits?"),
+        ("coarse times", 3, "samples have the stamp or number of another sample: do the times have too few digits?"),
         ("newest first", 2, "they look like rows from the newest to the oldest: sort the rows by time"),
         ("swapped", 2, "t: got stamps of which"),
         ("days", 2, "they look like days of a spreadsheet: write seconds, or dates"),
@@ -985,7 +985,7 @@ def test_utf16_a_folder_that_is_taken_and_a_threshold_in_kilonewtons_are_named(
     words = ["live", str(path), "--scene", "paper", "--quiet", "--set", "alarm_force=[160, 220]"]
     assert run_cli([*words, "--record", str(tmp_path / "run")]) == 0
     shown = capsys.readouterr().err
-    assert f"run is not empty: the recording goes to {tmp_path / 'run_2'}" in shown
+    assert f"run is not empty: the recording is written to {tmp_path / 'run_2'}" in shown
     assert "alarm_force: got 160 N, expected some 3.2e+04 N as in the scene; is it in kN?" in shown
     path.write_text(path.read_text(), encoding="utf-16")
     assert run_cli(words) == 1

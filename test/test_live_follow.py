@@ -644,7 +644,7 @@ def test_a_runtime_reports_its_followers_and_falls_back_to_the_parameters_where_
         assert not runtime.reduced
         look()
     level, message, _ = diagnostics.summary("active", "", runtime)
-    assert runtime.reduced and level == diagnostics.WARN and "did not keep up" in message
+    assert runtime.reduced and level == diagnostics.WARN and "too slow" in message
     play(1.5, 2.0)
     assert front.sent["force_intervals"] == sent["force_intervals"]
     assert front.sent["contact_forces"] > sent["contact_forces"]

@@ -327,7 +327,7 @@ def test_a_break_without_history_is_a_loss(server: Plant, roles: Any) -> None:
         _until(bridge, lambda found: start_ns + 19 * MS in _stamps(found))
         facts = bridge.part()[2]
         assert (facts["breaks"], facts["breaks_filled"], facts["unfilled_s"], bridge.lost) == ("1", "0", "0.01", 1)
-        assert facts["no_history"] == "the server's history is empty"
+        assert facts["no_history"] == "the history of the server is empty"
 
 
 @pytest.mark.parametrize("kind", ["future", "endless", "nothing"])

@@ -192,7 +192,7 @@ def test_a_misspelt_topic_of_a_broker_is_no_success(
     access = ["--user", broker.user, "--tls-ca", str(broker.ca)]
     arguments = ["live", broker.url, "--map", str(mapping), "--scene", "paper", "--seconds", "1", "--quiet"]
     assert run_cli([*arguments, *access]) == 3
-    assert "no sample came on plough/mistaken" in capsys.readouterr().err
+    assert "no sample arrived on plough/mistaken" in capsys.readouterr().err
     gc.collect()  # the socket is closed here, where its warning is ignored, and not during another test
 
 

@@ -92,7 +92,7 @@ def test_undecided_columns_end_with_the_option_that_states_them(
     file = _file(tmp_path / "own.csv", "t;a;b;c;d", step=1e-3, size=1.0)
     assert cli(["setup", str(file), "--out", str(tmp_path / "out")]) == 2
     said = " ".join(capsys.readouterr().err.split())
-    assert "fx, fy, m cannot be told from the columns t, a, b, c, d" in said and "--column fx=COLUMN" in said
+    assert "fx, fy, m cannot be determined from the columns t, a, b, c, d" in said and "--column fx=COLUMN" in said
     assert not (tmp_path / "out").exists()
     stated = {"fx": "a", "fy": "b", "m": "c"}
     guess = guess_columns(file, PAPER, stated, {"m": "kN m"})

@@ -146,7 +146,7 @@ def test_faults_that_stop_other_programs_are_named_and_repaired(tmp_path: Path) 
             assert reader.message_count
     with run.file.open("ab") as stream:
         stream.write(b"x" * 100)
-    assert examine(run.folder).problems == ["run_0.mcap: 100 B after its end"]
+    assert examine(run.folder).problems == ["run_0.mcap: 100 B after the end of the MCAP content"]
     assert repair(run.folder) == [run.file] and examine(run.folder).problems == []
     with AnyReader([run.folder]) as reader:
         assert reader.message_count
@@ -177,7 +177,7 @@ def test_topics_recorded_beside_a_run_are_examined_and_repaired(tmp_path: Path) 
     lost = "beside: 7 lost on /level, as counted by the recorder"
     assert examine(run.folder).problems == [lost]
     writer.path.write_bytes(writer.path.read_bytes()[:2000])  # the recorder was killed
-    assert examine(run.folder).problems == ["beside/beside_0.mcap: cut off: it has no end", lost]
+    assert examine(run.folder).problems == ["beside/beside_0.mcap: truncated: its end is missing", lost]
     assert repair(run.folder) == [writer.path] and examine(run.folder).problems == [lost]
     with writer.path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
@@ -290,7 +290,7 @@ def test_a_part_that_is_no_mcap_file_is_named_and_the_rest_is_read(tmp_path: Pat
         good = part.read_bytes()
         part.write_bytes(b"\0" * len(good))
         found, after = examine(run.folder), replay(run.folder)
-        assert f"{part.name}: not an MCAP file: nothing of it can be read" in found.problems
+        assert f"{part.name}: not an MCAP file: it cannot be read" in found.problems
         assert found.entries[Sample.__name__] == after.samples < COUNT
         assert (after.exit_code, after.divergences) == (3, 0) and after.status is FileStatus.DAMAGED
         part.write_bytes(good)

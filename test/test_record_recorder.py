@@ -462,9 +462,7 @@ def test_closing_waits_while_items_are_written_and_then_says_what_is_missing(
         assert report.complete == (count == 50)
     sentence = report.sentence(tmp_path / "run51")
     stuck.set()
-    assert (
-        "is incomplete: the disk took nothing for 0.6 s, " in sentence and "are unwritten; its end is not" in sentence
-    )
+    assert "is incomplete: no data were written for 0.6 s, " in sentence and "are unwritten; its last file" in sentence
     assert sentence.endswith(f"plow-twin doctor --repair {tmp_path / 'run51'} completes its files")
 
 
@@ -575,7 +573,7 @@ def test_a_full_disk_beside_a_run_is_reported_at_once_and_when_there_is_room_aga
         writer.add(number, index, index, index, bytes(12))
         writer.flush()
     assert [text.removeprefix(f"{writer.path}: ") for text in said] == [
-        "full: messages are lost until there is room",
+        "full: messages are lost until the disk has free space",
         "recording continues, 2 messages were lost",
     ]
     writer.close()

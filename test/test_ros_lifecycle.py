@@ -341,7 +341,7 @@ def test_quality_of_service_of_an_input_can_be_overridden(tmp_path: Path) -> Non
         subscription = node.create_subscription(JointState, "contact_forces", lambda message: None, kept)
         running.probe.until_figure("input", "refused_publishers", "1", timeout_s=60.0)
         assert value(running.probe.status[-1], "publishers_excitation") == "0"
-        running.probe.until(lambda: "nothing goes to the subscriber" in running.twin.output(), "said")
+        running.probe.until(lambda: "nothing is sent to the subscriber" in running.twin.output(), "said")
         said = running.twin.output()
         assert f"{publisher.topic_name}: nothing is received from the publisher {node.get_name()}: incompatible" in said
-        assert said.count("nothing goes to the subscriber") == 1 and f"{subscription.topic_name}: nothing goes" in said
+        assert said.count("is sent to the subscriber") == 1 and f"{subscription.topic_name}: nothing is" in said

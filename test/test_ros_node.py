@@ -250,7 +250,7 @@ def test_of_several_publishers_of_an_optional_input_one_is_followed(tmp_path: Pa
                 publish(topic, second, 2 * index + 1, 0.002)
             probe.until_figure("input", f"{topic}_not_followed", "20")
             assert probe.figures("input")[f"{topic}_used"] == "20"
-            said = f"another publisher of {topic} sends too and is not followed"
+            said = f"another publisher of {topic} is also sending, and is not followed"
             probe.until(lambda text=said: text in probe.status[-1].message, said)
             node.destroy_publisher(first)
             probe.until(lambda key=f"publishers_{topic}": value(probe.status[-1], key) == "1", "the end of the first")
@@ -638,7 +638,7 @@ def test_under_sim_time_silence_moves_nothing(tmp_path: Path) -> None:
             send(T0 + index * MS, (30e3, 0.0, 0.0))
             probe.pace(index)
         probe.until_figure("input", "dropped_without_clock", "10")
-        assert "nothing has come on /clock" in probe.status[-1].message and probe.status[-1].level == b"\x01"
+        assert "no message has arrived on /clock" in probe.status[-1].message and probe.status[-1].level == b"\x01"
         assert not probe.call(Trigger, f"{running.namespace}/plow_twin/reset", Trigger.Request()).success
         assert (len(forces), probe.figures("recorder")["written"]) == (0, "0")
         clock = probe.node.create_publisher(Clock, "/clock", 10)

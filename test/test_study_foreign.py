@@ -261,7 +261,7 @@ def test_a_part_that_a_killed_recorder_has_only_named_costs_nothing_before_it(tm
     report = replay(run.folder)
     assert (report.status, report.exit_code, report.samples) == (FileStatus.TRUNCATED, 3, COUNT)
     unnamed = "run_1.mcap: metadata.yaml does not name it"
-    assert examine(run.folder).problems == ["run_1.mcap: cut off: it has no end", unnamed]
+    assert examine(run.folder).problems == ["run_1.mcap: truncated: its end is missing", unnamed]
     repair(run.folder)
     assert replay(run.folder).exit_code == 0 and (run.folder / "run_1.mcap.damaged").exists()
 

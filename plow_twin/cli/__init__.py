@@ -19,7 +19,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line, and exit with its exit code."""
     _open_what_is_closed()
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
-        sys.exit("plow-twin: NUMBA_DISABLE_JIT is set, expected it unset, as the solver is compiled")
+        sys.exit("plow-twin: NUMBA_DISABLE_JIT is set, expected it unset, because the solver must be compiled")
     with _ending_at_once():
         # the cause of an ImportError is reported if it exists, because it is more precise
         try:

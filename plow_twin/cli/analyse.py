@@ -62,7 +62,7 @@ def analyse(
         if given is not None and not many:
             raise click.UsageError(f"{option}: got one recording, expected many, or a folder of recordings")
     if dask is not None and workers is not None:
-        raise click.UsageError("--workers cannot be combined with --dask: a cluster has its own")
+        raise click.UsageError("--workers cannot be combined with --dask: a cluster has its own workers")
     folders = [out / name for name in names_apart(found)] if out is not None and many else [out] * len(found)
     beside = () if many else left
     tasks = [
@@ -212,7 +212,7 @@ def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool,
         _show_contacts(console, good)
     for facts in good:
         if "without_samples" in facts:
-            said = f"{facts['run']}: {facts['without_samples']}; there the load is interpolated linearly"
+            said = f"{facts['run']}: {facts['without_samples']}; in these intervals the load is interpolated linearly"
             console.print(said, highlight=False, soft_wrap=True)
         if not facts["signals"]:
             console.print(
@@ -235,7 +235,7 @@ def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool,
         if "stretches" in facts:
             left = ", ".join(f"{name} {count}" for name, count in facts["not_compared"].items()) or "none"
             console.print(
-                f"{facts['stretches']} stretches between resets; the table is of the longest. Not compared: {left}."
+                f"{facts['stretches']} stretches between resets; the table shows the longest. Not compared: {left}."
             )
         if "outside" in facts:
             outside = ", ".join(f"{name} {count}" for name, count in facts["outside"].items())

@@ -12,7 +12,7 @@ from plow_twin.live.service_names import SERVICES, mark_problem
 
 
 @click.command(
-    short_help="Ask a running `plow-twin live` to acknowledge its alarms, set a mark or reset.",
+    short_help="Request a service of a running `plow-twin live`, such as reset or a mark.",
     epilog="Exit codes: 0 done, 1 refused or no answer, 2 wrong usage.",
 )
 @click.argument("socket", type=PLACE)

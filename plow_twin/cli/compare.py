@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @click.command(
-    short_help="Compare runs: do the contacts change, and is it the load or the machine?",
+    short_help="Compare the contacts of runs, and find whether the load or the machine changed.",
     epilog="Exit codes: 0 done; 1 failed; 2 wrong usage; 3 done, but a run was left out.",
 )
 @click.argument("recordings", metavar="RUN...", type=PLACE, nargs=-1, required=True)
@@ -139,8 +139,9 @@ def _show(found: Comparison) -> None:
 #: Sign of each cause of a change in a table, and an explanation of the signs.
 _SIGNS: Final = {"chance": "", "machine": "M", "load": "L", "load or machine": "?"}
 _KEY: Final = (
-    "M: the machine changed, L: the load changed, ?: either; no letter: may be chance. All numbers of a table are "
-    "judged together: one letter in twenty is there by chance. Contact: share of samples with force."
+    "M: the machine changed; L: the load changed; ?: the machine or the load changed; no letter: the change may be "
+    "random. All numbers of a table are tested together, so that one letter in twenty is random. Contact is the share "
+    "of samples with force."
 )
 
 

@@ -178,7 +178,7 @@ def say_end(recording: object, status: str) -> None:
 
     if status not in (FileStatus.COMPLETE.value, FileStatus.UNREAD.value):
         cut = status == FileStatus.TRUNCATED.value
-        remedy = f"; plow-twin doctor --repair {recording} completes it after the run's end" if cut else ""
+        remedy = f"; plow-twin doctor --repair {recording} completes it after the end of the run" if cut else ""
         say_error(f"plow-twin: {recording}: {status}{remedy}")
 
 

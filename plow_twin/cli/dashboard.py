@@ -71,12 +71,12 @@ def access_if_shown(options: dict[str, Any]) -> PageAccess | None:
 
 def say_where(screen: Screen, access: PageAccess) -> None:
     """Print the address of the page."""
-    say_error(f"screen: {screen.url}" + ("#token=... (the token's file has the rest)" if access.token else ""))
+    say_error(f"screen: {screen.url}" + ("#token=... (the token file contains the rest)" if access.token else ""))
 
 
 def stay(screen: Screen, stopped: Callable[[], bool]) -> None:
     """Serve the page until a stop is requested or the server ends."""
-    say_error("the input has ended; the page stays until Ctrl-C")
+    say_error("the input has ended; the page is served until Ctrl-C")
     while not (stopped() or screen.has_ended):
         screen.feed.turn()
         time.sleep(0.2)
@@ -101,7 +101,7 @@ def dashboard(
     if ros == (run is not None):
         raise click.UsageError("expected a recording or --ros")
     if scene is not None and not ros:
-        raise click.UsageError("--scene is for --ros: a recording has its scene")
+        raise click.UsageError("--scene: expected it only with --ros, because a recording contains its scene")
     from plow_twin.cli.interruption import interruptible
 
     access = access_of(options)

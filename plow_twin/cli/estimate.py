@@ -307,10 +307,10 @@ def _show_forces(forces: Forces) -> None:
 
 
 def _show_live(live: dict[str, Any]) -> None:
-    same = "the same bit for bit" if live["repeated"] else "not the same"
+    same = "equal bit for bit" if live["repeated"] else "not the same"
     window = f"{1e-9 * live['start_ns']:.3f} s to {1e-9 * live['end_ns']:.3f} s"
     text = (
-        f"the newest of the node's {live['estimates']} estimates computed again, {same}; its window by stamp: {window}"
+        f"the last of {live['estimates']} estimates of the node, computed again: {same}; its window by stamp: {window}"
     )
     output_console().print(text, highlight=False, soft_wrap=True)
 

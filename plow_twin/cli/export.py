@@ -29,7 +29,7 @@ def export(recording: Path, kind: str, out: Path, quiet: bool) -> int:
     opened = read_recording(recording)
     there = [path for path in ([out] if kind == "npz" else _tables(out, kind)) if path.is_file()]
     if there:
-        raise click.UsageError(f"{there[0]}: is there already, expected another place: --out")
+        raise click.UsageError(f"{there[0]}: exists already, expected another path: --out")
     with busy("exporting", quiet):
         rows = write(opened, kind, out)
     if not quiet:

@@ -23,7 +23,7 @@ from plow_twin.scene_file.presets import PRESETS
 
 @click.command(
     short_help="Describe a scene, a recording or this installation.",
-    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 a recording with loss.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 the recording has losses.",
 )
 @click.argument("target", required=False)
 @click.option("--unused", is_flag=True, help="Print each unused message of a recording, one per line.")
@@ -98,7 +98,7 @@ def _scene(target: str, as_json: bool) -> int:
         return DONE
     console = output_console()
     _print_numbers(console, target, rows)
-    follows = table("what follows", "quantity", "value", "unit")
+    follows = table("derived quantities", "quantity", "value", "unit")
     for fact in facts:
         follows.add_row(fact["quantity"], f"{fact['value']:.6g}", fact["unit"])
     console.print(follows)
@@ -107,7 +107,7 @@ def _scene(target: str, as_json: bool) -> int:
 
 def _print_numbers(console: Console, target: str, rows: Sequence[dict[str, Any]]) -> None:
     sources = list(dict.fromkeys(row["source"] for row in rows if row["source"]))
-    stated = table(f"{target}: what is stated", "number", "value", "unit", "mark, source")
+    stated = table(f"{target}: numbers", "number", "value", "unit", "mark, source")
     section = ""
     for row in rows:
         name, _, key = row["key"].partition(".")

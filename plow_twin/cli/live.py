@@ -178,7 +178,7 @@ def _say_what_differs(front: BridgeFront, settings: Settings) -> None:
 
     recording = front.runtime.recording
     if recording is not None and (folder := recording.recorder.path.parent) != Path(settings.record_path):
-        say_error(f"plow-twin: {settings.record_path} is not empty: the recording goes to {folder}")
+        say_error(f"plow-twin: {settings.record_path} is not empty: the recording is written to {folder}")
     doubt = small_thresholds(settings.alarm_force, front.runtime.scene)
     if doubt:
         say_error(f"plow-twin: {doubt}")
@@ -237,7 +237,7 @@ def _settings(options: dict[str, Any]) -> Settings:
     if not options["scene"] and "scene" not in values:
         say_error(f"plow-twin: no --scene: the preset {settings.scene} is used, which is not your machine")
     if settings.opcua_server:
-        raise click.UsageError("opcua_server: a parameter of the node only; expected the address as SOURCE")
+        raise click.UsageError("opcua_server: got a parameter that only the node has, expected the address as SOURCE")
     scene, record = options["scene"] or settings.scene, options["record"] or settings.record_path
     return replace(settings, scene=scene, record_path=str(record))
 

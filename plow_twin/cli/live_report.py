@@ -28,7 +28,7 @@ class Report:
     def __init__(self, *, lines: bool, quiet: bool, stamp_ns: Callable[[], int]) -> None:
         self._lines, self._quiet, self._stamp_ns = lines, quiet, stamp_ns
         self._alarms: list[str] = []
-        self._out = Outlet(_printed, lambda: self.error("standard output is not read: lines are lost"))
+        self._out = Outlet(_printed, lambda: self.error("standard output is not read, so lines are lost"))
         self._errors = Outlet(_said)
 
     def __enter__(self) -> Report:

@@ -16,7 +16,7 @@ from plow_twin.cli.options import FOLDER, json_option, quiet_option, wait_option
 
 @click.command(
     short_help="Record other topics in the folder of a run.",
-    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done with loss or without a named topic.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, but messages were lost or a topic was not recorded.",
 )
 @click.argument("run", type=FOLDER)
 @click.argument("topics", metavar="[TOPIC]...", nargs=-1)

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 
 @click.command(
-    short_help="Compute a recording again and compare it bit for bit.",
-    epilog="Exit codes: 0 the same, bit for bit; 1 diverged or failed; 2 wrong usage; 3 the same, with counted loss.",
+    short_help="Compute a recording again, and compare the results bit for bit.",
+    epilog="Exit codes: 0 equal bit for bit; 1 diverged or failed; 2 wrong usage; 3 equal, but with losses.",
 )
 @click.argument("recording", type=EXISTING)
 @click.option("--digests-only", is_flag=True, help="Compare only the digests of the state.")
@@ -49,7 +49,7 @@ def replay(recording: Path, digests_only: bool, write: Path | None, as_json: boo
         say_error(f"plow-twin: warning: {file} repeats {read}: it is not read")
     for file, keys in report.foreign_parts.items():
         differ = ", ".join(keys)
-        say_error(f"plow-twin: warning: {file} is of another run (its {differ} differ): it is not read")
+        say_error(f"plow-twin: warning: {file} belongs to another run (its {differ} differ) and is not read")
     if report.repeated:
         say_error(f"plow-twin: warning: {report.repeated} entries occur more than once")
     if report.first_divergence is not None:
@@ -61,7 +61,7 @@ def _facts(report: ReplayReport) -> dict[str, Any]:
     diverged = report.first_divergence
     return {
         "file": str(report.path),
-        "result": "diverged" if diverged else "the same as far as the file goes" if report.loss else "the same",
+        "result": "diverged" if diverged else "the same, but with losses" if report.loss else "the same",
         "file_status": report.status.value,
         "stop_reason": report.stop_reason,
         "entries": report.entries,

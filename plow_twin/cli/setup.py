@@ -46,7 +46,7 @@ def setup(file: Path, scene: str | None, given: tuple[str, ...], units: dict[str
         name, choices = next(iter(guess.open.items()))
         if quiet or not sys.stdin.isatty():
             raise click.UsageError(
-                f"{file}: {', '.join(guess.open)} cannot be told from the {Columns(guess.names)}; "
+                f"{file}: {', '.join(guess.open)} cannot be determined from the {Columns(guess.names)}; "
                 + "state " + " ".join(f"--column {one}=COLUMN" for one in guess.open)
             )  # fmt: skip
         columns[name] = click.prompt(f"Column of {name}", type=click.Choice(choices or guess.names))
@@ -84,7 +84,7 @@ def _write(guess: Guess, scene: str | None, out: Path) -> list[Path]:
         files["scene.yaml"] = _STUB + dump_scene(load_scene("paper"))
     for name in files:
         if (out / name).exists():
-            raise click.UsageError(f"{out / name}: is there already, expected another folder: --out")
+            raise click.UsageError(f"{out / name}: exists already, expected another folder: --out")
     for name, text in files.items():
         (out / name).write_text(text, encoding="utf-8")
     try:

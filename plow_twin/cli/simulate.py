@@ -227,7 +227,7 @@ def _plain(value: Any) -> Any:
 
 
 def _balance_table(balance: EnergyBalance) -> Table:
-    rows = table("balance of energy", "what", "J")
+    rows = table("balance of energy", "quantity", "J")
     kinetic, stored = (end - start for start, end in (balance.kinetic_j, balance.stored_j))
     for name, value in (
         ("work of the loads", balance.load_work_j),

@@ -128,7 +128,7 @@ def _check_plot(plot: Path, options: dict[str, Any]) -> None:
     from plow_twin.study.report import require
 
     if plot.suffix == ".rrd" and options["recording"] is None:
-        raise click.UsageError(f"--plot: got {plot.name} with --target, expected a PNG: figures are no motion")
+        raise click.UsageError(f"--plot: got {plot.name} with --target, expected a PNG: figures have no motion")
     require("rerun" if plot.suffix == ".rrd" else "matplotlib")
 
 
@@ -167,7 +167,7 @@ def _objective(
 
     target, recording, workers = options["target"], options["recording"], options["workers"]
     if (target is None) == (recording is None):
-        raise click.UsageError("got both or neither of --target and --recording, expected one of them")
+        raise click.UsageError("expected either --target or --recording")
     _check_options(options)
     model = study_scene(scene, settings)
     if recording is not None:

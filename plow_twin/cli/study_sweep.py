@@ -105,7 +105,7 @@ def _list_failed(result: Table) -> None:
         for values in members[:MOST_ROWS]:
             say_error(f"  {values}")
         if len(members) > MOST_ROWS:
-            say_error(f"  and {len(members) - MOST_ROWS} more, in sweep.parquet")
+            say_error(f"  and {len(members) - MOST_ROWS} more, which are listed in sweep.parquet")
 
 
 def _computed(store: Store, workers: int | None, dask: str | None, quiet: bool) -> Table:
@@ -127,7 +127,7 @@ def _show(result: Table, out: Path) -> None:
     console = output_console()
     show = _show_curve if len(result.sweep.axes) == 1 else _show_grids
     thinned = show(console, result)
-    note = "; the table above is thinned out" if thinned else ""
+    note = "; the table above does not show all rows and columns" if thinned else ""
     console.print(f"{out / 'sweep.parquet'}, {out / 'sweep.png'}{note}", highlight=False, soft_wrap=True)
 
 

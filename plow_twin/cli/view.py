@@ -84,7 +84,7 @@ def view(
 
     foreign = scene is not None or mapping is not None or bool(units)
     if foreign and follow:
-        raise click.UsageError("--follow cannot be combined with --scene, --map or --unit: it shows a run of plow_twin")
+        raise click.UsageError("--follow cannot be combined with --scene, --map or --unit: it needs a run of plow_twin")
     if not follow and not recording.exists():
         raise click.BadParameter(f"{recording}: does not exist", param_hint="RECORDING")
     if exaggerate is not None and exaggerate > _MOST_EXAGGERATED:
@@ -92,12 +92,12 @@ def view(
             f"got {exaggerate:g}, expected at most {_MOST_EXAGGERATED:g}", param_hint="--exaggerate"
         )
     if png is not None and html is not None:
-        raise click.UsageError("--png cannot be combined with --html: the page has the picture")
+        raise click.UsageError("--png cannot be combined with --html: the page contains the picture")
     for option, file in (("--png", png), ("--html", html)):
         if file is not None:
             _check_still(option, moving=out is not None or web or follow, exaggerate=exaggerate, others=others)
     if follow and out is not None and web:
-        raise click.UsageError("--follow goes into --out or to --web, not both")
+        raise click.UsageError("--follow cannot be combined with both --out and --web")
     if follow:
         return _follow(recording, out, exaggerate, _scenes(others), web_port if web else None, wait, quiet)
     with ExitStack() as opened:
@@ -118,19 +118,17 @@ def view(
     if web:
         return _serve(out, web_port)
     if not quiet:
-        click.echo(f"look at it with: rerun {out}")
+        click.echo(f"show it with: rerun {out}")
     return DONE_WITH_LOSS if lossy else code
 
 
 def _check_still(option: str, *, moving: bool, exaggerate: float | None, others: tuple[str, ...]) -> None:
     if moving:
-        raise click.UsageError(
-            f"{option} cannot be combined with --out, --web or --follow: it is a picture of a whole run"
-        )
+        raise click.UsageError(f"{option} cannot be combined with --out, --web or --follow: it shows a whole run")
     if exaggerate is not None:
         raise click.UsageError(f"--exaggerate cannot be combined with {option}: a picture shows the gaps as numbers")
     if others:
-        raise click.UsageError(f"--with cannot be combined with {option}: a picture shows the run alone")
+        raise click.UsageError(f"--with cannot be combined with {option}: a picture shows only the run")
 
 
 def _still(run: Path, png: Path | None, html: Path | None) -> tuple[FileStatus, dict[str, int], int]:
@@ -193,7 +191,7 @@ def _print_losses(recording: Path, status: FileStatus, lost: Mapping[str, int], 
     say_end(recording, status.value)
     say_lost(recording, lost)
     if failed:
-        say_error(f"plow-twin: {recording}: {failed} advances failed: they have no forces")
+        say_error(f"plow-twin: {recording}: {failed} advances failed: their samples have no forces")
     return not whole or bool(lost or failed)
 
 

@@ -216,16 +216,16 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
     others, keeper = ", ".join(runtime.inputs.other_senders()), runtime.wear_keeper
     silent = ", ".join(runtime.inputs.silent())
     troubles = [
-        (ERROR, runtime.unsteady, "the stamps jump again and again: samples are dropped"),
+        (ERROR, runtime.unsteady, "the stamps jump repeatedly: samples are dropped"),
         (ERROR, values["recorder"] == "trouble", "the recording has lost data or has stopped"),
         (ERROR, keeper, keeper.error if keeper else ""),
         (WARN, estimation, estimation.worker.error if estimation else ""),
         (WARN, estimation, "; ".join(estimation.reasons) if estimation else ""),
-        (WARN, runtime.reduced, "the following twins did not keep up: only the parameters follow"),
+        (WARN, runtime.reduced, "the twins were too slow: measured poses no longer correct the motion"),
         (OK, runtime.clock == "paused", "/clock is paused"),
-        (WARN, runtime.without_clock, "use_sim_time is set and nothing has come on /clock"),
-        (WARN, others, f"another publisher of {others} sends too and is not followed"),
-        (WARN, runtime.others_publish, "another node publishes contact_forces under this name too: a second twin?"),
+        (WARN, runtime.without_clock, "use_sim_time is set and no message has arrived on /clock"),
+        (WARN, others, f"another publisher of {others} is also sending, and is not followed"),
+        (WARN, runtime.others_publish, "another node also publishes contact_forces: is it a second twin?"),
         (WARN, silent, f"silent: {silent}"),
     ]
     for trouble_level, there, text in troubles:
@@ -246,7 +246,7 @@ def failures(runtime: Runtime) -> list[str]:
     )
     if failed.lasts:
         return [f"{begun} since {since}: {failed.reason}"]
-    whence = "began again in the initial position, with its wear" if failed.restarts else "went on from where it was"
+    whence = "was set to the initial position, with its wear" if failed.restarts else "continued from its last position"
     return [f"{begun} from {since} to {until}: {failed.reason}; then the head {whence}"]
 
 
@@ -368,7 +368,7 @@ class Health:
         self._before["periods_missed"] = missed
         values |= zip(keys, (str(missed), *map(_ms, runtime.periods.recent())), strict=True)
         new = missed - before
-        return f"{new} periods left out since the last report" if 0 < runtime.settings.missed_periods <= new else ""
+        return f"{new} periods were missed since the last report" if 0 < runtime.settings.missed_periods <= new else ""
 
     def estimate(self, runtime: Runtime) -> Part:
         """Return the part `estimate` about the estimates and their process."""
@@ -408,9 +408,9 @@ class Health:
             "reduced": str(int(reduced)),
         }
         if reduced:
-            return WARN, "the twins did not keep up", values
+            return WARN, "the twins were too slow", values
         if follower.lost:
-            return WARN, f"{follower.lost} of {follower.members} twins have left the model's range", values
+            return WARN, f"{follower.lost} of {follower.members} twins have left the range of the model", values
         return OK, "following", values
 
     def recorder(self, runtime: Runtime) -> Part:

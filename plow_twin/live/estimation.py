@@ -244,7 +244,7 @@ def problems(settings: Settings, scene: Scene) -> list[Problem]:
     if scene.support is not None:
         found.append(Problem("estimate", True, "false where the scene has a support: the fit assumes a fixed frame"))
     if settings.follows != "off" and settings.max_evaluations:
-        expected = "0 unless follow is off: the work of the following twins has no bound"
+        expected = "0 unless follow is off: the number is not limited for twins that follow"
         found.append(Problem("max_evaluations", settings.max_evaluations, expected))
     limits = settings.forecast_limits
     if any(limits) and not all(limits):

@@ -189,7 +189,7 @@ class BridgeFront:
             return []
         intake, topic = self.runtime.driver.intake, self.roles["drive" if "drive" in self.roles else "excitation"].topic
         if not sum(intake.counts.values()):
-            return [f"no sample came on {topic}"]
+            return [f"no sample arrived on {topic}"]
         if stopped and self._bridge.ends and (self._first or not self._bridge.finished):
             return [f"stopped before the end of {topic}"]
         estimation = self.runtime.estimation
@@ -207,7 +207,8 @@ class BridgeFront:
             found.append(f"{counts[Verdict.MALFORMED]} malformed; the first: {self._feeder.unfit}")
         if counts[Verdict.DUPLICATE] > many:
             found.append(
-                f"{counts[Verdict.DUPLICATE]} samples came twice, by stamp or number: do the times have too few digits?"
+                f"{counts[Verdict.DUPLICATE]} samples have the stamp or number of another sample: "
+                "do the times have too few digits?"
             )
         if counts[Verdict.NON_FINITE] > many:
             found.append(f"{counts[Verdict.NON_FINITE]} loads have a number that is not finite (nan or inf)")
@@ -216,18 +217,18 @@ class BridgeFront:
             force = "" if most is None else f" (forces to {most.largest[0]:.3g} N, by {most.fastest[0]:.3g} N/s)"
             found.append(
                 f"{counts[Verdict.IMPLAUSIBLE]} loads are larger or change faster than plausible{force}: "
-                "is the unit of load or time another one? Otherwise set limit_force and related limits"
+                "check the units of load and time, or set limit_force and related limits"
             )
         estimation = self.runtime.estimation
         if estimation is not None and not (estimation.count or self._bridge.ends):
-            found.append("no estimate was made: the run ended before the first")
+            found.append("no estimate was made, because the run ended too early")
         if silence := self.runtime.driver.silences.text():
             found.append(silence)
         jumps = counts[Verdict.JUMP_BACK]
         if jumps:
             found.append(
-                f"the stamps jumped back ({jumps}), and the motion was reset: is it local time "
-                "at the end of summer time, or was a clock set? Expected UTC, or stamps with their offset"
+                f"the stamps jumped back ({jumps}), and the motion was reset: are they in local time "
+                "at the end of summer time, or was a clock set? Expected stamps in UTC, or with an offset"
             )
         return found
 
@@ -321,10 +322,10 @@ def roles_of(
         raise BridgeError("excitation_source: got 'tool_forces', expected 'excitation' or 'scene' without ROS")
     topics: Any = bridge.topics()
     if topics is None and mapping is None:
-        raise BridgeError("mapping: got none, expected one that names the topics")
+        raise BridgeError("mapping: got none, expected a mapping that assigns the topics")
     roles = {name: role for name, role in read_map(mapping, topics).items() if name in _TAKEN}
     if topics is None and any(role.message_type == OPCUA for role in roles.values()):
-        raise BridgeError("mapping: got nodes, expected topics: nodes are those of opc.tcp://HOST:PORT")
+        raise BridgeError("mapping: got nodes, expected topics: only opc.tcp://HOST:PORT has nodes")
     if ("drive" in roles) != modelled or {"drive", "excitation"} <= roles.keys():
         raise BridgeError("mapping: expected drive and load_model together, and no excitation beside them")
     if source == "excitation" and not {"drive", "excitation"} & roles.keys():

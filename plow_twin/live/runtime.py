@@ -238,9 +238,9 @@ class Runtime:
             return False, "nothing is recorded"
         folder = self.recording.recorder.mark()
         if folder is None:
-            return True, "noted in the recording"
+            return True, "written to the recording"
         self._renew_recording()
-        return True, f"the ring in memory goes to {folder}"
+        return True, f"the ring in memory will be written to {folder}"
 
     def record_status(self, status: DiagnosticStatus) -> None:
         """Record a published status."""

@@ -39,12 +39,12 @@ class Services:
         """Reset the motion to its initial state."""
         self._runtime.driver.reset(self._runtime.stamp_ns, "service")
         self._changed()
-        return True, "initial motion restored, the wear stays; the next sample is model time 0"
+        return True, "the motion is reset, the wear is not; the next sample has the model time 0"
 
     def snapshot(self) -> tuple[bool, str]:
         """Write the exact state to the journal, and store it for the service `restore`."""
         self._kept = self._runtime.driver.snapshot()
-        return True, f"the state at {self._kept.stamp_ns} ns is kept and journalled"
+        return True, f"the state at {self._kept.stamp_ns} ns is stored, and written to the journal"
 
     def restore(self) -> tuple[bool, str]:
         """Restore the motion from the stored snapshot."""
@@ -52,7 +52,10 @@ class Services:
             return False, "no snapshot has been taken since configure"
         self._runtime.driver.restore(self._runtime.stamp_ns, self._kept)
         self._changed()
-        return True, f"the motion is that at {self._kept.stamp_ns} ns; the next sample belongs to its time, wear stays"
+        return (
+            True,
+            f"the motion at {self._kept.stamp_ns} ns is restored, the wear is not; the next sample continues it",
+        )
 
     def acknowledge_alarms(self) -> tuple[bool, str]:
         """Release the latched alarms."""
@@ -61,7 +64,7 @@ class Services:
         self._runtime.driver.parameter(ACKNOWLEDGED, self._runtime.stamp_ns)
         self._runtime.send_alarms()
         values = dict(alarms_message(alarms, "", "").values)
-        return True, f"still there: {'; '.join(alarm_texts(values, newest=True))}" if left else "no alarm is left"
+        return True, f"still active: {'; '.join(alarm_texts(values, newest=True))}" if left else "no alarm is active"
 
     def forecast(self) -> tuple[bool, str]:
         """Return the last forecast as JSON."""
@@ -80,7 +83,7 @@ class Services:
             return False, f"parameter set_wear: {error}"
         self._runtime.save_wear()
         self._changed()
-        return True, f"the pads are worn by {list(depth)} m from now on; the motion starts anew"
+        return True, f"the pads are worn by {list(depth)} m from now on; the motion is reset"
 
     def switch_publisher(self) -> tuple[bool, str]:
         """Follow the other sender of the load."""
@@ -88,4 +91,4 @@ class Services:
         self._changed()
         if done:
             return True, f"the other publisher of {self._runtime.settings.excitation_source} is followed from now on"
-        return False, f"no other publisher of {self._runtime.settings.excitation_source} has been heard"
+        return False, f"no other publisher of {self._runtime.settings.excitation_source} has sent samples"

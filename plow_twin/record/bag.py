@@ -87,7 +87,7 @@ class BagWriter:
             self.lost.update(waiting)
             self.error = f"{self.path}: {error.strerror or error}"
             if not self._in_trouble:
-                self._on_trouble(f"{self.error}: messages are lost until there is room")
+                self._on_trouble(f"{self.error}: messages are lost until the disk has free space")
             self._in_trouble = True
         else:
             if waiting and self._in_trouble:

@@ -179,7 +179,7 @@ def _name_problems(report: RunReport, reader: RunReader) -> None:
     for file, read in reader.repeated.items():
         report.problems.append(f"{file.name}: repeats {read.name} (part {reader.number(file)}): it is not read")
     for file, keys in reader.foreign.items():
-        report.problems.append(f"{file.name}: of another run (its {', '.join(keys)} differ): it is not read")
+        report.problems.append(f"{file.name}: belongs to another run (its {', '.join(keys)} differ) and is not read")
     problems = _metadata_problems(reader)
     report.problems += problems
     unnamed = reader.missing_parts - sum("is missing: metadata" in problem for problem in problems)
@@ -200,15 +200,15 @@ def _name_problems(report: RunReport, reader: RunReader) -> None:
 def _part_problems(part: PartReport) -> list[str]:
     problems = []
     if not part.mcap:
-        problems.append("not an MCAP file: nothing of it can be read")
+        problems.append("not an MCAP file: it cannot be read")
     elif not part.finished:
-        problems.append("cut off: it has no end")
+        problems.append("truncated: its end is missing")
     if part.damaged_chunks:
         problems.append(f"{part.damaged_chunks} damaged chunk(s)")
     if part.left_out:
         problems.append(f"{part.left_out} chunk(s) left out by a repair")
     if part.trailing_bytes:
-        problems.append(f"{part.trailing_bytes} B after its end")
+        problems.append(f"{part.trailing_bytes} B after the end of the MCAP content")
     return [f"{part.path.name}: {problem}" for problem in problems]
 
 

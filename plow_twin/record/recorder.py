@@ -93,7 +93,7 @@ class LossReport:
             lacks.append(self.error)
         remedy = f"plow-twin info {folder} shows its content"
         if not self.closed:
-            lacks.append("its end is not written")
+            lacks.append("its last file has no end")
             remedy += f", plow-twin doctor --repair {folder} completes its files"
         return f"the recording {folder} is incomplete: {'; '.join(lacks)}. {remedy}"
 
@@ -385,7 +385,7 @@ class Recorder:
         with self._lock:
             error = self._error or self._mark_error
             if error is None and not self._closed:
-                error = f"the disk took nothing for {timeout_s:g} s, {self._queued} messages and entries are unwritten"
+                error = f"no data were written for {timeout_s:g} s, {self._queued} messages and entries are unwritten"
             return LossReport(dict(self._lost), self._closed, error)
 
     def __enter__(self) -> Self:

@@ -245,7 +245,7 @@ def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
     beside = float(compile_loads(scene.loads).largest()[2]) * min(1.0, largest / usual) if usual else 0.0
     moment = magnitudes.get(("excitation", "m"), 0.0)
     if _BROKEN_SHARE * beside < moment < _IDLE_SHARE * beside:
-        expected = f"some {beside:.2g} N m beside such forces, as in the scene"
+        expected = f"some {beside:.2g} N m with such forces, as in the scene"
         doubts.append(UnitDoubt("excitation", ("m",), f"{moment:.3g}", expected, "kN m"))
     return doubts
 
@@ -321,4 +321,4 @@ def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
         return []
     found = f"stamps {spacing:.4g} s apart"
     likely = next((unit for unit, size in _TIMES.items() if spacing * size < _SLOW_S), "ns")
-    return [UnitDoubt("excitation", ("t",), found, "many in each period of a load this smooth", likely)]
+    return [UnitDoubt("excitation", ("t",), found, "many samples in each period of such a smooth load", likely)]

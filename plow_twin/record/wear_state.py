@@ -110,7 +110,7 @@ def claim_folder(folder: Path) -> int:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(descriptor)
-        raise WearStateError(f"{folder}: another twin keeps its wear there, expected a folder for each") from None
+        raise WearStateError(f"{folder}: another twin uses it for its wear, expected a separate folder") from None
     except OSError:  # the file system has no locks
         pass
     beside = folder / f".{FILE_NAME}.{os.getpid()}"

@@ -62,7 +62,7 @@ class WithoutEvents(Node):
 
     def _take_clock(self, take: Callable[[Clock], None], message: Clock) -> None:
         if message.clock.sec < 0:
-            text = f"/clock: got {message.clock.sec} s, expected a time from 0 on: it is ignored"
+            text = f"/clock: got {message.clock.sec} s, expected a time >= 0: the message is ignored"
             self.get_logger().error(text, throttle_duration_sec=_SAY_AGAIN_S)
         else:
             take(message)
@@ -115,7 +115,7 @@ class Connections:
             for subscriber in self._node.get_subscriptions_info_by_topic(topic):
                 reason = _reason(subscriber, kind, _in_full(publisher.qos_profile), subscriber.qos_profile)
                 if reason:
-                    self._say(topic, subscriber, f"nothing goes to the subscriber {subscriber.node_name}: {reason}")
+                    self._say(topic, subscriber, f"nothing is sent to the subscriber {subscriber.node_name}: {reason}")
 
     def _say(self, topic: str, other: Any, text: str) -> bool:
         key = (topic, bytes(other.endpoint_gid))

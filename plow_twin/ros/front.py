@@ -170,7 +170,7 @@ class RosFront:
         """Call the service `name`; return success and an answer."""
         with self.turns:
             if self.runtime.waits_for_clock:
-                return False, "use_sim_time is set and nothing has come on /clock yet"
+                return False, "use_sim_time is set and no message has arrived on /clock yet"
             return self._services.call(name)
 
     def close(self) -> list[str]:

@@ -257,7 +257,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
         runtime = self.runtime
         if runtime is not None and runtime.without_clock and self._reports % _SAY_AGAIN == 0:
             self.get_logger().warning(
-                "use_sim_time is set and no message has come on /clock: waiting, without recording"
+                "use_sim_time is set and no message has arrived on /clock: the twin waits and records nothing"
             )
         self._reports += 1
         with self._turn():

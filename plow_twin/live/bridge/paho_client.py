@@ -35,7 +35,7 @@ def use_tls(client: Any, ca: Path | str | None, certificate: Path | str | None, 
         A file cannot be read or is invalid.
     """
     if key and not certificate:
-        raise ValueError("a key without its certificate")
+        raise ValueError("got a key without its certificate")
     context = ssl.create_default_context(cafile=ca)
     if certificate:
         context.load_cert_chain(certificate, key)

@@ -322,7 +322,7 @@ class OpcUa(Bridge):
             else:
                 await asyncio.sleep(0.2)
         if not found and any(self._newest_ns(number) < end for number, end in ends_ns.items()):
-            self._no_history = "the server's history is empty"
+            self._no_history = "the history of the server is empty"
 
     async def _take_piece(self, begin_ns: int, end_ns: int) -> int:
         """Use the new values of the history between two stamps [ns], and return the number of these values."""
