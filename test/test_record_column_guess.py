@@ -57,7 +57,7 @@ def test_a_spreadsheet_s_file_becomes_a_mapping_with_which_the_twin_runs(
     facts = json.loads(capsys.readouterr().out)
     assert (facts["input"]["samples_used"], facts["state"]["model_time_s"]) == ("600", "0.599")
     # existing files are not overwritten
-    assert cli(["setup", str(file), "--out", str(out)]) == 2 and "is there already" in capsys.readouterr().err
+    assert cli(["setup", str(file), "--out", str(out)]) == 2 and "exists already" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -156,7 +156,7 @@ def test_prompts_in_a_terminal_take_corrections_and_write_the_choice(tmp_path: P
     assert "next: plow-twin live own.csv --map out/map.yaml --scene out/scene.yaml" in screen
     # existing files are not overwritten
     code, screen = _in_terminal(tmp_path, b"a\n", b"b\n", b"c\n")
-    assert code == 2 and "is there already" in screen and (tmp_path / "out" / "map.yaml").read_text() == written
+    assert code == 2 and "exists already" in screen and (tmp_path / "out" / "map.yaml").read_text() == written
 
 
 @pytest.mark.parametrize("last", [CTRL_C, b"\x04"], ids=["Ctrl-C", "Ctrl-D"])

@@ -95,7 +95,7 @@ def test_an_export_is_the_recording_and_overwrites_nothing(
         np.testing.assert_array_equal(read, values)
         np.testing.assert_array_equal(table["stamp"].to_numpy().astype("datetime64[ns]").astype(np.int64), stamps)
     assert cli(["export", str(run.folder), "--to", kind, "--out", str(out), "--quiet"]) == 2
-    assert "is there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
 
 
 def test_an_export_of_a_cut_recording_says_so_and_of_a_place_that_takes_nothing_too(

@@ -215,14 +215,14 @@ def test_a_part_of_another_run_is_named_and_not_read(tmp_path: Path, capsys: pyt
         after, found, (facts, lossy) = replay(run.folder), examine(run.folder), read_recording(run.folder)
         assert (after.exit_code, after.divergences, after.repeated) == (3, 0, 0) and lossy
         assert after.foreign_parts[part.name] == facts["foreign_parts"][part.name] == ["run_id"]
-        assert f"{part.name}: of another run (its run_id differ): it is not read" in found.problems
+        assert f"{part.name}: belongs to another run (its run_id differ) and is not read" in found.problems
         count = len(after.foreign_parts)
         counted = {"missing_parts": count, "foreign_parts": count}
         assert facts["lost"] == counted and facts["damaged_chunks"] == 0
         assert counted.items() <= after.lost.items() and counted.items() <= analyse(run.folder).lost.items()
     capsys.readouterr()
     assert cli(["replay", str(run.folder), "-q"]) == 3
-    assert f"{part.name} is of another run" in capsys.readouterr().err
+    assert f"{part.name} belongs to another run" in capsys.readouterr().err
     assert repair(run.folder) == [parts[1], parts[-1]] and not RunReader(run.folder).foreign
     assert part.with_name(f"{part.name}.foreign").is_file()
 

@@ -82,7 +82,7 @@ def test_another_head_or_scene_and_damage_are_refused(tmp_path: Path) -> None:
 
 def test_two_twins_do_not_keep_their_wear_in_one_folder(tmp_path: Path) -> None:
     first = WearKeeper(tmp_path / "wear", "head 7", SCENE)
-    with pytest.raises(WearStateError, match="another twin keeps its wear there"):
+    with pytest.raises(WearStateError, match="another twin uses it for its wear"):
         WearKeeper(tmp_path / "wear", "head 7", SCENE)
     first.close(np.array(DEPTH))
     second = WearKeeper(tmp_path / "wear", "head 7", SCENE)
@@ -118,7 +118,7 @@ def test_a_file_that_came_while_the_twin_ran_is_left_as_it_is(tmp_path: Path) ->
     for _ in range(2):
         assert "is not the file that this twin has read or written" in _saved(keeper, WORN)
     assert _loaded(folder, "head 7", SCENE) == DEPTH
-    with pytest.raises(WearStateError, match="another twin keeps its wear there"):
+    with pytest.raises(WearStateError, match="another twin uses it for its wear"):
         WearKeeper(folder, "head 7", SCENE)
     # the former folder returns; then another program writes to it, and then it is removed
     folder.rename(volume)
@@ -138,13 +138,13 @@ def test_a_folder_that_is_recreated_is_claimed_again(tmp_path: Path) -> None:
     assert _saved(first, NEW) == ""
     folder.rename(tmp_path / "old")
     assert _saved(first, WORN) == "" and _loaded(folder, "head 7", SCENE) == tuple(WORN)
-    with pytest.raises(WearStateError, match="another twin keeps its wear there"):
+    with pytest.raises(WearStateError, match="another twin uses it for its wear"):
         WearKeeper(folder, "head 7", SCENE)
     folder.rename(tmp_path / "older")
     second = WearKeeper(folder, "head 7", SCENE)
     second.close(WORN)
     second = WearKeeper(folder, "head 7", SCENE)
-    assert "another twin keeps its wear there" in _saved(first, NEW)
+    assert "another twin uses it for its wear" in _saved(first, NEW)
     second.close(WORN)
     first.release()
     assert _loaded(folder, "head 7", SCENE) == tuple(WORN)
