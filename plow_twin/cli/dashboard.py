@@ -46,7 +46,7 @@ dashboard_option = click.option("--dashboard", is_flag=True, help="Show the run 
 def access_of(options: dict[str, Any]) -> PageAccess:
     """Return the address and the token of the page from the options.
 
-    The errors are those of `PageAccess.of` and `listening`.
+    If an option is invalid, `PageAccess.of` or `listening` raises an error.
     """
     from plow_twin.dashboard.access import PageAccess, listening
 

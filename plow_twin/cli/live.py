@@ -86,7 +86,7 @@ _LOST = re.compile(r"dropped_.*|.*_dropped|.*_lost")
 def live(source: str, as_json: bool, quiet: bool, lines: bool, seconds: float | None, **options: Any) -> int:
     """Run the twin on the samples of SOURCE.
 
-    SOURCE is a CSV or Parquet file, a folder of such files, - (standard input), mqtt[s]://HOST:PORT or
+    SOURCE is a CSV or Parquet file, a folder of CSV or Parquet files, - (standard input), mqtt[s]://HOST:PORT or
     opc.tcp://HOST:PORT.
     """
     from plow_twin.live.stop import StopSignals

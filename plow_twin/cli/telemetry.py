@@ -53,7 +53,7 @@ def telemetry_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def ways_of(options: dict[str, Any]) -> list[WayOut]:
-    """Return the receivers that the options request. The errors are those of the module `telemetry.access`."""
+    """Return the receivers that the options request. If an option is invalid, `telemetry.access` raises an error."""
     if options["sparkplug"] and not options["mqtt_out"]:
         raise click.UsageError("--sparkplug: expected --mqtt-out with the broker")
     if not any(options[name] for name in ("mqtt_out", "influx", "opcua")):

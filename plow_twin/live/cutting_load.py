@@ -1,8 +1,8 @@
 """Random cutting load along the face, with a Gamma distribution and a spatial correlation.
 
-The random process is drawn anew for each pass. It is a function of the position along the face, so that it does not
-depend on the sampling rate or the speed. A Gaussian process with exponential correlation is transformed to the Gamma
-distribution by its quantiles, which is called a translation process.
+A new random process is drawn for each pass. The process is a function of the position along the face, so that it does
+not depend on the sampling rate or the speed. It is a translation process: a Gaussian process with exponential
+correlation is transformed to the Gamma distribution by the quantiles of the two distributions.
 
 References
 ----------

@@ -85,7 +85,7 @@ class Runtime:
         self.scene = prepared.scene
         #: time in which the solver was compiled or loaded [s]
         self.compile_s = prepared.compile_s
-        #: statistics of the period of publications at a fixed rate, or of advances by the clock; otherwise None
+        #: statistics of the publishing period or the step period; None if the samples determine the times
         self.periods = _periods(settings)
         #: `waiting` until the first message on `/clock`, then `paused` or `running`
         self.clock = "running"
@@ -444,7 +444,7 @@ class Runtime:
             self.driver.travel(stamp_ns, speed_m_s)
 
     def add_pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...] = ()) -> None:
-        """Check and use a measured pose. The arguments are those of `Inputs.uses_pose`."""
+        """Check and use a measured pose. The arguments are described in `Inputs.uses_pose`."""
         if not self.inputs.uses_pose(stamp_ns, pose, deviation):
             return
         known = tuple(index for index, value in enumerate(pose) if math.isfinite(value))

@@ -1,4 +1,4 @@
-"""Names of the services of a live twin, and the check of the text of a mark."""
+"""Names of the services of a live twin, and a check for the texts of marks."""
 
 from __future__ import annotations
 

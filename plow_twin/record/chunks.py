@@ -397,8 +397,8 @@ class _Heads:
 def look_ahead(descriptor, size, place, table):  # type: ignore[no-untyped-def]
     """Read record heads, beginning at offset `place`, into the rows of `table`; return the number of rows.
 
-    The columns are offset, opcode, length, end and channel mask. An index record has no row: its channel is added to
-    the mask of the chunk before it, and the end of that chunk is moved behind the index record.
+    The columns are offset, opcode, length, end and channel mask. An index record has no row. Its channel is added to
+    the mask of the preceding chunk, and the end of the chunk is moved behind the index record.
     """
     head, count = np.zeros(_INDEX_HEAD, np.uint8), 0
     while True:

@@ -61,8 +61,8 @@ def _lz4_block() -> Callable[[int, int, int, int], int] | None:
 def independent_blocks(data: memoryview, size: int) -> Bytes | None:
     """Return the decompressed content of an LZ4 frame that has independent blocks and no checksums.
 
-    The recorder writes such frames. Their blocks are decompressed directly into the result, which saves the copy that
-    the package lz4 makes.
+    The recorder writes frames of this kind. The blocks are decompressed directly into the result, which saves the copy
+    that the package lz4 makes.
 
     Returns
     -------

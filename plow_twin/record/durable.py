@@ -58,7 +58,7 @@ def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
 
 
 def write_whole(path: Path, content: bytes, *, sync: bool = False) -> None:
-    """Write `content` to a file atomically; the arguments are those of `whole_file`."""
+    """Write `content` to a file atomically. The other arguments are described in `whole_file`."""
     with whole_file(path, sync=sync) as stream:
         stream.write(content)
 

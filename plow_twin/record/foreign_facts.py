@@ -58,9 +58,9 @@ def foreign_facts(path: Path, mapping: Path | None, units: Mapping[str, str]) ->
     Returns
     -------
     facts : dict
-        Types of the topics, counts of losses, and a dictionary for each role. The latter contains the topic, the
-        numbers of messages that fit and do not fit the role, their span [s] and rate [Hz], and the range of each
-        quantity [SI units].
+        Types of the topics, counts of losses, and a dictionary for each role. The dictionary contains the topic, and
+        the numbers of messages that fit and do not fit the role. For the messages that fit, it contains the span [s],
+        the rate [Hz], and the range of each quantity [SI units].
     lossy : bool
         Whether a part of the recording could not be read, or messages do not fit their role.
 

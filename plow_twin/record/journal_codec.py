@@ -96,7 +96,7 @@ def to_message(entry: Entry | Dropped, frame_id: str) -> Message:
     if isinstance(entry, Snapshot | Restore):
         values["data"] = base64.b64encode(entry.data).decode()
     elif isinstance(entry, Unused):
-        # infinity and NaN are written as strings, because JSON has no such numbers
+        # infinity and NaN are written as strings, because JSON cannot represent them as numbers
         values["values"] = [
             [number if math.isfinite(number) else repr(number) for number in row] for row in entry.values
         ]

@@ -65,9 +65,9 @@ _NAMES: Final = {
 class Role:
     """Role of a topic: the field of each quantity in a message, and its conversion to SI units.
 
-    A path consists of names that are separated by dots. In a path, `[3]` selects the item with the index 3 of an array,
-    and `[fx]` selects the item at the index of `fx` in the field `name` of the message. A path to a quaternion yields
-    the angle about z.
+    A path consists of names that are separated by dots. In a path, `[3]` selects the array item with the index 3.
+    `[fx]` selects the array item with the index that `fx` has in the field `name` of the message. A path to a
+    quaternion yields the angle about z.
 
     Attributes
     ----------

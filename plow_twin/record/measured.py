@@ -58,7 +58,7 @@ OLDER_ROWS: Final = "older_rows"
 
 
 class _Rows:
-    """Table that keeps only the newest `MOST_ROWS` rows, and sometimes up to a quarter more until it drops them."""
+    """Table of the newest `MOST_ROWS` rows. Until older rows are dropped, it has up to a quarter more rows."""
 
     def __init__(self, columns: int) -> None:
         self._columns, self._values = columns, array("d")

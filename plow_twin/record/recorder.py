@@ -4,8 +4,7 @@ Callers put journal entries and publications in a queue, and never wait for the 
 50 ms and writes the file. If the thread is too slow, items that do not fit in the queue are dropped. Dropped items are
 counted by topic, and a note in the file marks the place of each loss.
 
-A *ring* is a recording in memory that keeps only the last seconds of a run. The method `Recorder.mark` writes the ring
-to the disk.
+A *ring* is a recording of the last seconds of a run in memory. The method `Recorder.mark` writes the ring to the disk.
 """
 
 from __future__ import annotations
@@ -173,7 +172,7 @@ class Recorder:
         )
         if header.follow == "full":
             each += tuple(map(header.topic, names_of(Cadence.FOLLOWED)))
-        #: topics of a publication; the key contains whether it has a slow part, and whether it is marked
+        #: topics of a publication, by a pair: whether the publication has a slow part, and whether it is marked
         self._topics_of = {
             (False, False): each, (True, False): each + slow, (False, True): each + marked,
             (True, True): each + slow + marked,
@@ -499,7 +498,7 @@ class Recorder:
                 self._dump(self._ring, self._mark, lost)
             except (OSError, RecordingError) as failed:  # the ring stays in memory
                 error = f"{self._mark}: the last {self._ring_s:g} s not written: {failed}"
-            # both change under one lock, because a caller that reads a new count may call `mark` immediately
+            # `_mark` and the counts change under one lock, because a caller may read a count and then call `mark`
             with self._lock:
                 self._mark = None
                 if error is None:

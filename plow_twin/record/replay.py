@@ -446,8 +446,8 @@ class _Replay:
     def _snapshot(self, snapshot: Snapshot) -> None:
         if self.synced and self.outputs_synced:
             self.report.snapshots_compared += 1
-            # The live session discarded its earlier states when it took the snapshot. `renew` takes a snapshot and
-            # discards the earlier states, too, so that both sessions treat late samples alike.
+            # The live session discarded its earlier states when it took the snapshot. `renew` also takes a snapshot and
+            # discards the earlier states. Late samples then have the same effect in the replay as in the live session.
             computed = self.session.renew().data
             self._compare("snapshot", snapshot.stamp_ns, "state", _hash(snapshot.data), _hash(computed))
             return
@@ -456,7 +456,7 @@ class _Replay:
             self.session.apply(snapshot)
         except (ValueError, struct.error) as error:
             raise RecordingError(f"{self.report.path}: snapshot at {snapshot.stamp_ns} ns: {error}") from error
-        # no entry was lost, so the motion can be compared; the output window cannot, because messages were lost
+        # messages were lost, but no entry, so that only the motion can be compared
         if before is not None:
             self._compare("snapshot", snapshot.stamp_ns, "state", self.session.twin.digest(), before)
         self.synced = self.resumed = True

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 #: Largest number of samples by which a session advances in one call.
 BATCH: Final = 4096
-#: Types of entries that change the session. The samples between two such entries are sorted by their stamps.
+#: Types of entries that change the session. The samples between two of these entries are sorted by their stamps.
 _ACTING: Final = (Travel, Reset, Loss, Restore, Snapshot, SetModel, SetWear)
 #: Further types of entries that change the session if its motion follows measurements.
 _FOLLOWED: Final = (Pose, PartOfPose, Estimated, Parameter)
@@ -160,8 +160,8 @@ class Walker:
 class JournalWalk:
     """Pass the journal of a run to walkers.
 
-    After missing entries, the motion of all walkers begins anew. A late sample is inserted at its stamp if the walkers
-    have not reached the stamp; otherwise it is not used.
+    After missing entries, the motion of all walkers is reset. A late sample is inserted at its stamp. If the walkers
+    have already reached this stamp, the sample is not used.
 
     Parameters
     ----------

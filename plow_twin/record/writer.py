@@ -56,7 +56,7 @@ class _Part:
 
 
 class RunWriter:
-    """Write journal entries and outputs to the parts of a recording. The arguments are those of `Recorder`.
+    """Write journal entries and outputs to the parts of a recording. The arguments are described in `Recorder`.
 
     Journal entries and outputs are written to separate chunks. A chunk of entries precedes the chunk of the outputs
     that were sent after these entries.
@@ -269,8 +269,8 @@ class RunWriter:
     def split(self, loss: Mapping[str, int], keep_bytes: int = 0) -> None:
         """Start a new part and complete the old part. The caller must write a snapshot next.
 
-        The new part is opened first, so that a reader of the folder always finds an open part. With `keep_bytes`, the
-        oldest completed parts are removed until their total size [B] is at most `keep_bytes`.
+        The new part is opened first, so that the folder always contains a part that is being written. With
+        `keep_bytes`, the oldest completed parts are removed until their total size [B] is at most `keep_bytes`.
         """
         self._close_chunks()
         old, self._number = self._part, self._number + 1
@@ -325,7 +325,7 @@ def _is_free(folder: Path) -> bool:
 
 
 def free_folder(folder: Path) -> Path:
-    """Return `folder` if it can receive a recording, otherwise the first such folder of `<folder>_2`, ...."""
+    """Return the first of `folder`, `<folder>_2`, `<folder>_3`, ... that can receive a recording."""
     path, number = folder, 1
     while not _is_free(path):
         number += 1

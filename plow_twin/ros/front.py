@@ -33,7 +33,7 @@ class RosFront:
     """Topics, timers and services of a configured node. It is created on configure and closed on cleanup.
 
     The function `changed` is called when the state of the stream may have changed. The other arguments, and the errors,
-    are those of `Runtime`.
+    are described in `Runtime`.
     """
 
     def __init__(

@@ -24,9 +24,9 @@ _GREY: Final = (0.6, 0.6, 0.6)
 _BLUE: Final = (0.3, 0.55, 0.9)
 _ORANGE: Final = (0.9, 0.6, 0.1)
 _RED: Final = (0.9, 0.2, 0.2)
-#: Width of lines and arrows, as a share of the height of the frame.
+#: Width of lines and arrows, relative to the frame height.
 _LINE: Final = 0.015
-#: Length of the arrow of a force that equals the weight of the head, as a share of the height of the frame.
+#: Length of the arrow for a force as large as the weight of the head, relative to the frame height.
 _ARROW: Final = 0.5
 
 
@@ -34,7 +34,7 @@ class Markers:
     """Publisher of the markers. All coordinates are in the frame `frame_id`.
 
     The namespaces of the markers are `frame`, `cavity`, `pads` and `forces`. A pad is drawn behind its wall at a
-    distance equal to its wear depth. The forces are those that act on the head.
+    distance equal to the wear depth. The arrows of `forces` are the forces on the head.
     """
 
     def __init__(self, node: Node, settings: Settings, scene: Scene) -> None:

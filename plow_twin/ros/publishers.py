@@ -1,4 +1,4 @@
-"""Publish the outputs on ROS topics. The bytes of a message are equal to those in a recording."""
+"""Publish the outputs on ROS topics. A message has the same bytes as in a recording."""
 
 from __future__ import annotations
 

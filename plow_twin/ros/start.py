@@ -14,7 +14,7 @@ class RosArgumentsError(PlowTwinError):
 
 
 def start_ros(arguments: Sequence[str] | None) -> None:
-    """Initialize the default context of ROS with arguments, by default with those of the process.
+    """Initialize the default context of ROS with `arguments`, by default with the arguments of the process.
 
     ROS installs no signal handlers, because the program handles signals itself.
 

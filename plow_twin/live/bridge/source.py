@@ -134,7 +134,7 @@ class Rows:
         return columns_of(source, self.columns or ())
 
     def of_another_file(self) -> Rows:
-        """Return a parser for the next file. If that file has no header, its columns are those of the present file."""
+        """Return a parser for the next file. If the next file has no header, it has the columns of this file."""
         rows = Rows()
         rows._before = self.columns
         return rows

@@ -155,7 +155,7 @@ class Link:
         return f"no sign of life for {silent_s:.0f} s" if silent_s > 3.0 * self._keepalive_s else ""
 
     async def history(self, begin_ns: int, end_ns: int) -> list[tuple[int, Any]]:
-        """Return pairs of node number and value from `begin_ns` to `end_ns`, including both stamps [ns].
+        """Return pairs of node number and value for all stamps from `begin_ns` to `end_ns`, inclusive [ns].
 
         Raises
         ------
