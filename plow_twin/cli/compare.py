@@ -146,7 +146,6 @@ _KEY: Final = (
 
 
 def _text(change: Change | None) -> str:
-    """Return a change in percent, followed by the sign of its cause."""
     if change is None:
         return "-"
     percent = round(100.0 * change.share, 1) + 0.0

@@ -137,7 +137,6 @@ def forecast(
 
 
 def _check_limits(limits_m: tuple[float, float], scene: Scene) -> None:
-    """Raise a usage error for limits that seem to be in m, and report a clearance that has passed its limit."""
     import numpy as np
 
     from plow_twin.stream.outputs import clearances
@@ -171,7 +170,6 @@ def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
 
 
 def _estimate(path: Path) -> Any:
-    """Return the unchecked content of the JSON file of an estimate."""
     try:
         facts = json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:

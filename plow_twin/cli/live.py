@@ -173,7 +173,6 @@ def _live(
 
 
 def _say_what_differs(front: BridgeFront, settings: Settings) -> None:
-    """Report the folder of the recording if it is not the requested folder, and thresholds that seem to be wrong."""
     from plow_twin.record.unit_check import small_thresholds
 
     recording = front.runtime.recording
@@ -185,7 +184,6 @@ def _say_what_differs(front: BridgeFront, settings: Settings) -> None:
 
 
 def _say_pace(settings: Settings, quiet: bool) -> None:
-    """Report, before a file is read, that reading takes long."""
     if settings.follows == "full" and not quiet:
         say_error(
             f"plow-twin: {settings.follow_members} twins follow the machine, which takes about as long as the "

@@ -64,7 +64,6 @@ def setup(file: Path, scene: str | None, given: tuple[str, ...], units: dict[str
 
 
 def _check_sizes(guess: Guess, scene: Scene, stated: dict[str, str]) -> None:
-    """Raise a `UnitError` for loads that are too large for the scene, unless the user has stated their unit."""
     from plow_twin.record.unit_check import large_loads
 
     large = large_loads(guess.values, guess.units, scene)

@@ -95,7 +95,6 @@ def sweep(
 
 
 def _list_failed(result: Table) -> None:
-    """Report the failed members by reason. The Parquet file contains all of them."""
     reasons: dict[str, list[str]] = {}
     for member in result.failed:
         values = ", ".join(f"{path}={_text(value)}" for path, value in result.sweep.values(member).items())

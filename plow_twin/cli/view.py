@@ -196,7 +196,6 @@ def _print_losses(recording: Path, status: FileStatus, lost: Mapping[str, int], 
 
 
 def _serve(file: Path, port: int) -> int:
-    """Serve a .rrd file on the loopback address by the program of the viewer, until interrupted."""
     from plow_twin.view.viewer import LOOPBACK, free_port, page_address, page_port, viewer_program
 
     program, data_port = viewer_program(), free_port()

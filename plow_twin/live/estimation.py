@@ -139,7 +139,6 @@ class Estimation:
         return messages
 
     def _forget(self) -> None:
-        """Discard the estimate, so that the clearances of the model are valid again."""
         self.entry = None
         self.states = dict.fromkeys(self.states, State.PRIOR)
 

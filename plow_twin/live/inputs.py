@@ -202,7 +202,6 @@ class Inputs:
         return verdict.used
 
     def _is_implausible(self, stamp_ns: int, gaps: Mapping[int, float]) -> bool:
-        """Return whether a gap is too large, or has changed too fast since the last gap of the same pair."""
         limits = self._gap_limits
         if limits is None or not all(map(math.isfinite, gaps.values())):
             return False  # the intake refuses NaN and infinity later

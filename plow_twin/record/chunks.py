@@ -203,7 +203,6 @@ class ChunkReader:
             yield from self._scan(waiting.pop_all(), schemas)
 
     def _is_wanted(self, channels: int) -> bool:
-        """Return whether a chunk with the channel mask `channels` must be read."""
         if self.wanted is None or channels <= 0:
             return True
         if channels not in self._answers:

@@ -264,6 +264,5 @@ def _unit_of(name: str) -> str:
 
 
 def _plain(name: str) -> str:
-    """Return the name of a column in lower case, without unit, spaces and punctuation."""
     found = _UNIT.fullmatch(name)
     return re.sub(r"[^a-z0-9]", "", (found[1] if found else name).lower())

@@ -358,7 +358,6 @@ def _role(path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str, 
 
 
 def _check_nodes(path: Path, role: str, found: Role) -> None:
-    """Raise a `MapError` if the role of OPC UA nodes has a setting that nodes do not support."""
     if found.stamp not in (SOURCE_STAMP, SERVER_STAMP):
         raise map_error(path, f"{role}.stamp", found.stamp, f"{SOURCE_STAMP} or {SERVER_STAMP} for nodes")
     if found.stamp_unit != "ns":
@@ -420,7 +419,6 @@ def _check_columns(path: Path, name: str, role: Role) -> None:
 
 
 def _check_stamp_unit(path: Path, name: str, role: Role) -> None:
-    """Raise a `MapError` if the stamps of a role cannot have a unit."""
     kind, why = role.message_type, ""
     if role.stamp == "log":
         why = "none with stamp: log"

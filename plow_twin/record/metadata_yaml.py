@@ -147,7 +147,6 @@ def _information(folder: Path) -> Any:
 
 
 def _parsed(read: tuple[Any, list[Problem]]) -> Any:
-    """Return the parsed document, or raise `RecordingError` if it has problems."""
     document, problems = read
     if problems:
         raise RecordingError(f"{problems[0]}")

@@ -181,7 +181,6 @@ class RunReader:
         return self._headers[file].part if file in self._headers else part_number(file)[0]
 
     def _place_of(self, file: Path) -> tuple[int, bool, str]:
-        """Return the sort key of a part."""
         named = part_number(file)[0]
         number = self.number(file)
         return number, named != number, file.name

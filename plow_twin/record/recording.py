@@ -137,7 +137,6 @@ class Recording:
         return dict(self._losses)
 
     def _read(self, *, outputs: bool) -> Iterator[Batch]:
-        """Yield the batches of the recording, and store the losses at the end."""
         reader = RunReader(self.path)
         yield from reader.batches(outputs=outputs)
         whole = reader.status is FileStatus.COMPLETE

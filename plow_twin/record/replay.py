@@ -313,7 +313,6 @@ class _Replay:
         return True
 
     def _write_run(self, entries: Entries, found: Applied) -> None:
-        """Write a run to the sink, with a publication after each sample."""
         assert self.sink is not None
         begin = 0
         for end in (*sorted(entries.others), len(entries)):
@@ -354,7 +353,6 @@ class _Replay:
         done: Indexes,
         first_step: int,
     ) -> list[tuple[int, int, str, str, str, str]]:
-        """Return the differences between the recorded and the computed messages of a run."""
         poses = [
             (int(entries.sequence[index]) & _SEQUENCE_MASK, first_step + int(done[index]) - 1, entry)
             for index, entry in sorted(entries.rest.items())
@@ -378,7 +376,6 @@ class _Replay:
         return differences
 
     def _difference(self, record: OutputRecord, published: Published) -> tuple[str, str, str] | None:
-        """Return the first difference between a recorded message and the computed message, or None."""
         name = self.topics[record.topic]
         computed = publication_messages(published, self.header.frame_id, self.header.child_frame_id).get(name)
         if computed is None:

@@ -66,7 +66,6 @@ def _count_up() -> ctypes.c_void_p:
 
 
 def _new_buffer() -> SerializedMessage:
-    """Return a buffer that rcl fills, and enlarges if necessary."""
     _, rcutils = libraries()
     buffer, allocator = SerializedMessage(), rcutils.rcutils_get_default_allocator()
     if rcutils.rcutils_uint8_array_init(buffer, _FIRST_CAPACITY, allocator):

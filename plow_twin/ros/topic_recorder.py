@@ -90,7 +90,6 @@ class TopicRecorder:
                     self.skipped[name] = f"{', '.join(types)}: {error}"
 
     def _subscribe(self, name: str, types: Sequence[str], publishers: Sequence[Any]) -> None:
-        """Subscribe to a topic, once for each quality of service that its publishers offer."""
         if name not in self._topics:
             if len(types) != 1:
                 raise LookupError("expected one type")

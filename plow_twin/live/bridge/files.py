@@ -132,7 +132,6 @@ def _open(path: Path) -> Any:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Convert an error in the format of a table to a `BridgeError`."""
     try:
         yield
     except csv.Error as error:

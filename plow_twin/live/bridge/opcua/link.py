@@ -267,7 +267,6 @@ class Link:
         return range(0) if expected is None or number < expected else range(expected, number)
 
     async def _again(self, number: int) -> ua.NotificationMessage | None:
-        """Request a lost message, and return it, or None if the server has deleted it."""
         try:
             message = await self._client.uaclient.session.republish(self._subscription, number)
         except UaError:

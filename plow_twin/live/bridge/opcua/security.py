@@ -125,7 +125,6 @@ def _hosts(certificate: x509.Certificate) -> list[str]:
 
 
 def _application_uri(certificate: x509.Certificate, otherwise: str) -> str:
-    """Return the application URI in the certificate of the client, or `otherwise` if the certificate has none."""
     names = _names(certificate)
     uris = names.get_values_for_type(x509.UniformResourceIdentifier) if names else []
     return uris[0] if uris else otherwise
