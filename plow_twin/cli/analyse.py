@@ -46,7 +46,10 @@ def analyse(
     as_json: bool,
     quiet: bool,
 ) -> int:
-    """Analyse recordings: runs of plow_twin, MCAP, rosbag2's sqlite3, CSV, or folders of these."""
+    """Analyse recordings.
+
+    RUN is a run of plow_twin, another recording (MCAP, sqlite3 of rosbag2, CSV), or a folder of recordings.
+    """
     from plow_twin.study.analysis.task import Task, names_apart
 
     scene_file, further = Path(scene) if scene else None, tuple(map(Path, others))
@@ -91,7 +94,7 @@ def found_recordings(recordings: Sequence[Path], out: Path | None = None) -> tup
     for path in recordings:
         if not path.exists():
             raise click.BadParameter(f"{path}: does not exist", param_hint="RUN...")
-    # results of an earlier analysis are not reported as other items
+    # the results of an earlier analysis are not reported
     results_before = () if out is None else (out.resolve(), (out / "run").resolve())
     left = {item: path for path in recordings for item in left_out(path, results_before)}
     left = {item: path for item, path in left.items() if item.resolve() not in results_before}

@@ -15,7 +15,7 @@ Fact = dict[str, Any]
 
 
 def numbers(scene: Scene) -> list[Fact]:
-    """Return the key, value, unit, mark and source of each number of a scene. Each item of a list is a number."""
+    """Return the key, value, unit, mark and source of each number of a scene, including the numbers in lists."""
     rows = [row for key in SECTIONS for row in _numbers_of(getattr(scene, key), key, scene)]
     for index, load in enumerate(scene.loads):
         rows += _numbers_of(load, f"loads[{index}]", scene)

@@ -329,7 +329,7 @@ def roles_of(
     if ("drive" in roles) != modelled or {"drive", "excitation"} <= roles.keys():
         raise BridgeError("mapping: expected drive and load_model together, and no excitation beside them")
     if source == "excitation" and not {"drive", "excitation"} & roles.keys():
-        # the first line of a file that is not a table may be long, so each type is truncated
+        # each type is truncated, because the first line of a file that is not a table may be long
         there = "; ".join(f"{topic} ({str(kind)[:120]})" for topic, kind in (topics or {}).items())
         setup = "" if topics is None else "; plow-twin setup FILE writes a mapping"
         raise BridgeError(

@@ -91,7 +91,7 @@ class Inputs:
         return [topic for topic, heard_ns in self._other_heard_ns.items() if now_ns - heard_ns < _OTHER_SENDER_NS]
 
     def silent(self) -> list[str]:
-        """Return the optional inputs that have received messages, but none for some time."""
+        """Return the optional inputs that are silent now, but received messages before."""
         if self.ended:
             return []
         now_ns = time.monotonic_ns()

@@ -1,4 +1,4 @@
-"""Table of the parameters of the node. The checks, the ROS descriptors and config/twin.yaml are made from it."""
+"""Table of the parameters of the node, from which the checks, the ROS descriptors and config/twin.yaml are made."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from plow_twin.stream.session import Series
 if TYPE_CHECKING:
     from plow_twin.live.recording import Recording
 
-#: Base name of a topic and a message. A message of the motion is the buffer with its bytes.
+#: Base name of a topic and a message. A message of the motion is represented by the buffer with its bytes.
 Outgoing = tuple[str, memoryview | Message]
 
 

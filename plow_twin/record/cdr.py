@@ -84,7 +84,7 @@ def decode(data: bytes, message_type: str) -> Message:
         return _decode_short_text(data)
     try:
         return _DECODERS[kind](typestore().deserialize_cdr(data, message_type))
-    except Exception as error:  # rosbags lets index, struct and assertion errors of damaged bytes escape
+    except Exception as error:  # for damaged bytes, rosbags may raise index, struct and assertion errors
         raise RecordingError(f"{message_type}: got {len(data)} bytes, expected one message ({error!r})") from error
 
 

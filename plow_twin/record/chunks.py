@@ -57,7 +57,7 @@ _MESSAGE_FIELDS: Final = MESSAGE_HEAD - _HEAD_SIZE
 _COLUMNS: Final = 6
 #: Size [B] up to which several chunks are scanned in one call.
 _SMALL: Final = 2**18
-#: The same size if `wanted` is given. The large chunks are then often skipped, and many small chunks remain.
+#: The same size for a reader with `wanted`, which may skip the large chunks between small chunks.
 _SMALL_ALONE: Final = 2**20
 
 

@@ -37,7 +37,7 @@ _TIME: Final = r"t|time|timestamp|stamp|zeit|zeitstempel|date|datetime|datum"
 _UNIT: Final = re.compile(
     r"(.+?)\s*(?:[\[(]\s*([^\])]+?)\s*[\])]|[ _](kN ?m|N ?m|kN|N|mm|cm|m|mrad|rad|deg|ms|us|ns|s))"
 )
-#: Lower limits of a time that counts from 1970, for each unit of time. Each limit is the same date in 2001.
+#: Smallest time that is read as a date, for each unit of time. All limits are the same date in 2001.
 _DATES: Final = (("ns", 1e18), ("us", 1e15), ("ms", 1e12), ("s", 1e9))
 #: Largest number of cells that are examined. In a file with many columns, fewer rows are therefore examined.
 _MOST_CELLS: Final = 2_000_000
@@ -245,7 +245,7 @@ def _find_units(guess: Guess, numbers: Mapping[str, Array], scene: Scene, given:
             guess.units[name] = other
             guess.because[name] += f", {other} like the other force"
             guess.values["excitation", name] *= UNITS["force"][other]
-    # the size of a moment does not show its unit
+    # the unit of a moment cannot be guessed from its magnitude
     if guess.units.get("fx") == "kN" and "m" not in guess.units and ("excitation", "m") in guess.columns:
         guess.units["m"] = "kN m"
         guess.because["m"] += ", kN m because the forces are in kN"

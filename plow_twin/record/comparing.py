@@ -57,7 +57,7 @@ class Sent:
         slow_of = np.full(len(rows), -1)
         slow_of[slow["row"]] = np.arange(len(slow))
         numbers = [topic.numbers(topic.record_of(published)) for topic in REPLAYED]
-        #: Compiled code reads these arrays by address. This reference prevents that they are freed.
+        #: arrays that compiled code reads by address; this attribute keeps them in memory
         self._numbers = [[_with_whole_rows(part) for part in parts] for parts in numbers]
         self._expected = (
             self.publication, slow_of, kinds, np.ascontiguousarray(rows["stamp_ns"]),

@@ -52,7 +52,7 @@ def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
         if sync:
             sync_path(place.parent)
     except OSError as error:
-        if error.errno is None:  # an error of a library, which has its own message
+        if error.errno is None:  # the error was raised by a library, which has described it
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
 

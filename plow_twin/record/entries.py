@@ -169,7 +169,7 @@ class Outputs:
 
     @cached_property
     def newest(self) -> int:
-        """The highest sequence number. It is undefined without a message."""
+        """The highest sequence number. There must be at least one message."""
         return int(self.sequence.max())
 
     def __getitem__(self, chosen: slice) -> Outputs:

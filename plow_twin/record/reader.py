@@ -34,7 +34,7 @@ from plow_twin.stream.journal import Entry, Loss, Sample
 _PENDING: Final = 65_536
 #: Smallest number of entries in a batch. A batch may be smaller if the outputs of `_LEAST // 16` chunks are in memory.
 _LEAST: Final = 8192
-#: The same number for batches without outputs, which need less memory.
+#: Smallest number of entries in a batch without outputs. It is larger, because entries alone need less memory.
 _LEAST_ALONE: Final = 32_768
 #: Typical growth of a recording at 1 kHz [B/s]. It is used to estimate the duration of a file without an index.
 _BYTES_PER_S: Final = 400_000

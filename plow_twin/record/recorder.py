@@ -181,7 +181,7 @@ class Recorder:
         self._split_due = False
         self._part_since = time.monotonic()
         self._queue: deque[_Item] = deque()
-        #: number of entries and publications in the queue, minus the length of the queue; an item may contain several
+        #: number of entries and publications in the queue beyond one per item, because an item may contain several
         self._more = 0
         self._queue_size = queue_size
         self._flush_period_s = flush_period_s

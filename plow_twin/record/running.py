@@ -41,7 +41,7 @@ def running_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: Fa
                     claimed = is_claimed(stream.fileno())
                 if claimed and read_header(parts[0]) is not None:
                     return candidate
-            except (RecordingError, OSError):  # the recording is not complete enough to be read, or was just removed
+            except (RecordingError, OSError):  # the header is not yet written, or the recording was just removed
                 continue
         if stop() or time.monotonic() >= deadline:
             return None

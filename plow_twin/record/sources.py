@@ -33,7 +33,8 @@ _SQLITE_MAGIC: Final = b"SQLite format 3\0"
 _ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 #: Largest size of a decompressed message [B].
 _LARGEST_MESSAGE: Final = 2**26
-#: Query that finds views, virtual tables and computed columns. Reading these may never end, so the file is refused.
+#: Query for views, virtual tables and computed columns. A file that contains them is refused, because reading a
+#: computed table may never end.
 _COMPUTED: Final = """
     SELECT 1 FROM sqlite_master
     WHERE name COLLATE NOCASE IN ('topics', 'messages') AND (type != 'table' OR rootpage = 0)
@@ -201,7 +202,7 @@ class Decoder:
         for end in (len(data), len(data) - 8):  # after a final empty float64[], rclpy appends 8 meaningless bytes
             try:
                 return self._store.deserialize_cdr(data[:end], message_type)
-            except Exception:  # rosbags lets index, struct, unicode and assertion errors of damaged bytes escape
+            except Exception:  # for damaged bytes, rosbags may raise index, struct, unicode and assertion errors
                 continue
         self._losses.counts["undecodable"] += 1
         return None

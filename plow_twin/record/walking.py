@@ -170,10 +170,11 @@ class JournalWalk:
     others
         Walkers of other scenes, which never restore a state from the journal.
     whole
-        Whether the journal begins with the first entry of the run. If not, `own` restore the first snapshot.
+        Whether the journal begins with the first entry of the run. If not, the walkers `own` restore the first
+        snapshot.
     same_scene
-        Whether `own` have the scene of the run. They then also apply changes of the model, restored motions, and, if
-        their twin follows measurements, the measurements.
+        Whether the walkers `own` have the scene of the run. These walkers then also apply changes of the model and
+        restored motions. If their twin follows measurements, they apply the measurements, too.
 
     Attributes
     ----------

@@ -271,7 +271,7 @@ class Files(Bridge):
 
     @property
     def share(self) -> float:
-        """Share of the files that has been read, from 0 to 1. It is 0 with `follow`."""
+        """Share of the files that has been read, from 0 to 1. With `follow`, the share is 0."""
         return self._done / self._size if self._size else 0.0
 
     def _next(self) -> Messages:

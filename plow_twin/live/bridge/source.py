@@ -35,7 +35,7 @@ class Bridge(ABC):
     """Source of messages."""
 
     def __init__(self, *, ends: bool = False, connected: bool = False) -> None:
-        #: whether the source has an end, like a file that is read once; its stamps then replace the system time
+        #: whether the source has an end, like a file that is read once, so that stamps replace the system time
         self.ends = ends
         #: whether the source has ended
         self.finished = False
