@@ -29,8 +29,12 @@ _METRES: Final = 1e-2
     "part of the run is missing.",
 )
 @click.argument("scene")
-@click.option("--limit-horizontal", metavar="MM", type=POSITIVE, required=True, help="Limit of the clearance [mm].")
-@click.option("--limit-vertical", metavar="MM", type=POSITIVE, required=True, help="Limit of the clearance [mm].")
+@click.option(
+    "--limit-horizontal", metavar="MM", type=POSITIVE, required=True, help="Limit of the horizontal clearance [mm]."
+)
+@click.option(
+    "--limit-vertical", metavar="MM", type=POSITIVE, required=True, help="Limit of the vertical clearance [mm]."
+)
 @click.option(
     "--horizon", metavar="H", type=POSITIVE, default=4000.0, show_default=True, help="Longest time of operation [h]."
 )
