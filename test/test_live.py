@@ -965,7 +965,7 @@ def _mistaken(name: str) -> str:
         ("days", 2, "they look like days of a spreadsheet: write seconds, or dates"),
         ("km/h", 2, "speed: got 7.2, expected at most 5 m/s, as ploughs reach; they look like km/h"),
         ("bars", 1, "fx|fy|m (expected commas, semicolons or tabs between them)), expected the columns fx, fy, m"),
-        ("summer time", 0, "the stamps jumped back (1), and the motion was reset: is it local time"),
+        ("summer time", 0, "the stamps jumped back (1), and the motion was reset: are they in local time"),
     ],
 )
 def test_a_natural_mistake_in_a_file_is_named(
