@@ -92,8 +92,8 @@ def estimate(
     run made estimates, the last estimate is computed again from the journal, and the result is compared bit for bit.
     Otherwise the measured pose must be recorded in the folder of the run.
 
-    With --follow, each row of followed.csv contains forces and clearances with 90 % intervals. They are computed from
-    the measurements up to the time of the row.
+    With --follow, each row of followed.csv contains forces and clearances with 90 % intervals. The values are computed
+    from the measurements up to the time of the row.
     """
     import numpy as np
 

@@ -31,7 +31,7 @@ from plow_twin.stream.outputs import Published
 from plow_twin.stream.topics import TOPICS
 
 NAME: Final = "/plow_twin"
-#: Longest wait for a message [s]. It also limits the delay of a stop.
+#: Longest wait for a message [s]. A requested stop is delayed by this time at most.
 _POLL_S: Final = 0.1
 _REPORT_S: Final = 1.0
 #: Share of unused samples above which a probable cause is reported.
@@ -67,7 +67,7 @@ class BridgeFront:
     say
         Function that receives the status and the alarms when they change, and the diagnostics once a second.
     on_error
-        Function that receives errors. It may be called from another thread.
+        Function that receives errors. Other threads may also call this function.
     units
         Units of quantities (fx, ..., or t for the time), which replace the units in the mapping.
 

@@ -40,7 +40,7 @@ class Recording:
     clock
         Function that returns the time on `/clock` [ns], or None if the system time is used.
     on_error
-        Function that receives the reason when recording stops early. It is called in the thread of the recorder.
+        Function that receives the reason when recording stops early. The thread of the recorder calls this function.
     """
 
     def __init__(

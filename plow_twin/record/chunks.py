@@ -57,7 +57,7 @@ _MESSAGE_FIELDS: Final = MESSAGE_HEAD - _HEAD_SIZE
 _COLUMNS: Final = 6
 #: Size [B] up to which several chunks are scanned in one call.
 _SMALL: Final = 2**18
-#: The same size for a reader with `wanted`, which may skip the large chunks between small chunks.
+#: The size [B] if `wanted` is given. Larger chunks between small chunks may then be skipped.
 _SMALL_ALONE: Final = 2**20
 
 

@@ -30,7 +30,7 @@ from plow_twin.stream.session import wear_in
 class LiveEstimate:
     """An estimate from the journal of a node, with its window of measurements.
 
-    The window is computed again from the journal. It is None if the journal does not contain all its measurements.
+    The window is computed again from the journal. If measurements are missing in the journal, the window is None.
     """
 
     entry: Estimated

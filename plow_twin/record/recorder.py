@@ -126,7 +126,7 @@ class Recorder:
     now_ns
         Function that returns the receive time [ns]. The recorder calls it in the thread of the caller.
     on_error
-        Function that receives the reason when recording stops early. It is called once, in the thread of the recorder.
+        Function that receives the reason when recording stops early. The recorder calls it once, in its own thread.
 
     Raises
     ------

@@ -23,7 +23,7 @@ from plow_twin.record.words import set_word, word
 Bytes = NDArray[np.uint8]
 Indexes = NDArray[np.int64]
 
-#: Offset of the stamp [B]. It follows the four bytes that identify the encoding.
+#: Offset of the stamp in a message [B]. The first four bytes of the message identify the encoding.
 STAMP_AT: Final = 4
 _SECOND_NS: Final = 1_000_000_000
 

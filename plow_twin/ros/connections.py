@@ -1,7 +1,8 @@
 """Look up the publishers and subscribers on the topics of a node in the ROS graph.
 
-The lookup replaces the events of the middleware, with which rmw_fastrtps can deadlock. It acquires two locks in one
-order when an event is requested or taken, and in the opposite order when an event occurs (ros2/rmw_fastrtps#890).
+The lookup replaces the events of the middleware, which can cause a deadlock in rmw_fastrtps (ros2/rmw_fastrtps#890).
+When an event is requested or taken, rmw_fastrtps acquires two locks in one order. When an event occurs, it acquires
+them in the opposite order.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A thread that reads the input queues when messages arrive, and calls timers of a monotonic clock.
 
-It replaces the executors of rclpy, which create a task for each message. The events executor runs its timers only
-when no message is waiting. In a test with samples at 10 kHz, the twin therefore published nothing.
+The thread replaces the executors of rclpy, which create a task for each message. The events executor runs its timers
+only when no message is waiting. In a test with samples at 10 kHz, the twin therefore published nothing.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
     node_name
         Name of the node.
     stop_asked
-        Function that returns True if a stop was requested. It is called repeatedly while the solver is compiled.
+        Function that returns True if a stop was requested. The node calls it repeatedly while the solver is compiled.
     **options
         Options of `rclpy.node.Node`.
 

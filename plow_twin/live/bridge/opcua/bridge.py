@@ -34,7 +34,8 @@ from plow_twin.record.sources import Arrived, TopicType
 #: Largest number of samples in the queue. Further samples are counted as lost. Reading of the history waits instead.
 _QUEUE: Final = 100_000
 _PORTS: Final = {"opc.tcp": 4840}
-#: Longest wait for all values with the same stamp [s]. They arrive in one or two messages; the factor 5 is a margin.
+#: Longest wait for all values with the same stamp [s]. The values arrive in one or two messages. The wait is five
+#: publishing intervals, which includes a margin.
 _WAIT_S: Final = 5e-3 * PUBLISHING_MS
 #: Time span of the history that is read at a time [ns].
 _PIECE_NS: Final = 10_000_000_000
