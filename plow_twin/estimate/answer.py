@@ -18,8 +18,8 @@ from plow_twin.model.scene import Scene, Table
 
 #: Settling time in load periods before the evaluated span, derived from the decay of the members' initial states.
 _SETTLE_PERIODS: Final = 1.0
-#: Longest interval between two knots of a load, as a share of the load's period. It is derived from the paper's
-#: machine, for which it is about twice `tuning.LOAD_KNOT`.
+#: Longest interval between two knots of a load, as a share of the load's period. The share is derived from the paper's
+#: machine, for which the interval is about twice `tuning.LOAD_KNOT`.
 _KNOT_SHARE: Final = 1.0 / 400.0
 
 

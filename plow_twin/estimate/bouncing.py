@@ -582,10 +582,10 @@ class _Near:
 
 
 def regress_near(features: Array, targets: Array, measured: Array) -> _Regressed:
-    """Return the prediction at the features `measured`, (m,), of a regression of targets (n, k) on features (n, m).
+    """Return the k targets that a regression predicts for the features `measured`, shape (m,), with their deviations.
 
-    Draws near `measured` have large weights. The deviation of the prediction includes the extrapolation if `measured`
-    lies at the edge of the draws.
+    The regression is of targets (n, k) on features (n, m) of n draws. Draws near `measured` have large weights. The
+    deviations include the extrapolation if `measured` lies at the edge of the draws.
     """
     near = _Near.to(features, measured)
     value, error = near.regress(targets)

@@ -397,9 +397,10 @@ def with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
 
 
 def _with_apparent(result: Estimate, apparent: tuple[Interval, ...]) -> Estimate:
-    """Return an estimate with new apparent clearances, and clearances that are shifted and widened as before.
+    """Return an estimate with other apparent clearances, which hold for a frame of exactly the scene's size.
 
-    Apparent clearances hold for a frame of exactly the scene's size; the clearances allow for an error of the frame.
+    The clearances also allow for an error of the frame. Their shift and additional width relative to the apparent
+    clearances do not change.
     """
     horizontal, vertical = (
         Interval.normal(

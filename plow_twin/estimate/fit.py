@@ -50,8 +50,8 @@ _LEAST_DRIFT = 1e-8
 WALLS: Final = ((1, 7), (3, 5), (0, 2), (6, 4))
 #: Definition of the *differences*, which are unknowns by which machine and sensor differ from the model:
 #:
-#: - `turn_<wall>`: rotation of a wall, the distance in m by which the first pad in `WALLS` lies farther out than the
-#: second pad
+#: - `turn_<wall>`: rotation of a wall, expressed as the distance in m by which the first pad in `WALLS` lies farther
+#:   out than the second pad
 #: - `lever_<axis>`: lever arm of the sensor in m
 #: - `filter`: squared time constant of the sensor's low pass in s2
 TURNS, LEVER, LAG = slice(0, 4), slice(4, 6), 6

@@ -63,7 +63,7 @@ class Followed:
 
 @dataclass(frozen=True)
 class TakenOver:
-    """An estimate, the time in s at which it was finished, and whether the twins were then drawn from it (`taken`)."""
+    """An estimate and the time in s at which it was finished; `taken` states whether it replaced the twins."""
 
     t: float
     estimate: Estimate

@@ -154,9 +154,7 @@ class ForceEnsemble:
 
 
 def quantiles(values: Array) -> Array:
-    """Return the nearest-rank quantiles over the first axis of values that are not negative, in the order of
-    `POINTS`.
-    """
+    """Return the nearest-rank quantiles of non-negative values over the first axis, in the order of `POINTS`."""
     places = [min(int(share * len(values)), len(values) - 1) for share in POINTS]
     out = np.zeros((len(POINTS), *values.shape[1:]))
     # in most pairs the forces of all members are 0, so their quantiles are 0 without sorting

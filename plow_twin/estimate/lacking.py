@@ -34,8 +34,8 @@ def with_harmonics(
     """Return a fit that includes harmonics of the measured load `felt`, and its verdict.
 
     The result is None if the load is not periodic, if swings are linked, if the motion cannot be simulated, or if a
-    check fails. The checks are made after each stage, because a fit of whole swings, which is much more expensive,
-    would fail too.
+    check fails. The checks are made after each stage. If a stage fails a check, the fit of whole swings would fail too,
+    at a higher cost.
     """
     harmonics, poses = Harmonics.of(felt), problem.window.poses
     if harmonics is None or len(problem.link):

@@ -2,7 +2,7 @@
 
 Motions are drawn and simulated under each law. Their features are modelled as a polynomial of the drawn parameters plus
 normal noise (synthetic likelihood: Wood, Nature 466 (2010) 1102). The likelihood is integrated over the parameters with
-Laplace's method, and the ratio of the two integrals is the odds.
+Laplace's method, and the odds are the ratio of the two integrals.
 """
 
 from __future__ import annotations

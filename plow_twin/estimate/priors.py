@@ -25,7 +25,7 @@ DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
     "exponent": {Mark.GIVEN: 0.07, Mark.MEASURED: 0.03, Mark.RECONSTRUCTED: 0.07, Mark.ASSUMED: 0.07},
     "friction": {Mark.GIVEN: 0.05, Mark.MEASURED: 0.02, Mark.RECONSTRUCTED: 0.05, Mark.ASSUMED: 0.05},
 }
-#: Prior of the radius of the frame's corners if the scene states no radius: scale in m of a half-normal distribution.
+#: Scale in m of the half-normal prior of the corner radius, which is used if the scene states no radius.
 ROUNDING: Final = 3e-3
 #: Prior standard deviations of a sensor's scale factors of x, y and theta. The deviation for theta is larger, because
 #: an angle is often computed from two distances.

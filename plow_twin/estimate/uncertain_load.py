@@ -26,7 +26,7 @@ from plow_twin.model import geometry
 
 Array = NDArray[np.float64]
 
-#: Interval between the knots of the load's error, as a share of the shortest correlation time from which it is derived.
+#: Interval between the knots of the load's error, derived as a share of the error's shortest correlation time.
 _KNOTS = 1.0 / 3.0
 #: Interval [s] between the knots of the load between samples, derived as half the period of a soft contact (20 Hz).
 _KNOT = 0.025

@@ -108,8 +108,8 @@ LEAST_CLEARANCE: Final = 5e-4
 #: Alternative of a contact law, which is tested if the contact is linear (exponent 1).
 OTHER_LAW: Final = {"hunt_crossley": "kelvin_voigt"}
 
-#: Lower bound on a prior standard deviation. It is so small that a number with the stated deviation 0 does not change
-#: in the fit.
+#: Lower bound on a prior standard deviation. With this deviation, a number that is stated as exact hardly changes in
+#: the fit.
 _HELD = 1e-6
 #: Upper bound on the prior deviation of a load gain.
 _MOST_GAIN = 1.0

@@ -112,7 +112,8 @@ class Worker:
         self._closed = threading.Event()
         #: reason why the process has ended; empty while it runs
         self.error = ""
-        #: None until the estimate that `finish` requests is done; then an empty text, or the reason why there is none
+        #: None until the estimate that `finish` requests is done, then an empty text; without such an estimate, the
+        #: reason
         self.ended: str | None = None
         self._thread = threading.Thread(target=self._send_queue, name="estimate", daemon=True)
         self._thread.start()

@@ -165,7 +165,8 @@ class Driver:
     def series(
         self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], now_ns: int
     ) -> Iterator[Published | Series]:
-        """Use many samples, stamps (n,) [ns] and wrenches (n, 3), with the same motion and publications as `samples`.
+        """Use n samples with the same results as `samples`, but faster; `stamps` [ns] has the shape (n,), `wrench` (n,
+        3).
 
         Plausible samples are applied together and yielded as a `Series`. The caller must journal and publish the series
         before it requests the next item. All other samples are processed as in `samples`.

@@ -42,9 +42,9 @@ class Verdict(Enum):
     UNSTAMPED = "unstamped"
     DUPLICATE = "duplicate"
     OUT_OF_ORDER = "out_of_order"
-    #: older than the time reached by the model and than all stored states, so the sample cannot be inserted
+    #: older than all stored states of the model, so the sample cannot be inserted
     LATE = "late"
-    #: older than the time reached by the model, and inserted at its place in time
+    #: older than the time reached by the model, and inserted into the motion at its stamp
     WORKED_IN = "worked_in"
     #: a value or its rate of change exceeds the `Limits`
     IMPLAUSIBLE = "implausible"

@@ -119,7 +119,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Parameter:
-    """Change of the parameter `name`, which affects the model, to `value`."""
+    """New value of a parameter that affects the model."""
 
     name: str
     value: ParameterValue

@@ -493,7 +493,7 @@ class Session:
         )
         travels = b"".join(_TRAVEL.pack(travel.stamp_ns, travel.speed_m_s) for travel in self._travels)
         stamp_ns = self.stamp_ns if self.stamp_ns is not None else self.origin_ns or 0
-        # changes of the scene are appended last, and only if there are any
+        # changes of the scene are appended last, because `_split_twin` finds the changes after the data of the twin
         changes = json.dumps(self.changes).encode() if self.changes else b""
         data = header + travels + self.wear_depth.tobytes() + self.outputs.state() + self.twin.snapshot() + changes
         return Snapshot(stamp_ns, data)

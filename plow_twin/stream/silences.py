@@ -34,8 +34,8 @@ class Silences:
     def add(self, stamps_ns: Indexes) -> list[tuple[int, int, int]]:
         """Add the stamps of samples, shape (n,) [ns]; return the silences that end at these samples.
 
-        A silence is returned as the index of the sample at its end, its begin [ns] and its end [ns]. A sample that is
-        older than the newest stamp does not end a silence.
+        Each silence is a tuple of the index of the sample that ends it, its begin [ns] and its end [ns]. A sample that
+        is older than the newest stamp does not end a silence.
         """
         if not len(stamps_ns):
             return []
