@@ -328,9 +328,9 @@ def under_uncertain_load(
     """Return an estimate whose withdrawn clearances are replaced by values that allow for errors of the load.
 
     The values come from a comparison with motions under uncertain loads. `result` is the estimate under the measured
-    load. It is returned without new clearances if it contains a clearance, or if the comparison gives none. `fitted` is
-    a fit that failed a check and may have converged to a false optimum. A clearance of the fit that agrees with the
-    comparison is combined with it.
+    load. It is returned without new clearances if it contains a clearance, or if the comparison gives no clearance.
+    `fitted` is a fit that failed a check and may have converged to a false optimum. A clearance of the fit that agrees
+    with the comparison is combined with it.
     """
     if _known(result) or felt.interval() > tuning.COARSEST:
         return result
@@ -420,8 +420,8 @@ def _with_apparent(result: Estimate, apparent: tuple[Interval, ...]) -> Estimate
 def _with_differences(
     found: tuple[Problem, Fit], verdict: Verdict, period: float
 ) -> tuple[tuple[Problem, Fit], Verdict]:
-    """Return a fit that includes differences of walls and sensor, if the fit without them fails or gives evidence of
-    them.
+    """Return a fit that includes differences of walls and sensor, if the fit without differences fails or gives
+    evidence of differences.
 
     Without the differences, a wall whose two pads differ by 1.2 mm makes the clearance 0.2 mm too small.
     """

@@ -99,7 +99,7 @@ class Window:
 
 @dataclass(eq=False)
 class Point:
-    """Values of all unknowns, and the motion that follows from them.
+    """Values of all unknowns, and the motion that follows from the unknowns.
 
     shared, states : (SIZE,), (s, 6) unknowns of the whole window, and starting states of the swings
     swing : (n,) index of the swing of each pose, -1 outside all swings

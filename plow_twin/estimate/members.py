@@ -131,7 +131,7 @@ class Ensemble:
         self._path: deque[tuple[float, Array]] = deque([(start, np.tile(np.array(scene.initial.q), (members, 1)))])
         self._v, self.worn = np.tile(np.array(scene.initial.v), (members, 1)), np.tile(worn, (members, 1))
         self._depth = self._penetration(self._path[-1][1])
-        #: newest rows of all members, until `settle` copies from them
+        #: newest rows of all members, from which `settle` copies the state
         self._newest: Rows | None = None
 
     @property

@@ -144,8 +144,8 @@ class Driver:
     def samples(self, arrived: Iterable[Arrival], now_ns: int) -> Iterator[Published]:
         """Judge samples in order of arrival, advance to the accepted samples, and yield the publications.
 
-        The caller must send each publication before it requests the next publication, so that a recording contains them
-        in order. A sample whose stamp jumps waits until the next sample arrives or a silence begins.
+        The caller must send each publication before it requests the next publication, so that a recording contains the
+        publications in order. A sample whose stamp jumps waits until the next sample arrives or a silence begins.
         """
         run: list[Sample] = []
         for stamp_ns, wrench in arrived:

@@ -231,7 +231,7 @@ class Outputs:
         return Published(chosen, self._slow(chosen))
 
     def pop(self) -> Published:
-        """Publish all advances since the previous publication; `NOTHING` if there are none."""
+        """Publish all advances since the previous publication; `NOTHING` without such advances."""
         if not self._waits:
             return NOTHING
         rows, self._waits = self._stock.new(1), 0
