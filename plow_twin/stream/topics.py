@@ -17,7 +17,7 @@ from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES, SLOW, Published
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 STATUS: Final = "diagnostic_msgs/msg/DiagnosticStatus"
-#: Depth of a publisher's history. With 1 kHz, a subscriber that reads once per second misses no message.
+#: Depth of a publisher's history. At 1 kHz, a subscriber that reads once per second misses no message.
 _DEPTH: Final = 1000
 
 
