@@ -39,7 +39,7 @@ class History:
         self._samples: list[Sample] = []
         self._stamps_ns: list[int] = []
         self._travels: list[Travel] = []
-        #: stamps of the first samples after a held load
+        #: stamps of the first samples after held loads [ns]
         self._resumed_ns: list[int] = []
         #: applied samples as arrays, which `_make_samples` converts to `Sample` objects when they are needed
         self._later: deque[tuple[NDArray[np.int64], NDArray[np.float64]]] = deque()
@@ -161,15 +161,15 @@ class History:
             self._keep(np.array([stamp_ns]))
 
     def add_resumed(self, stamp_ns: int) -> None:
-        """Note the stamp of the first sample after a held load."""
+        """Store the stamp of the first sample after a held load."""
         if self._span_ns:
             self._resumed_ns = [*(found for found in self._resumed_ns if found > self._kept_ns[0]), stamp_ns]
 
     def correction_limit_ns(self, stamp_ns: int) -> int:
-        """Return the stamp [ns] before which no correction may begin that inserts a sample at `stamp_ns`.
+        """Return the earliest stamp [ns] at which a correction may begin if it inserts a sample at `stamp_ns`.
 
-        The samples that `rewind` returns do not contain the hold before a sample, so a correction that began before the
-        hold would lose it.
+        The samples that `rewind` returns do not contain the held load before a sample. A correction that began before
+        the held load would therefore lose the held load.
         """
         place = bisect_left(self._resumed_ns, stamp_ns)
         return max(self._resumed_ns[place - 1] if place else 0, self.oldest_ns or 0)
