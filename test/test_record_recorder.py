@@ -1,4 +1,4 @@
-"""The recorder under stress: killed, overrun, with a full disk, and not closed. Losses are counted."""
+"""The recorder under stress: killed, overrun, on a full disk, and not closed. All losses are counted."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ from plow_twin.stream.session import Session
 HEADER = RunHeader("version: 1")
 TOPIC = "/contact_forces"
 
-#: A program that writes a journal at 1 kHz and reports each sample when the recorder has it. Its arguments are the
-#: folder, the limit of a file's size, the number of samples, and the recorder's options as JSON.
+#: Program that writes a journal at 1 kHz and prints the time of each sample that the recorder accepts. Its arguments
+#: are the folder, the largest size of a file, the number of samples, and the recorder's options as JSON.
 WRITER = """
     import json, os, sys, time
     import numpy as np
@@ -95,8 +95,8 @@ def joint_state(index: int) -> JointState:
     return JointState(BASE_NS + index * STEP_NS, "slide_frame", PAIR_NAMES, values, values, values)
 
 
-#: A program that reads lines `folder flush_period`. For each line it forks a writer, and prints the writer's process id
-#: and its end.
+#: Program that reads lines `folder flush_period`. For each line it forks a writer, and prints its process id and its
+#: end.
 FORKS = """
     import json, os, sys
     import plow_twin.record.writer, mcap.writer, rosbags.typesys, lz4.frame, zstandard
@@ -118,7 +118,7 @@ FORKS = """
 
 
 def kill_writers(folders: Iterable[Path], rng: random.Random, flush_s: float, longest_s: float) -> None:
-    """Kill writers at random moments, and check that only items since the last flush are lost."""
+    """Kill writers at random times, and check that only items since the last flush are lost."""
     command = [sys.executable, "-c", textwrap.dedent(FORKS) + textwrap.dedent(WRITER)]
     with started(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdin is not None and process.stdout is not None
@@ -129,7 +129,7 @@ def kill_writers(folders: Iterable[Path], rng: random.Random, flush_s: float, lo
             lines = [process.stdout.readline()]  # this line shows that the writer has begun to write
             killer = threading.Timer(rng.uniform(0.0, longest_s), os.kill, [child, signal.SIGKILL])
             killer.start()
-            for line in process.stdout:  # lines are read all the time, so that the pipe never fills up
+            for line in process.stdout:  # the lines are read continuously, so that the pipe does not become full
                 if line.endswith("end\n"):
                     break
                 lines.append(line)
@@ -150,8 +150,8 @@ def check_killed(folder: Path, lines: list[str], flush_s: float) -> None:
     messages = [r.message() for r in records if isinstance(r, OutputRecord)]
     assert [m.stamp_ns for m in messages] == [BASE_NS + index * STEP_NS for index in range(len(messages))]
     assert len(messages) <= len(stamps) <= last_index + 2
-    # The file has the entries up to one flush period before the kill, and the messages up to two periods before,
-    # because the journal's chunk is written first. The allowance is for the machine, not for the recorder.
+    # The file contains the entries up to one flush period before the kill, and the messages up to two periods before,
+    # because the chunk of the journal is written first. The tolerance is for delays of a busy machine.
     first_ns = int(lines[0].split()[1])
     for kind, periods in ((EntryRecord, 1), (OutputRecord, 2)):
         newest_ns = max((r.log_time_ns for r in records if isinstance(r, kind)), default=first_ns)
@@ -187,7 +187,7 @@ def test_a_full_queue_is_counted_and_noted_in_the_file(tmp_path: Path) -> None:
     assert loss.closed and loss.error is None
     assert loss.lost[JOURNAL] > 0 and loss.lost[TOPIC] > 0 and taken["snapshot"] > 0
     assert len(kept_messages) + loss.lost[TOPIC] == 4000
-    # the lost entries may include refused snapshots, so the sum may be larger
+    # refused snapshots may be among the lost entries, so the sum may be larger
     assert len(kept_samples) + loss.lost[JOURNAL] >= 4000
 
     reader = RunReader(tmp_path / "run")
@@ -197,12 +197,12 @@ def test_a_full_queue_is_counted_and_noted_in_the_file(tmp_path: Path) -> None:
     assert [r.publish_time_ns for r in records if isinstance(r, OutputRecord)] == kept_messages
     assert sum(entry.count for entry in entries if isinstance(entry, Loss)) == loss.lost[JOURNAL]
     assert sum(entry.count for entry in entries if isinstance(entry, Dropped)) == loss.lost[TOPIC]
-    # notes of lost messages are left out, because they may come between the note of a lost entry and the snapshot
+    # notes of lost messages may be between the note of a lost entry and the snapshot, so they are removed
     told = [entry for entry in entries if not isinstance(entry, Dropped)]
     for entry, following in itertools.pairwise(told):
         assert not isinstance(entry, Loss) or isinstance(following, Snapshot)
     assert reader.lost == dict(loss.lost)
-    # the notes remain if the process is killed
+    # the notes remain in the file if the process is killed
     data = reader.path.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: data.index(LOSS_RECORD.encode())])
     cut = RunReader(tmp_path / "cut.mcap")
@@ -253,7 +253,7 @@ def test_little_free_space_ends_a_recording_that_can_be_read(tmp_path: Path) -> 
 
 
 def record_around_a_pause(folder: Path, stop: Callable[[], object], go_on: Callable[[], object]) -> Recorder:
-    """Record a twin; the disk fails half way and recovers."""
+    """Record a twin. The disk fails in the middle of the run and recovers."""
     scene = load_scene(scene_path("paper"))
     recorder = Recorder(folder, RunHeader(dump_scene(scene)), flush_period_s=0.02, min_free_bytes=1)
     session = Session(Twin(scene, excitation="sampled"), on_entry=recorder.journal)
@@ -353,7 +353,7 @@ def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(
     dump = RingWriter.dump
 
     def dump_after_another(ring: RingWriter, folder: Path, loss: Mapping[str, int]) -> None:
-        if folder.name == "ring_2":  # another process makes this folder just before the ring makes it
+        if folder.name == "ring_2":  # another process creates this folder just before the ring does
             Recorder(folder, HEADER).close()
         dump(ring, folder, loss)
 
@@ -388,8 +388,9 @@ def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(
     for path in written:
         report = replay(path)
         assert (report.exit_code, report.divergences) == (0, 0) and report.messages_compared
-        assert 0.02 < report.span_s < 0.7 * index * 1e-3  # on a busy machine few samples arrive within the ring's 0.4 s
-    # no sample is in both recordings
+        # on a busy machine, few samples arrive in the 0.4 s of the ring
+        assert 0.02 < report.span_s < 0.7 * index * 1e-3
+    # the two recordings have no sample in common
     stamps = [
         {int(stamp) for batch in RunReader(path).batches() for stamp in batch.entries.stamp_ns[batch.entries.sample]}
         for path in written
@@ -404,7 +405,7 @@ def test_losses_of_callers_do_not_disturb_the_closing_of_the_file(
 
     def close_among_callers(writer: RunWriter, loss: Mapping[str, int], *reason: str | None) -> None:
         before = dict(loss)
-        # this call would wait for ever if `close` held the lock
+        # this call would wait without limit if `close` held the lock
         assert not recorder.output("/late", BASE_NS, joint_state(0))
         assert dict(loss) == before
         close(writer, loss, *reason)
@@ -446,7 +447,7 @@ def test_closing_waits_while_items_are_written_and_then_says_what_is_missing(
     write, stuck = RunWriter.write_samples, threading.Event()
 
     def slowly(writer: RunWriter, *given: Any) -> None:
-        if len(given[0]) == 1:  # only the last sample comes alone; writing it hangs
+        if len(given[0]) == 1:  # only the last sample arrives alone, and writing it blocks
             stuck.wait(60.0)
         time.sleep(0.3)
         write(writer, *given)
@@ -457,7 +458,7 @@ def test_closing_waits_while_items_are_written_and_then_says_what_is_missing(
         recorder = Recorder(tmp_path / f"run{count}", HEADER)
         for index in range(count):
             assert recorder.journal(paper_sample(index))
-        # writing one burst takes 0.3 s, which is in time; five bursts take 1.5 s, which is too long
+        # writing one burst takes 0.3 s, which is fast enough; five bursts take 1.5 s, which is too long
         report = recorder.close(timeout_s=0.6)
         assert report.complete == (count == 50)
     sentence = report.sentence(tmp_path / "run51")
@@ -481,7 +482,7 @@ def test_of_recorders_that_want_one_folder_each_gets_its_own(tmp_path: Path, mon
     def make(folder: Path) -> Recorder:
         if not quicker:
             quicker.append(Recorder(folder, HEADER))
-        elif len(quicker) == 1:  # this folder existed before and was empty, so it counts as free
+        elif len(quicker) == 1:  # this folder existed before and was empty, so the recorder may use it
             monkeypatch.setattr("plow_twin.record.writer._is_free", lambda folder: True)
             quicker.append(Recorder(folder, HEADER))
         else:
@@ -508,7 +509,7 @@ def test_a_message_of_another_type_stops_the_recording_with_its_topic(tmp_path: 
     assert loss.error is not None and TOPIC in loss.error and not loss.closed
 
 
-#: Code that logs each wait for the disk with path and size.
+#: Code that logs the path and the size at each sync to the disk.
 SYNCS = """
     import os, time
     def note(wait):
@@ -540,7 +541,7 @@ def test_with_sync_flushed_data_survive_a_loss_of_power(tmp_path: Path) -> None:
                 before = index if flushes == 3 else before
             if flushes == 5:
                 process.kill()
-    # a loss of power may leave only what was synced, so the file is cut to that size
+    # a loss of power may leave only the synced data, so the file is truncated to the synced size
     assert {str(folder), str(tmp_path)} <= {path for path, _ in synced}
     os.truncate(file, max(size for path, size in synced if path == str(file)))
     reader = RunReader(folder)

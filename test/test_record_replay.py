@@ -1,4 +1,4 @@
-"""A replay computes: the same run gives the same bits, and any change of a recording is found where it is."""
+"""Replay: the same run gives bit-identical results, and any change of a recording is located."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ SAMPLES = "/plow_twin/journal/samples"
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Return a run of 2.5 s under the paper's load without a break, with only samples, each followed by a frame."""
+    """Return a run of 2.5 s under the paper's load: samples only, each followed by outputs."""
     return record_run(tmp_path_factory.mktemp("runs") / "paper", map(paper_sample, range(COUNT)))
 
 
 def flip_sample(index: int, bit: int) -> Any:
-    """Flip one bit of Fx in the sample with a given index."""
+    """Return a function that flips one bit of Fx in the sample with a given index."""
 
     def change(topic: str, message: Any) -> bytes | None:
         if topic != SAMPLES or message.publish_time != BASE_NS + index * STEP_NS:
@@ -84,7 +84,7 @@ def test_the_same_build_gives_the_same_bits(frame_every: int, tmp_path: Path) ->
     assert report.entries == len(run.entries)
     assert (report.samples, report.steps) == (COUNT, COUNT + 1)
     assert shares == sorted(shares) and shares[-1] == 1.0
-    # the run is worth comparing, because there was contact
+    # the comparison is meaningful, because contacts occur
     assert max(m.effort.max() for _, m in run.outputs if isinstance(m, JointState) and m.effort.size) > 1e4
 
 
@@ -170,7 +170,7 @@ def test_outputs_in_another_order_are_compared_all_the_same(run: Run, tmp_path: 
 
 
 def test_a_missing_sample_diverges(run: Run, tmp_path: Path) -> None:
-    """A sample repeats the stamp of the previous one, so the model cannot reach the recorded messages."""
+    """A sample has the stamp of the previous sample, so the model cannot reach the recorded messages."""
 
     def change(topic: str, message: Any) -> bytes | None:
         if topic != SAMPLES or message.publish_time != BASE_NS + 900 * STEP_NS:
@@ -195,11 +195,10 @@ def test_a_cut_file_is_replayed_as_far_as_it_goes(run: Run, tmp_path: Path) -> N
 def test_after_a_damaged_chunk_nothing_is_claimed(run: Run, tmp_path: Path) -> None:
     spans = chunk_spans(run.file)
     lost_entries = lost_messages = False
-    for start, length in spans:  # these are the chunks of the journal, and of the sent messages
+    for start, length in spans:  # the chunks of the journal and of the outputs
         data = bytearray(run.file.read_bytes())
         middle = start + length // 2
-        # in compressed data, one flipped bit may make a reference point to equal bytes and change nothing, so several
-        # bytes are changed
+        # several bytes are changed, because a single flipped bit in compressed data may have no effect
         data[middle : middle + 8] = bytes(byte ^ 0xFF for byte in data[middle : middle + 8])
         damaged = tmp_path / "damaged.mcap"
         damaged.write_bytes(data)
@@ -214,7 +213,7 @@ def test_replay_goes_on_from_the_snapshot_after_a_loss(tmp_path: Path) -> None:
     def rush_then_walk() -> Iterator[Sample]:
         for index in range(COUNT):
             if index > COUNT // 2 and index % 10 == 0:
-                time.sleep(0.03)  # the queue empties, so the recording is complete from here on
+                time.sleep(0.03)  # in the pause, the queue is emptied, so the recording is complete from here on
             yield paper_sample(index)
 
     run = record_run(tmp_path / "run", rush_then_walk(), queue_size=150, pause_every=0)
@@ -293,8 +292,7 @@ def test_digests_do_not_break_a_run_of_samples(run: Run, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(Session, "advance", counted)
     assert replay(run.folder).exit_code == 0
-    # a digest follows every hundred samples, but does not split the calls: after the first call, which warms up, each
-    # call processes thousands of samples
+    # a digest follows every hundred samples, but the calls process thousands of samples after the first call
     assert sum(calls) == COUNT + 2 and len(calls) <= 4
 
 

@@ -1,4 +1,4 @@
-"""A wrong unit is detected by magnitude and rate, and named; a stated unit and an unusual machine are accepted."""
+"""A wrong unit is detected from magnitude and rate, and named. Stated units and unusual machines are accepted."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_wrong_unit_is_refused_with_the_option_that_states_it(
     stated = [part for option in options for part in ("--unit", option)]
     for option in options:
         assert f"--unit {option}" in said
-    assert not (tmp_path / "run").exists()  # a refused start leaves no empty run
+    assert not (tmp_path / "run").exists()  # no empty run remains of a refused start
     assert cli([*command, *stated]) == 0
 
 
@@ -70,11 +70,12 @@ def test_an_estimate_refuses_millimetres_for_metres(tmp_path: Path, capsys: pyte
 
 
 def test_a_swing_that_the_clearance_does_not_allow_is_in_degrees() -> None:
-    angle = largest_angle(SCENE)  # at this angle the frame of 0.33 m by 0.27 m touches both walls
+    angle = largest_angle(SCENE)  # at this angle, the frame of 0.33 m by 0.27 m touches both walls
     reach = 0.33 * np.sin(angle) + 0.27 * np.cos(angle), 0.33 * np.cos(angle) + 0.27 * np.sin(angle)
     assert min(0.30 - reach[0], 0.355 - reach[1]) == pytest.approx(0.0, abs=1e-4)
     for swing, likely in ((0.25, []), (0.6, ["deg"]), (6.0, ["deg"])):
         for offset in (0.0, 0.1):  # the sensor's zero may be off, which must not change the verdict
+            # an offset of the sensor's zero must not change the verdict
             theta = {("head_pose", "theta"): offset + swing * np.sin(2.0 * TIMES)}
             assert [doubt.likely for doubt in unit_doubts(theta, TIMES, SCENE)] == likely
 

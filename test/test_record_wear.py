@@ -1,4 +1,4 @@
-"""The wear of the pads on disk: written completely or not at all, for one head and one scene."""
+"""The wear of the pads on disk: written atomically, for one head and one scene."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _loaded(folder: Path, head: str, scene: Scene) -> tuple[float, ...] | None:
 
 
 def _saved(keeper: WearKeeper, depth: np.ndarray) -> str:
-    """Save depths and wait until they are saved; return the error."""
+    """Save depths, and wait until they are on disk. Return the error."""
     keeper.save(depth)
     assert keeper._writing is not None
     keeper._writing.result()
@@ -54,7 +54,7 @@ def test_saved_wear_is_loaded_to_the_bit_and_no_other_file_stays_behind(tmp_path
     _save(folder)
     assert _loaded(folder, "head 7", SCENE) == DEPTH
     assert os.listdir(folder) == [FILE_NAME]
-    # the wear is kept for a scene with other loads, because loads do not concern the pads
+    # the wear is also valid for a scene with other loads
     assert _loaded(folder, "head 7", replace(SCENE, loads=())) == DEPTH
 
 
@@ -87,7 +87,7 @@ def test_two_twins_do_not_keep_their_wear_in_one_folder(tmp_path: Path) -> None:
     first.close(np.array(DEPTH))
     second = WearKeeper(tmp_path / "wear", "head 7", SCENE)
     assert second.load() == DEPTH
-    second.release()  # a configuration that fails also releases the folder
+    second.release()  # a failed configuration releases the folder too
     WearKeeper(tmp_path / "wear", "head 7", SCENE).release()
     assert os.listdir(tmp_path / "wear") == [FILE_NAME]
 
@@ -107,7 +107,7 @@ def test_a_disk_that_takes_nothing_leaves_the_old_file(tmp_path: Path, monkeypat
 
 
 def test_a_file_that_came_while_the_twin_ran_is_left_as_it_is(tmp_path: Path) -> None:
-    # a volume that is mounted late replaces the folder by another folder, which has earlier wear
+    # a volume that is mounted late replaces the folder by another folder with earlier wear
     folder, volume = tmp_path / "wear", tmp_path / "volume"
     volume.mkdir()
     path = _save(volume)
@@ -162,7 +162,7 @@ def test_wear_that_could_not_be_saved_goes_on_unless_the_file_is_another_one(
 
         def fail(descriptor: int) -> None:
             calls.append(descriptor)
-            # either the sync of the file fails, or the sync of the folder, when the new file already exists
+            # the first sync is that of the file, the second is that of the folder with the new file
             if len(calls) == 1 + waited:
                 raise OSError(28, "No space left on device")
 

@@ -1,4 +1,4 @@
-"""The main task as a user starts it, live: publisher and node as processes, with a summary of the recording."""
+"""The demo as a user starts it: publisher and node as processes, and a summary of the recording."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ def test_the_processes_of_the_demo_end_with_it_however_it_ends(tmp_path: Path) -
     )
     done = subprocess.run([sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, timeout=110)
     child, give_up = Path("/proc", done.stdout.strip(), "cmdline"), time.monotonic() + 60.0
-    # the child has ended when its command line is empty (a zombie) or absent
+    # the child has ended if its command line is empty (a zombie) or absent
     while child.exists() and child.read_bytes():
         assert time.monotonic() < give_up
         time.sleep(0.05)
 
 
-# CI runs the fast form as a step of its own
+# CI has a separate step for the speed `fast`
 @pytest.mark.parametrize("speed", ["real", pytest.param("fast", marks=pytest.mark.stress)])
 def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> None:
     done = _demo(tmp_path, "--speed", speed, "--seconds", "3")
@@ -68,7 +68,7 @@ def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> No
     ):
         assert line in done.stdout, done.stdout
     if speed == "fast":
-        # the printed command works in this folder, without the environment on PATH
+        # the printed command works in this folder, although the environment is not on PATH
         (again,) = (line.partition(":  ")[2] for line in done.stdout.splitlines() if "again, bit for bit" in line)
         bare = dict(os.environ) | {"PATH": "/usr/bin:/bin"}
         assert subprocess.run(again, shell=True, cwd=ROOT, env=bare, capture_output=True, timeout=100).returncode == 0
@@ -81,7 +81,7 @@ def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> No
     assert json.loads((folder / "publisher.log").read_text().splitlines()[-1])["stalls"] == 0
     assert "Traceback" not in (folder / "node.log").read_text()
 
-    # the summary is compared with the twin itself
+    # the summary is compared with a twin in this process
     scene = load_scene(folder / "scene.yaml")
     times = np.arange(3000) * 1e-3
     series = Twin(scene, excitation="sampled").advance_samples(times, compile_loads(scene.loads).at(times))
@@ -101,7 +101,7 @@ def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> No
 def test_the_demo_takes_no_sample_before_the_estimator_is_compiled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The processes are simulated: each look at the reports brings the next report."""
+    """The processes are simulated: each read of the diagnostics returns the next report."""
     watch, seen = Watch(), list[str]()
     reports = iter([
         {"state": {"lifecycle": "active"}, "estimate": {"ready": "0"}}, {"estimate": {"ready": "0"}},
@@ -134,7 +134,7 @@ def test_forces_are_compared_with_the_machine_s_and_the_time_of_each_estimate_is
     beside = compare_forces(record_run(tmp_path / "run", entries).folder, 1.5e-3)
     assert beside is not None
     assert beside.estimates_s == pytest.approx([1.499])
-    # this run does not follow the machine, so its forces are those of the nominal model
+    # the twin of this run does not follow its machine, so its forces are those of the nominal model
     assert beside.error["followed"] == pytest.approx(beside.error["nominal"], rel=1e-3)
     assert beside.error["nominal"] > 0.02
 

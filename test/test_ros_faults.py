@@ -63,7 +63,7 @@ def _accounted(figures: dict[str, str]) -> int:
 
 
 def _until_accounted(running: Bench, sent: int) -> dict[str, str]:
-    """Wait until all sent samples are accounted for; a later sample reveals a loss at the very end."""
+    """Wait until all sent samples are accounted for. A later sample reveals the loss of the last samples."""
     figures: dict[str, str] = {}
 
     def reached() -> bool:
@@ -89,7 +89,7 @@ def test_late_samples_of_a_publisher_that_was_stopped_are_used(tmp_path: Path) -
         running.probe.pause(2.0)
         publisher.send_signal(signal.SIGCONT)
         figures = _until_accounted(running, _sent(publisher))
-        # the publisher's own queue may lose some of the samples that it sends at once, so losses are counted too
+        # the publisher's own queue may lose samples that are sent at the same time, so losses are counted too
         assert int(figures["samples_used"]) + int(figures["samples_lost"]) == 4000
         assert int(figures["rolled_back"]) > 0
 
@@ -121,13 +121,13 @@ def test_a_paused_node_counts_the_overrun_of_its_queue_and_continues(tmp_path: P
 
 
 def test_outputs_come_in_time_while_samples_come_ten_times_as_fast(tmp_path: Path) -> None:
-    # with a best-effort reader a loss at the very end would never show, so the reader is reliable
+    # a best-effort subscriber would not detect the loss of the last samples, so the subscriber is reliable
     settings = {"publish_mode": "fixed_rate", "publish_rate": 100.0, "input_depth": 20000}
     with bench(tmp_path, **settings, **RELIABLE_INPUT) as running:
         publisher = running.publisher("--rate", "10000", "--seconds", "5")
         _until_accounted(running, _sent(publisher))
-        # an executor that checks its timers only when no message waits would send 23 of 500 due messages; at this rate
-        # even such an executor sometimes finds an empty queue, so test_ros_runtime keeps the queue full
+        # an executor that serves timers only when no message waits would send 23 of 500 messages; test_ros_runtime
+        # keeps the queue full, because at this rate the queue is sometimes empty
         figures = running.probe.figures("output")
         assert int(figures["published"]) - int(figures["held"]) > 60
 
@@ -161,8 +161,7 @@ def test_a_disk_that_takes_no_more_stops_the_recording_and_not_the_twin(tmp_path
         # a write beyond this size fails, as on a full disk
         resource.prlimit(running.twin._process.pid, resource.RLIMIT_FSIZE, (200_000, 200_000))
         publisher = running.publisher("--rate", "1000", "--seconds", "120")
-        # on a busy machine other losses, which are errors too, may be reported earlier, so the recorder's error is
-        # awaited
+        # on a busy machine, other losses may be reported earlier, so the error of the recorder is awaited
         running.probe.until(lambda: running.probe.figures("recorder")["error"], "the full disk")
         running.probe.until(lambda: value(running.probe.status[-1], "recorder") == "trouble", "the full disk in status")
         assert running.probe.status[-1].level == b"\x02"
@@ -231,7 +230,7 @@ def test_damaged_bytes_on_every_input_are_counted_to_the_last_one(tmp_path: Path
         assert running.twin.stop() == 0
     report = replay(tmp_path / "run")
     assert report.exit_code == 0 and report.samples > 2900
-    # the counts in the file add up to the number of messages sent
+    # the sum of the counts in the file is the number of messages sent
     assert sum(report.inputs["tool_forces"].values()) == 3000
 
 
@@ -266,11 +265,11 @@ def test_a_clock_that_is_paused_looped_and_fast_moves_the_twin_with_its_samples(
         play(0, 500, 10)
         _until_accounted(running, 500)
         busy = psutil.Process(running.twin._process.pid).cpu_times()
-        probe.pause(3.0)  # while /clock stands still, everything stands still
+        probe.pause(3.0)  # while /clock stops, the twin must be idle
         idle = psutil.Process(running.twin._process.pid).cpu_times()
         assert (idle.user + idle.system) - (busy.user + busy.system) < 1.0
         play(500, 3000, 500)  # the clock advances in large steps
-        play(0, 500, 10)  # the clock starts from the beginning again
+        play(0, 500, 10)  # the clock restarts
         figures = _until_accounted(running, 3500)
         assert (figures["samples_used"], figures["holds"]) == ("3500", "0")
         assert probe.figures("state")["resets"] == "1"
@@ -294,14 +293,14 @@ def test_the_scene_s_loads_follow_a_clock_that_is_paused_looped_and_fast(tmp_pat
         reach(T0)
         reach(T0 + 20 * MS)
         count = len(forces)
-        for _ in range(3):  # while the clock is paused, three reports come and none shows motion
+        for _ in range(3):  # while the clock is paused, three reports arrive, and none contains motion
             probe.figures("output")
         assert len(forces) == count and probe.figures("state")["resets"] == "0"
-        # each message advances the clock by a second; the next is sent once this one is answered
+        # each message advances the clock by one second, and the next message waits for its answer
         for second in range(1, 8):
             reach(T0 + second * 1000 * MS)
         assert probe.figures("state")["resets"] == "0"
-        reach(T0)  # the clock starts from the beginning again
+        reach(T0)  # the clock restarts
         reach(T0 + 20 * MS)
         figures = probe.figures("state")
         assert (figures["resets"], figures["solver_failures"]) == ("1", "0")
@@ -341,7 +340,7 @@ def test_any_sequence_on_clock_is_survived_counted_and_repeated_by_the_journal(s
                 service = rng.choice(("reset", "set_wear", "snapshot", "restore", "mark"))
                 probe.call(Trigger, f"{running.namespace}/plow_twin/{service}", Trigger.Request())
             probe.pace(index)
-        # when the clock runs steadily again, the twin follows it again
+        # when the clock advances steadily again, the twin follows it again
         probe.pause(10.0)
         time_ns, count = T0, len(forces)
 
@@ -364,9 +363,9 @@ def test_any_sequence_on_clock_is_survived_counted_and_repeated_by_the_journal(s
 
 @pytest.fixture
 def stepped_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
-    """Give later processes a clock of their own; return a function that shifts this clock by seconds.
+    """Set a clock that only later processes use. Return a function that shifts this clock by seconds.
 
-    Only the system's clock is shifted; the steady clock continues, as with a step of NTP.
+    The system clock is shifted, but not the steady clock, as in a step of NTP.
     """
     compiler, library, offset = shutil.which("cc"), tmp_path / "stepped_clock.so", tmp_path / "offset"
     if compiler is None:
@@ -389,7 +388,7 @@ def test_steps_of_the_node_s_own_clock_stop_reset_and_lose_nothing(
 ) -> None:
     settings = {"record_path": tmp_path / "run", "excitation_timeout": 60.0, **RELIABLE_INPUT}
     with bench(tmp_path, **settings) as running:
-        # from here on new processes have the true clock; only the node has the shifted clock
+        # processes that start later have the true clock; only the node has the shifted clock
         monkeypatch.delenv("LD_PRELOAD")
         probe = running.probe
         send = probe.excitation()
@@ -402,8 +401,8 @@ def test_steps_of_the_node_s_own_clock_stop_reset_and_lose_nothing(
                 probe.pace(sent)
             figures = _until_accounted(running, sent)
             age_s = float(figures["newest_sample_age_s"]) - (time.time_ns() - T0 - sent * MS) * 1e-9
-            # the report's age is by the node's clock and therefore shows the step; on a busy machine the report may be
-            # read late
+            # the age in the report contains the shift of the node's clock; on a busy machine, the report may be read
+            # late
             assert abs(age_s - off_s) < 5.0
             assert (figures["samples_used"], figures["holds"]) == (str(sent), "0")
         found = probe.figures("state")
@@ -443,8 +442,7 @@ rclpy.spin(node)
 
 
 def test_a_subscriber_that_stands_still_does_not_hold_up_the_twin(tmp_path: Path) -> None:
-    # the queue has room for all samples, because on a busy machine the twin may stop for more than a second, which is
-    # not a loss here
+    # the queue is long enough for all samples, because on a busy machine the twin may pause for more than a second
     with bench(tmp_path, jump_forward=60.0, input_depth=10_000, **RELIABLE_INPUT) as running:
         slow = subprocess.Popen(
             [sys.executable, "-c", SUBSCRIBER.format(namespace=running.namespace)], stdout=subprocess.PIPE
@@ -527,7 +525,7 @@ def test_two_twins_in_one_process_do_not_disturb_each_other() -> None:
 
 def test_two_minutes_with_the_recorder_account_for_every_message_and_grow_by_nothing() -> None:
     command = [sys.executable, str(ROOT / "benchmark" / "live_load.py"), "--minutes", "2", "--rate", "500"]
-    # a ROS domain of its own, because other nodes publish reports too
+    # a separate ROS domain, because other nodes publish reports too
     environment = os.environ | {"ROS_DOMAIN_ID": "97"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=400.0)
     rows = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-# both packages belong to a sourced ROS 2, and neither is on PyPI
+# both packages are part of a ROS 2 installation and are not on PyPI
 pytest.importorskip("launch_testing")
 pytest.importorskip("launch_ros")
 
@@ -23,7 +23,7 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 
 from launch import LaunchDescription
 
-#: Time [s] that is long enough for the solver's first compilation on a slow machine.
+#: Time limit [s] that is sufficient for the first compilation of the solver on a slow machine.
 START_S = 200.0
 
 try:
@@ -34,7 +34,7 @@ except PackageNotFoundError:
 
 @pytest.mark.launch_test
 def generate_test_description() -> LaunchDescription:
-    """Start the twin as its users do."""
+    """Return a description that starts the twin as users start it."""
     twin = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(LAUNCH_FILE)), launch_arguments={"namespace": "launched"}.items()
     )

@@ -1,4 +1,4 @@
-"""Lifecycle and parameters, through the services that any manager uses."""
+"""Lifecycle and parameters through the services that each lifecycle manager uses."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ def _set(running: Bench, name: str, given: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def waiting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    """Yield a node for a manager to configure; without `autostart` it stays unconfigured."""
+    """Yield a node that waits for a manager: without `autostart`, it is unconfigured."""
     with bench(tmp_path_factory.mktemp("managed"), "unconfigured", autostart="false", file_root="/") as running:
         yield running
 
 
 @pytest.fixture
 def managed(waiting: Bench) -> Iterator[Bench]:
-    """Yield the same node, which is unconfigured and has its initial parameters before and after."""
+    """Yield this node in the state unconfigured, and restore its initial parameters after the test."""
     for name, given in (("scene", "paper"), ("record_path", ""), ("wear_state_path", "")):
         assert _set(waiting, name, given).successful
     yield waiting
@@ -155,7 +155,7 @@ def test_a_request_beside_a_cleanup_is_answered_and_the_node_lives(tmp_path: Pat
         running.probe.pause(0.5)
 
         def beside(transition: int) -> None:
-            """Send requests before and after a transition's request, faster than they are answered."""
+            """Send requests before and after the request for a transition, faster than they are answered."""
             request = ChangeState.Request(transition=Transition(id=transition))
             before = [one.call_async(Trigger.Request()) for one in asked]
             changed = change.call_async(request)
@@ -212,14 +212,14 @@ def test_arguments_that_ros_cannot_read_are_reported_without_a_traceback(tmp_pat
 def test_a_parameter_file_with_integers_for_doubles_and_a_typing_error(tmp_path: Path) -> None:
     path = tmp_path / "twin.yaml"
     path.write_text(yaml.safe_dump({"/**": {"ros__parameters": {"excitation_timeout": 2, "hold_polcy": "zero"}}}))
-    # YAML 1.1 reads 1e-8 as a text, so the tolerance comes as a text
+    # YAML 1.1 reads 1e-8 as a text, so the parameter is a text
     with bench(tmp_path, arguments=("--params-file", str(path)), tolerance="1e-8") as running:
         request = GetParameters.Request(names=["excitation_timeout", "tolerance"])
         service = f"{running.namespace}/plow_twin/get_parameters"
         found = running.probe.call(GetParameters, service, request).values
         assert [item.type for item in found] == [ParameterType.PARAMETER_DOUBLE] * 2
         assert [item.double_value for item in found] == [2.0, 1e-8]
-        # an active node accepts all of its own parameters again, without a change
+        # an active node accepts its present parameters again
         assert _set(running, "tolerance", 1e-8).successful and _set(running, "scene", "paper").successful
         assert not _set(running, "tolerance", 1e-7).successful
         assert "unknown parameter hold_polcy: 'zero' is not used; did you mean hold_policy?" in running.twin.output()
@@ -248,7 +248,7 @@ def active(tmp_path_factory: pytest.TempPathFactory) -> Any:
         ("tolerance", 1e-8, False),
         ("no_such_parameter", 1.0, False),
         ("hold_policy", "x" * 100_000, False),
-        # rclpy raises an error for both of these values
+        # for both of these values, rclpy raises an error
         ("failure_limit", ParameterValue(type=200), False),
         ("hold_policy", ParameterValue(type=ParameterType.PARAMETER_DOUBLE_ARRAY), False),
     ],
@@ -296,7 +296,7 @@ def test_the_model_changes_a_motion_comes_back_and_the_journal_gives_it_all_agai
         assert ask("snapshot").success
         first = feed(100)
         assert ask("restore").success
-        # the first sample after the restore gets the snapshot's time
+        # the first sample after the restore gets the time of the snapshot
         assert feed(101)[1:] == first
         answer = _set(running, "damping", 0.0)
         assert not answer.successful and "configure the node again" in answer.reason

@@ -1,4 +1,4 @@
-"""The node as its users run it, with real processes and real topics."""
+"""The node as users run it, with real processes and real topics."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ MS = 1_000_000
 PAPER = load_scene(scene_path("paper"))
 WEAR = Wear(coefficient_m2_n=1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0)
 
-#: Settings of a reliable input for tests that need all samples; on a busy machine a best-effort input may lose some.
+#: Settings for tests that need all samples. On a busy machine, a best-effort input may lose samples.
 RELIABLE_INPUT = {"qos_overrides.{ns}/excitation.subscription.reliability": "reliable"}
 
 
@@ -75,7 +75,7 @@ def _offline(scene: Scene, stamps: list[int], wrench: np.ndarray) -> AdvanceSeri
 
 def test_outputs_equal_an_offline_twin_on_the_same_samples_bit_for_bit(tmp_path: Path) -> None:
     scene = replace(PAPER, wear=WEAR)
-    # the queue has room for all samples, because a busy machine may read it less than once a second
+    # the queue is long enough for all samples, because a busy machine may read it less than once per second
     settings = {"expected_rate": 1000.0, "excitation_timeout": 60.0, "input_depth": 10_000, **RELIABLE_INPUT}
     with bench(tmp_path, scene=_scene_file(tmp_path, scene), **settings) as running:
         probe = running.probe
@@ -92,7 +92,7 @@ def test_outputs_equal_an_offline_twin_on_the_same_samples_bit_for_bit(tmp_path:
 
     stamps = [stamp_ns(message.header) for message in forces]
     assert (np.diff(stamps) == MS).all()
-    # the publisher's samples are the scene's loads on the grid
+    # the publisher sends the loads of the scene at the times of a grid
     wrench = compile_loads(scene.loads).at(np.arange(2000) * 1e-3)
     series = _offline(scene, stamps, wrench)
     assert tuple(forces[0].name) == PAIR_NAMES == tuple(peaks[0].name)
@@ -150,22 +150,22 @@ def test_at_a_fixed_rate_the_latency_includes_the_wait_for_the_publication(tmp_p
     ("mode", "rate"), [pytest.param("on_sample", 3000, marks=pytest.mark.stress), ("fixed_rate", 10000)]
 )
 def test_every_sample_sent_is_used_dropped_or_counted_as_lost(tmp_path: Path, mode: str, rate: int) -> None:
-    # the publisher may overrun any queue, so samples may be lost, but each of them is counted
+    # the publisher may overrun each queue, so samples may be lost, but each loss is counted
     with bench(tmp_path, publish_mode=mode, input_depth=200, excitation_timeout=60.0) as running:
         probe = running.probe
         publisher = running.publisher("--rate", str(rate), "--seconds", "1")
         probe.until(lambda: not publisher.running, "the end of the publisher", 100.0)
         sent = json.loads(publisher.output().splitlines()[-1])["sent"]
-        for _ in range(5):  # on a busy machine the last samples may still be on their way
+        for _ in range(5):  # on a busy machine, the last samples may still be in transit
             figures = probe.figures("input")
             counted = sum(int(count) for key, count in figures.items() if key.startswith("dropped_"))
             counted += int(figures["samples_used"]) + int(figures["samples_lost"])
             if counted == sent:
                 break
     assert sent == rate
-    # a loss at the very end would show only with the next sample, so it is not yet counted
+    # the loss of the last samples shows only at the next sample, so it is not counted yet
     assert 0 <= sent - counted <= 0.01 * sent
-    assert int(figures["samples_missing"]) == 0  # no sample counts as missing, because no rate is expected
+    assert int(figures["samples_missing"]) == 0  # no sample is missing, because no rate is expected
 
 
 @pytest.mark.stress
@@ -183,7 +183,9 @@ def test_an_overrun_of_the_queue_is_counted_as_loss_and_reported(tmp_path: Path)
         sent, figures = 1000, probe.figures("input")
 
         def accounted() -> bool:
-            """Send one more message, which reveals missing messages before it; a busy middleware may keep none."""
+            """Send one more message, which reveals missing messages before it. A busy middleware may lose many
+            messages.
+            """
             nonlocal sent
             send(T0 + sent * MS, (1.0, 2.0, 3.0))
             sent += 1
@@ -276,11 +278,11 @@ def test_an_alarm_stays_until_it_is_acknowledged_and_writes_the_time_before_it(t
             probe.pace(index)
         probe.until(lambda: alarms, "an alarm")
         assert alarms[0].level == b"\x01" and alarms[0].message.startswith("force ")
-        logged = "plow_twin]: " + alarms[0].message  # the alarm's text has value, pad, threshold and time
+        logged = "plow_twin]: " + alarms[0].message  # the text of the alarm contains value, pad, threshold and time
         probe.until(lambda: logged in running.twin.output(), "the alarm in the log")
         assert value(alarms[0], "force_level") == "warn"
         send(T0 + 600 * MS, (0.0, 0.0, 0.0))
-        # the operator's screen beside the node shows the alarm, and calls the node's services
+        # the operator's screen beside the node shows the alarm and calls services of the node
         options = ["dashboard", "--ros", "--namespace", running.namespace, "--listen", "127.0.0.1:0"]
         screen = Process("plow_twin", options, tmp_path / "screen.log")
         try:
@@ -320,20 +322,20 @@ def test_an_alarm_stays_until_it_is_acknowledged_and_writes_the_time_before_it(t
         found["topic_metadata"]["name"].rpartition("/")[2]: found["topic_metadata"]["offered_qos_profiles"][0]
         for found in stated["topics_with_message_count"]
     }
-    # for each topic, the recording states the durability that the topic's publisher has in the graph
+    # the recording states the same durability as the publisher of each topic
     recorded = {name: profiles[name]["durability"] for name in profiles.keys() & offered.keys()}
     assert recorded == {name: offered[name] for name in recorded}
     assert {*recorded.values()} == {"volatile", "transient_local"}
     assert (profiles["alarms"]["depth"], profiles["contact_forces"]["depth"]) == (1, 1000)
     before, after = replay(tmp_path / "run"), replay(tmp_path / "run_2")
     assert (before.exit_code, after.exit_code) == (0, 0)
-    # the first ring ends at the alarm; the time from the alarm to the run's end is in the second ring
+    # the first ring ends at the alarm, and the second ring contains the time after it
     assert 0 < before.samples < 600 and before.samples + after.samples == 601
-    # the first ring begins with the run, so its replay raises the alarm again; the second ring lacks the alarm's cause,
-    # so its replay raises none
+    # the first ring begins with the run, so its replay raises the alarm again; the second ring does not contain its
+    # cause
     assert (before.compared["alarms"], after.compared["alarms"]) == (1, 0) and after.not_compared["alarms"] > 0
     kinds = [type(record.entry).__name__ for record in RunReader(tmp_path / "run_2") if hasattr(record, "entry")]
-    # the acknowledgement and the mark's text are entries of the kind Parameter; the mark itself is a Mark
+    # the acknowledgement and the text of the mark are Parameter entries; the mark itself is a Mark entry
     assert (kinds.count("Parameter"), kinds.count("Mark")) == (2, 1)
 
 
@@ -363,17 +365,17 @@ def test_a_delay_that_rises_for_good_is_worked_in_marked_and_replayed_exactly(tm
         # the model is so far ahead that the next sample is late even if it is sent at once
         probe.until(lambda: quality and stamp_ns(quality[-1].header) > T0 + 350 * MS, "advances without a sample")
         assert tuple(quality[0].name) == ("held", "corrected")
-        for index in range(300, 600):  # from now on all samples are late by the same time
+        for index in range(300, 600):  # from now on, all samples are late by the same time
             send(T0 + index * MS, wrench[index])
             probe.pace(index)
         probe.until(lambda: forces and stamp_ns(forces[-1].header) > T0 + 700 * MS, "silence again")
         figures = probe.figures("input")
         running.twin.stop()
     assert figures["samples_used"] == "600"
-    assert 1 <= int(figures["rolled_back"]) < 300  # the first batch is late; later batches are on time again
+    assert 1 <= int(figures["rolled_back"]) < 300  # the first batch is late, and later batches are on time again
     marks = [tuple(message.position) for message in quality]
     turns = [mark for mark, _ in itertools.groupby(marks)]
-    # on a busy machine there may be another silence in between
+    # on a busy machine, another silence may occur in between
     assert turns[:2] == [(1.0, 0.0), (0.0, 1.0)] and (0.0, 0.0) in turns and turns[-1] == (1.0, 0.0)
     held = {stamp_ns(message.header) for message in quality if message.position[0]}
     series = _offline(replace(PAPER, wear=WEAR), [T0 + index * MS for index in range(600)], np.array(wrench))
@@ -382,7 +384,7 @@ def test_a_delay_that_rises_for_good_is_worked_in_marked_and_replayed_exactly(tm
     report = replay(record)
     assert (report.exit_code, report.divergences) == (0, 0), report
     assert report.compared["contact_peaks"] >= len(forces) and not report.not_compared
-    # the messages in the file are those that a subscriber received
+    # the messages in the file are those that a subscriber has received
     topic = f"{running.namespace}/contact_forces"
     recorded = [item.message() for item in RunReader(record) if getattr(item, "topic", "") == topic]
     assert len(recorded) >= len(forces)
@@ -415,7 +417,7 @@ def test_wear_outlives_reset_clock_step_cleanup_and_restart_and_is_set_by_its_se
         send(T0 - 3_000 * MS, (0.0, 0.0, 0.0))
         probe.until(lambda: stamp_ns(clearances[-1].header) < T0, "the step back")
         assert _pads(clearances[-1]) == worn
-        for transition in (4, 2, 1, 3):  # the transitions deactivate, cleanup, configure, activate
+        for transition in (4, 2, 1, 3):  # deactivate, cleanup, configure, activate
             request = ChangeState.Request(transition=Transition(id=transition))
             assert probe.call(ChangeState, f"{service}/change_state", request).success
         running.twin.stop()
@@ -452,7 +454,7 @@ def test_bad_samples_are_dropped_counted_and_never_published(tmp_path: Path) -> 
         send(T0 + 2 * MS, good)  # this sample is late, so the motion is corrected
         send(T0 + 4 * MS, (1e8, 0.0, 0.0))
         other.publish(JointState(name=["fx1"], effort=[1.0]))
-        # these bytes are no message of the topic's type
+        # these bytes are not a message of the topic's type
         for kind, topic in ((TwistStamped, "travel"), (PoseStamped, "head_pose"), (JointState, "gaps")):
             probe.publisher(kind, topic).publish(b"\x00\x01\x00\x00" + b"\xff" * 12)
         send(T0 + 4 * MS, good)
@@ -504,7 +506,7 @@ def test_an_absurd_load_gives_an_error_status_and_no_message(tmp_path: Path) -> 
         send(T0 + 5 * MS, (0.0, 0.0, 0.0))
         probe.until(lambda: len(forces) == 2, "recovery")
         probe.until(lambda: probe.status[-1].level == b"\x00", "status OK")
-        # the failure occurs again, followed at once by a good sample; the next report still shows the failure
+        # the failure occurs again, and a good sample follows at once; the next report still contains the failure
         send(T0 + 6 * MS, (1e200, 1e200, 1e200))
         for index in (7, 8):
             send(T0 + index * MS, (0.0, 0.0, 0.0))
@@ -525,7 +527,7 @@ def test_a_stop_under_load_is_clean_and_closes_the_recording(tmp_path: Path, num
         forces = running.probe.listen(JointState, "contact_forces")
         publisher = running.publisher("--seconds", "60")
         running.probe.until(lambda: len(forces) > 500, "a flow of messages", 60.0)
-        # several signals arrive, for example one from a terminal and one from a launch
+        # several signals arrive, for example from a terminal and from a launch
         assert running.twin.stop_again_and_again(number) == 0
         assert "Traceback" not in running.twin.output()
         assert publisher.running
@@ -540,8 +542,8 @@ def test_a_stop_under_load_is_clean_and_closes_the_recording(tmp_path: Path, num
 
 
 def test_a_twin_ends_cleanly_when_its_launch_has_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # `launch` ends at once at SIGTERM without passing the signal on, so mocks replace it; the tests check only what the
-    # launch file requests
+    # `launch` ends at SIGTERM without passing the signal on, so mocks replace it; the tests check the requests of the
+    # launch file
     asked = {name: MagicMock() for name in ("launch", "launch_ros")}
     for package, names in (("launch", "actions conditions substitutions"), ("launch_ros", "actions substitutions")):
         for name in ("", *names.split(), *(("parameter_descriptions",) if package == "launch_ros" else ())):
@@ -574,7 +576,7 @@ def test_a_stop_while_the_solver_is_compiled_is_clean(tmp_path: Path, monkeypatc
         running.probe.until(lambda: "preparing the solver" in running.twin.output(), "the start of compiling")
         running.probe.pause(1.0)
         assert "solver ready" not in running.twin.output()
-        # the node still answers while the solver compiles
+        # the node answers while the solver compiles
         count = len(running.probe.reports)
         service = f"{running.namespace}/plow_twin/get_state"
         assert running.probe.call(GetState, service, GetState.Request()).current_state.label == "unconfigured"
@@ -591,7 +593,7 @@ def test_best_effort_and_reliable_publishers_connect(tmp_path: Path, reliability
         forces = running.probe.listen(JointState, "contact_forces")
         send, stamps = running.probe.excitation(reliability), itertools.count(T0, MS)
         send(next(stamps), (1.0, 2.0, 3.0))
-        # a best-effort message is lost if the reader has not discovered its writer yet, so it is sent again
+        # a best-effort subscriber that has not discovered its publisher yet loses the message, so it is sent again
         again = reliability is ReliabilityPolicy.BEST_EFFORT
         running.probe.until(lambda: forces or (again and send(next(stamps), (1.0, 2.0, 3.0))), "an answer")
         assert running.probe.figures("input")["refused_publishers"] == "0"
@@ -613,7 +615,7 @@ def test_silence_is_held_and_reported(tmp_path: Path) -> None:
         assert states == ["waiting", "running", "stale", "running", "stale"]
         assert [status.level for status in probe.status[-3:]] == [b"\x01", b"\x00", b"\x01"]
         assert value(probe.status[-1], "stale_inputs") == "excitation"
-        # the stamps of held messages follow the clock, although no newer sample has come
+        # the stamps of held messages follow the clock, although no new sample has arrived
         probe.until(lambda: stamp_ns(forces[-1].header) > T0 + 9_200 * MS, "held frames")
         sent_ns = T0 + 9_000 * MS
         assert float(probe.figures("input")["newest_sample_age_s"]) <= (time.time_ns() - sent_ns) * 1e-9
@@ -633,7 +635,7 @@ def test_under_sim_time_silence_moves_nothing(tmp_path: Path) -> None:
         probe = running.probe
         forces = probe.listen(JointState, "contact_forces")
         send = probe.excitation()
-        # without /clock the node waits and says so; samples that the queue cannot take are counted
+        # without /clock, the node waits and prints a message; samples that do not fit in the queue are counted
         for index in range(210):
             send(T0 + index * MS, (30e3, 0.0, 0.0))
             probe.pace(index)
@@ -643,7 +645,7 @@ def test_under_sim_time_silence_moves_nothing(tmp_path: Path) -> None:
         assert (len(forces), probe.figures("recorder")["written"]) == (0, "0")
         clock = probe.node.create_publisher(Clock, "/clock", 10)
         message = Clock()
-        # a time before 0 is not valid
+        # a time before 0 is invalid
         message.clock.sec = -5
         probe.until(lambda: clock.publish(message) or "/clock: got -5 s" in running.twin.output(), "a wrong time said")
         assert value(probe.status[-1], "clock") == "waiting" and not forces
@@ -739,7 +741,7 @@ def test_tool_forces_drive_the_model_like_their_sum(tmp_path: Path) -> None:
         heads = probe.listen(Odometry, "head_state")
         publisher = probe.publisher(JointState, "tool_forces")
         for index, share in enumerate(scale):
-            # any order of the names is accepted
+            # the names may have any order
             names = sorted(amplitudes, reverse=bool(index % 2))
             message = JointState(name=names, effort=[amplitudes[name] * share for name in names])
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(T0 + index * MS, 1_000_000_000)
@@ -766,7 +768,7 @@ def test_the_scenes_own_loads_run_by_the_nodes_clock(tmp_path: Path) -> None:
         for step in range(5):
             message = Clock()
             message.clock.sec, message.clock.nanosec = divmod(T0 + step * 300 * MS, 1_000_000_000)
-            # the twin may see the connection later than this process does, so the clock is published repeatedly
+            # the twin may discover the clock later than this process does, so the clock is published repeatedly
             probe.until(lambda: clock.publish(message) or _at(heads, T0 + step * 300 * MS), "its answer")  # noqa: B023
     twin = Twin(PAPER)
     for index, head in enumerate(heads):

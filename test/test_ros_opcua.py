@@ -57,7 +57,7 @@ def test_a_node_waits_for_its_server_and_works_a_break_in_by_the_server_s_histor
         figures = probe.figures("input")
         assert int(figures["rolled_back"]) > 0 and figures["messages_lost"] == "0"
         assert value(probe.status[-1], "publishers_excitation") == "1"
-        # setting the parameter is refused, so that another node cannot make the twin read from another server
+        # the parameter is read-only, so that another node cannot connect the twin to another server
         other = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value="opc.tcp://127.0.0.1:1")
         request = SetParameters.Request(parameters=[Parameter(name="opcua_server", value=other)])
         answer = probe.call(SetParameters, f"{running.namespace}/plow_twin/set_parameters", request)

@@ -29,7 +29,7 @@ RELIABLE_INPUT = {"qos_overrides.{ns}/excitation.subscription.reliability": "rel
 
 
 def _rights(enclave: str, kind: str, right: str, namespace: str) -> set[str]:
-    """Return the full names that the policy allows an enclave; `~` is the twin."""
+    """Return the full names that the policy allows an enclave to use; `~` is replaced by the name of the twin."""
     root = ElementTree.parse(CONFIG / "sros2" / "policy.xml").getroot()
     found = root.findall(f".//enclave[@path='{enclave}']//{kind}s[@{right}='ALLOW']/{kind}")
     names = [(item.text or "").replace("~", "/plow_twin") for item in found]
@@ -54,7 +54,7 @@ def test_the_policy_allows_exactly_the_names_of_the_node(tmp_path: Path) -> None
     assert _rights("/plow_twin/twin", "service", "reply", ns) == answered
     assert _rights("/plow_twin/manager", "service", "request", ns) == answered
     assert {f"{ns}/plow_twin/{service}" for service in SERVICES} <= answered
-    # the sender of the load may publish the inputs and nothing else, and may call no service
+    # the sender of the load may publish only the inputs, and may call no service
     assert not _rights("/plow_twin/plant", "service", "request", ns)
     assert _rights("/plow_twin/plant", "topic", "publish", ns) - {"/rosout"} == taken - {"/parameter_events"}
 
@@ -80,7 +80,7 @@ def test_markers_show_the_head_where_it_is_and_the_forces_on_it(tmp_path: Path) 
     assert np.ptp(frame, axis=0) == pytest.approx((scene.frame.width_m, scene.frame.height_m))
     arrows = [marker for (kind, _), marker in markers.items() if kind == "forces" and marker.action == Marker.ADD]
     assert 0 < len(arrows) < len(PAIR_NAMES)
-    # the load pushes the head to the right and down, and the walls' forces push it back
+    # the load pushes the head to the right and down, and the forces of the walls push it back
     pushed = sum(
         np.array([arrow.points[1].x - arrow.points[0].x, arrow.points[1].y - arrow.points[0].y]) for arrow in arrows
     )

@@ -43,7 +43,7 @@ def test_other_topics_come_into_the_run_s_folder_with_their_types(tmp_path: Path
             recorder = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stream, text=True)
         try:
             probe.until(lambda: camera.get_subscription_count() == 1, "the recorder")
-            # a publisher with a weaker QoS starts later; the messages of both are received, and none twice
+            # a publisher with a weaker QoS starts later; messages of both publishers are received once
             best_effort = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
             weak = probe.node.create_publisher(PoseStamped, "gauge", best_effort)
             probe.until(lambda: weak.get_subscription_count() == 1, "a subscription that the weaker publisher matches")
@@ -66,9 +66,9 @@ def test_other_topics_come_into_the_run_s_folder_with_their_types(tmp_path: Path
     assert recorder.returncode == (3 if facts["lost"] else 0), log.read_text()
     assert facts["messages"][f"{namespace}/camera/pose"] == COUNT and facts["messages"][f"{namespace}/notes"] == 1
     gauge = f"{namespace}/gauge"
-    assert facts["messages"][gauge] + facts["lost"].pop(gauge, 0) == 2 * COUNT  # these messages are best-effort
+    assert facts["messages"][gauge] + facts["lost"].pop(gauge, 0) == 2 * COUNT  # best-effort messages may be lost
     assert facts["lost"] == {} == facts["skipped_topics"] and facts["without_publisher"] == []
-    # topics of the run itself are left out
+    # topics of the run itself are not recorded again
     assert not facts["messages"].keys() & {*RunReader(run).header.topics.values()}
     with Reader(run / "beside") as reader:
         store = get_typestore(Stores.EMPTY)

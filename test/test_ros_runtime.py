@@ -1,4 +1,4 @@
-"""A node releases its resources. It runs in this process, where threads, objects and topics can be counted."""
+"""A node releases its resources. It runs in this process, in which threads, objects and topics can be counted."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from plow_twin.stream.journal import Pose
 
 
 class _Flood:
-    """A queue that is never empty."""
+    """A queue that never becomes empty."""
 
     def __init__(self) -> None:
         self.fd = os.eventfd(1)
@@ -79,7 +79,7 @@ def _node(**parameters: Any) -> Iterator[TwinNode]:
 
 
 def test_a_failed_configure_leaves_nothing_behind(tmp_path: Path) -> None:
-    # the node makes this input last, so the other inputs exist when it fails
+    # the node creates this input last, so the other inputs exist when it fails
     override = f"qos_overrides./r{os.getpid()}/head_pose.subscription.reliability"
     with _node(**{override: "bogus", "record_path": str(tmp_path / "run")}) as node:
         threads = set(threading.enumerate())
@@ -146,7 +146,7 @@ def test_no_runtime_outlives_its_cycle() -> None:
         assert node.start()
         assert node.runtime is not None
         seen.append(weakref.ref(node.runtime))
-        node.release()  # here the node is released while it is active
+        node.release()  # the node is released while it is active
         gc.collect()
         assert seen[-1]() is None
     assert gc.get_freeze_count() == 0
@@ -166,7 +166,7 @@ def test_who_cannot_connect_is_named_though_its_topics_are_discovered_before_it(
         monkeypatch.setattr(node, "get_publishers_info_by_topic", discovered)
         connections = Connections(node)
         assert [connections.publishers(taken) for _ in range(3)] == [([], 0), ([], 1), ([], 0)]
-        identity = [2]  # a publisher whose name never arrives is still reported
+        identity = [2]  # a publisher without a name is reported too
         assert [connections.publishers(taken) for _ in range(2)] == [([], 0), ([], 1)]
     said = [line for line in capfd.readouterr().err.splitlines() if "nothing is received" in line]
     assert ["publisher sender: type" in line for line in said] == [True, False]
@@ -309,7 +309,7 @@ def test_under_a_flood_of_samples_due_work_is_done_and_others_have_their_turn() 
 
 
 def test_a_queue_that_fills_while_it_is_emptied_is_emptied_to_its_end() -> None:
-    # a turn requests as many messages as were signalled; newer messages must not displace those that are left
+    # a turn requests as many messages as were announced; newer messages must not displace the remaining ones
     with _node() as node:
         heard: list[int] = []
         subscription = node.create_subscription(TwistStamped, "burst", lambda _: None, sensor_input(1000), raw=True)
@@ -320,7 +320,7 @@ def test_a_queue_that_fills_while_it_is_emptied_is_emptied_to_its_end() -> None:
         def send(count: int) -> None:
             for _ in range(count):
                 publisher.publish(TwistStamped())
-            # when the middleware has announced all messages, every turn takes the requested number
+            # the middleware has announced all messages, so every turn takes the requested number
             time.sleep(0.2)
 
         while publisher.get_subscription_count() == 0 and time.monotonic() < give_up:
@@ -355,7 +355,7 @@ def test_loss_is_counted_by_the_publishers_numbers() -> None:
         assert node.start()
         assert node._front is not None and node.runtime is not None
         subscriptions = node._front.subscriptions
-        for numbers in ((7, 8), (11,), (10,), (12,)):  # sequence number 9 never comes, and 10 comes late
+        for numbers in ((7, 8), (11,), (10,), (12,)):  # sequence number 9 never arrives, and 10 is late
             batch = [Taken(b"one", number, 0, serialize_message(TwistStamped())) for number in numbers]
             subscriptions.receive("travel", batch)
         assert node.runtime.inputs.lost == 1
@@ -365,12 +365,12 @@ def test_messages_from_before_the_subscription_are_no_loss_whenever_their_publis
     period_ns = 5_000_000
 
     def hear(node: TwinNode, sender: bytes, after_s: float, *numbers: int) -> int:
-        """Send samples, the first one `after_s` after the subscription; return the loss."""
+        """Send samples, the first of them `after_s` after the subscription. Return the loss."""
         assert node._front is not None and node.runtime is not None
         subscriptions = node._front.subscriptions
         begun_ns = subscriptions._since_ns + round(after_s * 1e9) - numbers[0] * period_ns
         for number in numbers:
-            # the sender's stamps are not by the receiver's clock
+            # sender and receiver have different clocks
             received_ns, sent_ns = begun_ns + number * period_ns, number * period_ns
             batch = [Taken(sender, number, received_ns, serialize_message(WrenchStamped()), sent_ns)]
             subscriptions.receive("excitation", batch)
@@ -381,8 +381,8 @@ def test_messages_from_before_the_subscription_are_no_loss_whenever_their_publis
         # the publisher has sent samples for 21 s, and is discovered 0.3 s after the subscription
         assert hear(node, b"before", 0.3, *range(4158, 4200), 4203) == 3
         assert node.trigger_cleanup() == node.trigger_configure() == TransitionCallbackReturn.SUCCESS
-        # a second publisher comes an hour later; it has sent 60 messages before its connection, and three are lost
-        # afterwards
+        # a second publisher appears after an hour; it sent 60 messages before its connection, and three are lost after
+        # it
         assert hear(node, b"after", 3600.0, 61) == 0
         assert hear(node, b"after", 3600.0, 62) == 60
         assert hear(node, b"after", 3600.0, *range(63, 100), 103) == 63
@@ -394,7 +394,7 @@ def test_the_middleware_is_asked_for_no_events() -> None:
         topics = [*node.publishers, *node.subscriptions, *node._front.subscriptions._taken_from.values()]  # type: ignore[union-attr]
         names = {topic.topic_name.rpartition("/")[2] for topic in topics}
         assert {"contact_forces", "excitation", "estimate", "status", "parameter_events"} <= names
-        # taking an event while another event arises blocks rmw_fastrtps for ever, so no topic has event handlers
+        # rmw_fastrtps blocks if an event is taken while another event occurs, so no topic has event handlers
         assert [topic.topic_name for topic in topics if topic.event_handlers] == []
 
 

@@ -35,7 +35,7 @@ def samples(count: int) -> np.ndarray:
 
 
 def in_lanes() -> dict[str, list[Scene]]:
-    """Return scenes that run in the eight lanes of a vector, by the form of their law."""
+    """Return scenes for the eight lanes of a SIMD vector, by the form of their contact law."""
     laws = {
         "C d'": {},
         "lambda d'": {"law": "hunt_crossley", "damping": 0.7},
@@ -63,7 +63,7 @@ def test_a_member_beside_the_lanes_is_its_single_run_bit_for_bit(workers: int) -
     assert together.makes.sum() > 0
 
 
-# the other forms compile kernels of their own
+# the other forms need additional compiled kernels
 @pytest.mark.parametrize(
     "law",
     [
@@ -73,7 +73,7 @@ def test_a_member_beside_the_lanes_is_its_single_run_bit_for_bit(workers: int) -
 )
 def test_a_member_in_lanes_has_its_own_bits_and_the_motion_of_a_twin(law: str) -> None:
     scenes = in_lanes()[law]
-    # samples with a pause, with a jump and at short intervals need series of few orders and of all orders
+    # pauses, jumps and short intervals need series of low and of high order
     times = np.concatenate([TIMES[:250], TIMES[250:] + 0.2, [0.7, 0.7]])
     wrench = np.concatenate([samples(len(scenes)), samples(len(scenes))[:, :2]], axis=1)
     together = TwinBatch(scenes, tol=1e-9).advance_samples(times, wrench)
@@ -92,7 +92,7 @@ def test_a_member_in_lanes_has_its_own_bits_and_the_motion_of_a_twin(law: str) -
 
 
 def test_a_sample_soon_after_a_touch_leaves_no_false_peak() -> None:
-    """0.12 us after a touch with exponent 1.5 a step of 1 ms is beyond what the series of the force can give."""
+    """A step of 1 ms, 0.12 us after a touch with exponent 1.5, is longer than the range of the force series."""
     scene = dataclasses.replace(preset("bench_hc"), clearance=Clearance(0.02177825783567106, 0.026269479985725534))
     times = np.arange(1, 852) * 1e-3
     wrench = compile_loads(scene.loads).at(times)
@@ -111,7 +111,7 @@ def test_a_twin_at_rest_costs_next_to_nothing() -> None:
         row, alone = twins.advance(t), twin.advance(t)
         assert row.status.tolist() == [[0]] * 3 and row.steps.max() <= alone.steps
         assert np.abs(row.q[1, 0] - alone.q).max() < 1e-9 and np.array_equal(row.force[0], row.force[2])
-    assert row.steps.max() < 40  # some steps are needed, because a step is no longer than 100 s
+    assert row.steps.max() < 40  # some steps are needed, because the longest step is 100 s
 
 
 def test_one_sample_a_call_a_pause_and_a_restored_snapshot_change_no_bit() -> None:
@@ -148,10 +148,10 @@ def test_twins_moved_between_calls_go_on_like_twins_restored_there_and_no_sample
     assert twins.digest() == other.digest() != before
 
 
-# friction compiles kernels that no other test has
+# friction needs kernels that no other test compiles
 @pytest.mark.parametrize("friction", [None, pytest.param(Friction(0.2, 0.02), marks=pytest.mark.stress)])
 def test_members_may_lack_terms_that_others_have(friction: Friction | None) -> None:
-    """One member has wear and friction; both are zero in the other member."""
+    """One member has wear and friction. In the other member, both are zero."""
     plain = preset("paper")
     scenes = [plain, dataclasses.replace(plain, friction=friction, wear=Wear(1e-9, 0.015, 2.0))]
     wrench = samples(1)[0]

@@ -1,4 +1,4 @@
-"""Many scenes at once have the same bits as one by one, on any number of threads. A failure affects only its member."""
+"""An ensemble gives bit-identical results to single runs, and a failure affects only its member."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from plow_twin.solve import compiled_scene
 
 
 def members() -> list[Scene]:
-    """Return scenes that the lanes do not take (`test_solve_lanes`)."""
+    """Return scenes that cannot be computed in lanes (see `test_solve_lanes`)."""
     scene = preset("bench_hc")
     scene = dataclasses.replace(scene, contact=Contact("ramped_damping", 1e8, 1.5, damping=6e4, ramp_m=1e-3))
     pairs = [(gx, gy) for gx in (0.020, 0.025, 0.030) for gy in (0.021, 0.028)]
@@ -56,7 +56,7 @@ def test_each_member_is_its_single_run_bit_for_bit(workers: int) -> None:
 
 
 def test_members_with_other_terms_leave_nothing_behind() -> None:
-    """A thread's scratch memory is used by one member after the other: beside the lanes, a flight, a rest."""
+    """The members of a thread share its scratch memory: scenes for lanes, a flight and a rest."""
     scene = preset("bench_kv")
     swing = Harmonic("swing", (200.0, 50.0), 20.0)
     swinging = dataclasses.replace(scene, gravity=Gravity(0.0), loads=(swing,))
@@ -131,12 +131,12 @@ def test_times_are_checked_as_in_simulate(t_end: float) -> None:
         simulate_many([preset("paper")], t_end)
 
 
-#: Load that starts to push a head between walls without clearance, and a head without weight.
+#: Load that begins to push a head without weight between walls without clearance.
 SMALL_LOAD = Harmonic("load", (-3.0931353695787673, -2.0267345092034312), 21.16137888565331, 1.7436965700134877, 0.08)
 
 
 def test_a_head_that_starts_between_its_walls_has_the_same_bits_in_company() -> None:
-    """The guard of a pair that parts at once falls from a double zero; its root is 0, wherever its search ends."""
+    """The guard of a pair that separates at once falls from a double zero. Its root is 0, wherever the search ends."""
     scene = Scene(
         Head(0.2376573288673373, 0.001142509680508577),
         Frame(0.26358762310928385, 0.28687215851288694),
@@ -154,7 +154,7 @@ def test_a_head_that_starts_between_its_walls_has_the_same_bits_in_company() -> 
 
 
 def test_a_force_with_an_exponent_near_1_stays_finite() -> None:
-    """With a depth of some rounding errors the series of its power would overflow."""
+    """At a depth comparable to rounding errors, the series of the power could overflow."""
     scenes = [
         Scene(
             Head(1000.0, 20.0),
@@ -162,7 +162,8 @@ def test_a_force_with_an_exponent_near_1_stays_finite() -> None:
             Clearance(1e-3, 1e-4),
             Contact("hunt_crossley", 3e9, 1.1, damping=0.1),
             Gravity(0.0),
-            # it moves the head by 2 nm, but is so large that the solver does not look for rest, as in other tests
+            # the load moves the head by only 2 nm, but it is large enough to prevent the search for rest, as in other
+            # tests
             (Harmonic("hardly any", (1e3, 0.0), 2e4),),
             initial=Initial((1e-4, -5e-5 - depth, 0.0)),
         )

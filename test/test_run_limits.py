@@ -1,4 +1,4 @@
-"""Limited work: limits of a run, Ctrl-C and progress. Each gives the results so far."""
+"""Limits of a run, Ctrl-C and progress. Each stop returns the results so far."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_run_stops_at_its_limits_and_says_where_it_stood() -> None:
     part = stop.value.result
     assert part.solver["steps"] == 100 and 0 < len(part.t) < len(whole.t)
     assert stop.value.time_s == pytest.approx(part.t[-1], abs=0.01)
-    # the results so far equal those of a whole run
+    # the results so far equal those of a complete run
     for name in ("t", "q", "v", "force"):
         assert np.array_equal(getattr(part, name), getattr(whole, name)[: len(part.t)]), name
     with pytest.raises(LimitError, match=r"max_wall_s = 1e-09 reached at t = "):
@@ -112,7 +112,7 @@ def test_a_twin_stops_at_its_limits_where_its_last_advance_ended() -> None:
     samples = np.stack([4e4 * np.sin(2.0 * times), 1e4 * np.cos(2.0 * times), 3e4 * np.sin(2.0 * times)], axis=1)
     free = Twin(BENCH, excitation="sampled")
     whole = free.advance_samples(times, samples)
-    # the limit of steps belongs to the motion, so an advance that needs more steps is undone and gets the status BUDGET
+    # the limit of steps applies to the motion, so an advance that needs more steps is undone and has the status BUDGET
     tied = Twin(BENCH, excitation="sampled", max_steps=1)
     assert {tied.advance(t, load).status.name for t, load in zip(times[:50], samples, strict=False)} == {"OK", "BUDGET"}
     for name in ("sampled", "scene"):
@@ -179,8 +179,7 @@ def test_no_scene_works_without_bound(scene: Scene, tol: float) -> None:
         assert "at t = " in str(error)
 
 
-#: A program that prints its number of steps twice: from another thread when the signal arrives, and after the call has
-#: returned.
+#: Program that prints its number of steps twice: when the signal arrives, from another thread, and after the call.
 INTERRUPTED = """
 import json, os, signal, threading, time
 from plow_twin import RunInterrupted, load_scene
@@ -217,7 +216,7 @@ print(json.dumps(told))
 
 
 def test_slices_of_lanes_stay_bounded_through_many_short_ones() -> None:
-    """A scene at rest leaves its lane repeatedly, so that more than thirty slices in a row take almost no time."""
+    """A scene at rest leaves its lane repeatedly, so that more than thirty consecutive slices take almost no time."""
     scene = replace(preset("bench_kv"), loads=())
     found = simulate_many([scene], 1e6, 1e6, 1e-6, workers=1)
     assert found.status[0] == Status.OK and found.steps[0] > 10_000
@@ -230,12 +229,12 @@ def test_a_process_that_gets_sigint_returns_within_a_slice_of_work() -> None:
         told = json.loads(process.communicate(timeout=60)[0])
     slices = told["slices"]
     largest = max(after - before for before, after in itertools.pairwise(slices))
-    # the run ends after the slice in which the signal came; this slice may be four times as large as the slice before
+    # the run ends after the slice in which the signal arrived; a slice may be four times as large as the previous slice
     assert 0 <= told["returned"] - told["signalled"] <= 4 * largest
     assert told["rows"] >= 1
 
 
-#: A program that runs the command line and prints when the motion itself has begun.
+#: Program that runs the command line, and prints when the motion has begun.
 COMMAND = """
 import sys
 from plow_twin.run import simulate as module

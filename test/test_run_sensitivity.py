@@ -1,4 +1,4 @@
-"""The meaning of a tolerance: growth of errors against finite differences, a map's exponent, and amplified errors."""
+"""Growth of errors: comparison with finite differences and with the exponent of a map; derivatives of motions."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def bouncing(gamma: float, r: float, stiffness: float) -> Scene:
 
 
 def test_the_exponent_of_a_ball_on_a_vibrating_table_is_that_of_its_map() -> None:
-    """The map of the impacts shrinks areas by r^2 a period; its pair of eigenvalues of size r gives ln(r) a period."""
+    """The map of the impacts shrinks areas by r^2 per period. Its two eigenvalues of size r give ln(r) per period."""
     r = 0.5
     result = simulate(bouncing(1.3, r, 1e10), 4.0, sensitivity=True)
     assert result.sensitivity is not None and result.sensitivity.trusted
@@ -77,7 +77,7 @@ def test_the_derivatives_are_finite_differences_of_the_motion() -> None:
 
 @pytest.mark.parametrize("name", ["bench_kv", pytest.param("paper", marks=pytest.mark.stress)])
 def test_the_derivatives_by_parameters_are_finite_differences_of_the_motion(name: str) -> None:
-    """The parameters are stiffness, damping, clearances and load gains; the motion has several touches."""
+    """The parameters are stiffness, damping, clearances and load gains. The motion has several touches."""
     scene = replace(preset(name), initial=Initial((0.001, 0.002, 0.003), (0.1, 0.0, 0.2)))
     paths = sensitivity_parameters(scene)
     assert {"contact.stiffness", "contact.damping", "clearance.vertical_m"} < set(paths) and len(paths) >= 5
@@ -100,8 +100,8 @@ def _law(name: str) -> Scene:
     scene = replace(preset("paper"), initial=Initial((0.001, 0.002, 0.003), (0.4, 0.1, 0.8)))
     stiffness = scene.contact.stiffness
     contact = {
-        # with this floor, which the presets have too, no implicit step is possible, so the presets' kernels are used
-        # again
+        # with this floor, which the presets have too, no implicit step is possible, and the kernels of the presets are
+        # used
         "restitution": Contact("exact_restitution", stiffness, restitution=0.7, impact_speed_floor_m_s=0.05),
         "Hertz with restitution": Contact(
             "exact_restitution", 30.0 * stiffness, 1.5, restitution=0.7, impact_speed_floor_m_s=0.05
@@ -112,7 +112,7 @@ def _law(name: str) -> Scene:
     return replace(scene, contact=contact)
 
 
-# each exponent compiles kernels of its own
+# each exponent needs additional compiled kernels
 @pytest.mark.parametrize(
     "name",
     [
@@ -121,9 +121,9 @@ def _law(name: str) -> Scene:
     ],
 )
 def test_the_linearised_equations_agree_with_displaced_motions(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """These laws are not covered by the tests above, which compare differences of runs.
+    """The tests above, which compare differences of runs, do not cover these laws.
 
-    The linearised equations are used, not shadow runs.
+    The derivatives are those of the linearised equations, not of displaced runs.
     """
     scene, used = _law(name), list[int]()
     paths = tuple(sensitivity_parameters(scene))
@@ -143,7 +143,7 @@ def test_the_linearised_equations_agree_with_displaced_motions(name: str, monkey
 
 
 def test_derivatives_where_errors_grow_follow_a_motion_that_is_known_better(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stiff walls multiply errors, so with the first tolerance the motion would soon be a different one."""
+    """Stiff walls amplify errors, so at the first tolerance the motion would soon be a different motion."""
     scene = replace(preset("bench_kv"), contact=Contact("kelvin_voigt", 1e9, damping=1e4))
     tolerances, follow = [], sensitivity._by_equations
 
@@ -159,7 +159,7 @@ def test_derivatives_where_errors_grow_follow_a_motion_that_is_known_better(monk
 
 
 def test_products_of_stretches_grow_as_their_matrices_do() -> None:
-    """The growth agrees with numpy's norms, in one call and in portions, with stretches that pass some of the ends."""
+    """The growth agrees with matrix norms of numpy, in one call and in portions that end at various places."""
     random = np.random.default_rng(3)
     matrices = 0.5 * random.normal(size=(300, 4, 4))
     changes, ends = random.normal(size=(300, 2, 4)), random.random(300) < 0.7
@@ -216,7 +216,7 @@ def test_a_live_twin_has_the_derivatives_too() -> None:
 
 @pytest.mark.parametrize("e", [1.0, 0.7])
 def test_a_live_twin_has_the_derivative_by_restitution_also_where_nothing_damps(e: float) -> None:
-    """At e = 1 the displaced scene is damped, and an existing contact keeps the damping of its touch."""
+    """At e = 1, the displaced scene is damped. An existing contact retains the damping of its touch."""
     scene = replace(preset("paper"), initial=Initial((0.001, 0.002, 0.003), (0.4, 0.1, 0.8)))
     contact = Contact("exact_restitution", scene.contact.stiffness, restitution=e, impact_speed_floor_m_s=0.05)
     scene = replace(scene, contact=contact)
@@ -236,7 +236,7 @@ def test_a_live_twin_has_the_derivative_by_restitution_also_where_nothing_damps(
         assert rows.makes.sum() > 2
         return np.concatenate([rows.q[-1], rows.v[-1]])
 
-    # the expected derivative is the one-sided difference of second order, from three points
+    # the expected derivative is a one-sided difference of second order from three points
     ends = [end(with_parameters(scene, {"contact.restitution": e - d})) for d in (0.0, 1e-5, 2e-5)]
     expected = (1.5 * ends[0] - 2.0 * ends[1] + 0.5 * ends[2]) / 1e-5
     found = followed.by_parameter["contact.restitution"]

@@ -1,4 +1,4 @@
-"""The twin has the same bits for any way of advancing, saving and restoring, and bad input changes nothing."""
+"""Advancing, saving and restoring give bit-identical results in all ways. Invalid input changes nothing."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_sampled_at_1_khz_follows_the_analytic_motion() -> None:
 
 @pytest.mark.parametrize("name", ["paper", pytest.param("bench_hc", marks=pytest.mark.stress)])
 def test_impulses_of_all_advances_are_those_of_the_run(name: str) -> None:
-    """Steps that begin at a touch measure time from the touch; with d^1.5 they advance in the root of time."""
+    """In steps that begin at a touch, time is counted from the touch; with d^1.5, the series are in its root."""
     exact = simulate(preset(name), 2.0, tol=1e-9)
     expected = [row["impulse"] for row in exact.statistics.values()]
     for times in (TIMES[:2000], TIMES[1999:2000]):
@@ -143,10 +143,10 @@ def test_a_failed_advance_keeps_the_last_good_state_and_the_next_one_goes_on(wre
     assert after.status is Status.OK and abs(after.q - good.q).max() < 0.05
 
 
-@pytest.mark.stress  # this test compiles a kernel of its own
+@pytest.mark.stress  # this test compiles an additional kernel
 @pytest.mark.parametrize("depth", [0.2, 1.3])
 def test_a_failed_advance_leaves_no_trace_in_later_ones(depth: float) -> None:
-    """The advance fails after the end of the ramp; the impact continues as if the advance had not been tried."""
+    """The advance fails after the end of the ramp. The impact continues as if the advance had not been attempted."""
     ramp, idle = 1e-3, (0.0, 0.0, 0.0)
     contact = Contact("ramped_damping", 1e6, exponent=1.5, damping=2e3, ramp_m=ramp)
     twins = [Twin(wall_and_point(contact, speed=1.0), excitation="sampled") for _ in range(2)]
@@ -157,7 +157,7 @@ def test_a_failed_advance_leaves_no_trace_in_later_ones(depth: float) -> None:
     twins[1].advance(t, idle)
     assert twins[1].advance(t + 0.1, (0.0, -1e6, 0.0)).status is Status.OUT_OF_RANGE
     assert twins[1].advance(t + 0.1, idle).status is Status.OK
-    # a step ends where the failure was, so the two motions are equal only up to rounding
+    # a step ends at the failure, so the two motions are equal only up to rounding errors
     expected, after = twins[0].advance(t + 0.01, idle), twins[1].advance(t + 0.11, idle)
     assert after.q == pytest.approx(expected.q, abs=1e-13) and after.v == pytest.approx(expected.v, rel=1e-9)
 
@@ -178,7 +178,7 @@ def test_a_pose_out_of_range_is_never_handed_out_as_good() -> None:
 
 
 def test_a_scene_compiles_only_its_own_terms() -> None:
-    """Terms that a scene lacks are None in the compiled signature of the step."""
+    """Terms that a scene does not have are None in the compiled signature of the step."""
     twin = Twin(wall_and_point(preset("bench_kv").contact, speed=1.0))
     twin.advance(0.01)
     compiled = [str(signature[1]) for signature in loop.advance_rows.signatures]  # type: ignore[attr-defined]
@@ -222,7 +222,8 @@ def test_a_bound_on_evaluations_is_kept_and_the_error_estimated() -> None:
         assert most <= bound
         series = Twin(scene, excitation="sampled", max_evaluations=bound).advance_samples(t, wrench)
         error, estimate = np.abs(series.q - exact.q).max(), series.error_estimate_m.sum()
-        # `exact` comes from a kernel without the error bound, so even an unbounded motion equals it only up to rounding
+        # the kernel of `exact` has no error bound, so a motion without bounded steps equals it only up to rounding
+        # errors
         assert (twin.bounded == 0) == (estimate == 0.0) == (error < 1e-14)
         assert error <= 10.0 * estimate and error < 1e-4
     assert twin.bounded == 0

@@ -1,4 +1,4 @@
-"""Scene files: reading, errors with their messages, and writing and reading back without loss."""
+"""Scene files: reading, error messages, and writing and reading back without loss."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ contact: {law: hunt_crossley, stiffness: 9.6975e6, damping: 0.72154}
 
 def test_numbers_are_read_as_people_write_them() -> None:
     scene = loads_scene(MINIMAL)
-    assert scene.contact.stiffness == 9.6975e6  # as this number is written, YAML 1.1 reads it as a text
+    assert scene.contact.stiffness == 9.6975e6  # YAML 1.1 reads a number in this notation as a text
     assert type(scene.head.mass_kg) is float
     assert scene.pairs == PAIR_NAMES
     assert scene.wear is None
@@ -163,7 +163,7 @@ gravty: 3
     missing = {key: value for key, value in expected.items() if got.get(key, ("", ""))[0] != value}
     assert not missing, f"not reported: {missing}\n{caught.value}"
     assert got.keys() - {"frame.labels.1"} == expected.keys()
-    assert "mass_kg" in got["head.mas"][1]  # the error names the nearest known key
+    assert "mass_kg" in got["head.mas"][1]  # the error names the most similar known key
     assert got["gravty"][1] == "a known key; did you mean gravity?"
     assert got["head.mass_kg"][1] == "a finite number > 0 [kg]"
     assert str(caught.value).startswith("bad.yaml: ")
@@ -228,7 +228,7 @@ def test_table_from_a_file_stands_in_the_dump(tmp_path: Path) -> None:
 
 
 def test_a_table_is_read_as_any_other_csv_file(tmp_path: Path) -> None:
-    """A byte order mark is not taken for a part of `t`, and semicolons separate columns."""
+    """A byte order mark is not part of the name `t`, and semicolons separate columns."""
     scene = MINIMAL + "loads: [{name: cut, table: {file: load.csv}}]"
     for text in (
         "time;fx;fy;m\r\n0;1,5;2;3\r\n\r\n0,5;1;-2,25;3\r\n",
@@ -315,7 +315,7 @@ def scenes(draw: st.DrawFn) -> Scene:
         sliding=draw(st.sampled_from(["travel", "total"])), running_in_ratio=ratio, running_in_depth_m=draw(POSITIVE),
     )  # fmt: skip
     rate = ratio * wear.coefficient_m2_n * wear.travel_speed_m_s / wear.pad_area_m2
-    # a scene is refused if a pad wears faster than its damper lets the head move
+    # a scene is rejected if a pad wears faster than its damper lets the head move
     bearable = not LAWS[contact.law].additive or not (contact.damping or 0.0) * rate > 1.0
     letters = draw(st.lists(NAME, max_size=len(CORNER_NAMES), unique=True))
     labels = dict(zip(letters, draw(st.permutations(CORNER_NAMES)), strict=False))

@@ -1,4 +1,4 @@
-"""Measured orders of convergence: of the method with event location, and of a fixed step that misses the touch."""
+"""Measured orders of convergence: with event detection, and with fixed steps that do not locate touches."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def local_orders(errors: list[float]) -> np.ndarray:
 def fixed_step_errors(
     contact: Contact, method: Literal["rk4", "euler"], halvings: int, phases: int = 32
 ) -> list[float]:
-    """Return the mean error of the pose after one impact, for steps of 80 us that are halved repeatedly.
+    """Return the mean pose error after one impact, for steps of 80 us that are halved repeatedly.
 
-    The touch occurs equally often at every phase of a step, and so does the separation, because the stiffness varies
-    slightly. The mean is therefore smooth in dt, although a single run is not.
+    The phases of touch and separation in a step are distributed uniformly, because the stiffness varies slightly. The
+    mean is therefore smooth in dt, although a single run is not.
     """
     t_end, errors = 0.016, []
     for count in 200 * 2 ** np.arange(halvings + 1):
@@ -54,7 +54,7 @@ def fixed_step_errors(
     ("name", "order"),
     [
         ("n = 1.5", 2.5),
-        # these laws compile their own kernels
+        # these laws need additional compiled kernels
         pytest.param("n = 1", 2.0, marks=pytest.mark.stress),
         pytest.param("kelvin_voigt", 1.0, marks=pytest.mark.stress),
         pytest.param("n = 1.5, Hertz", 2.5, marks=pytest.mark.stress),
@@ -81,9 +81,9 @@ def test_semi_implicit_euler_has_order_one(name: str) -> None:
 def test_event_location_keeps_the_order_of_the_series(
     name: str, first: int, order: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The error is compared with the number of steps over 4 s of impacts, with series of order 6 and 8.
+    """The error is compared with the number of steps in 4 s of impacts, for series of order 6 and 8.
 
-    The tolerance varies over six decades, above rounding (1e-13 of the clearance).
+    The tolerance varies over six decades. All errors are above rounding errors (1e-13 of the clearance).
     """
     scene, exact = preset(name), reference(REFERENCES[name])["q"][:401]
     monkeypatch.setattr(compiled_scene, "order_for", lambda tol: order)
@@ -94,7 +94,7 @@ def test_event_location_keeps_the_order_of_the_series(
 
 @pytest.mark.parametrize("name", REFERENCES)
 def test_the_error_falls_with_the_tolerance(name: str) -> None:
-    """From 1e-3 to 1e-8, above rounding, the error is a constant times tol^s with s near 1."""
+    """From 1e-3 to 1e-8, above rounding errors, the error is a constant times tol^s with s near 1."""
     scene, exact = preset(name), reference(REFERENCES[name])["q"][:501]
     exponents = np.arange(3, 9)
     errors = [run(scene, 10.0**-k, exact)[1] for k in exponents.tolist()]

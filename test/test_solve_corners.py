@@ -1,4 +1,4 @@
-"""A head that carries corners is a block in a fixed cavity: on one wall, tumbling, and beside a head with walls."""
+"""A head that carries corners is a block in a fixed cavity: on one wall, tumbling, and compared with walls."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ WALL = 1.0
 
 
 def block(**changes: object) -> Scene:
-    """Return a square block above a table 1 m below the cavity's centre; it never meets the other walls."""
+    """Return a square block above a table 1 m below the centre of the cavity. It never touches the other walls."""
     scene = Scene(
         Head(MASS, INERTIA, carries="corners"),
         Frame(SIDE, SIDE),
@@ -51,7 +51,7 @@ def block(**changes: object) -> Scene:
 
 
 def on_table(t: float, z: np.ndarray) -> list[float]:
-    """Return the rate of z = (x, y, theta, vx, vy, omega) of the block, computed from its four corners."""
+    """Return the time derivative of z = (x, y, theta, vx, vy, omega), computed from the four corners of the block."""
     _, y, theta, vx, vy, omega = z
     c, s, half = math.cos(theta), math.sin(theta), 0.5 * SIDE
     fx = fy = moment = 0.0
@@ -89,7 +89,7 @@ def test_corners_balance_energy_and_momentum(falls) -> None:
 
 
 def test_corners_pass_their_contact_on_at_45_degrees() -> None:
-    # the block is pressed on the table by ten times its weight and rolls over its lower right corner
+    # the block is pressed on the table by ten times its weight, and rolls over its lower right corner
     push = Constant("push", force_n=(0.0, -90.0), moment_n_m=-3.3)
     lying = Initial(q=(0.0, -WALL + 0.5 * SIDE, 0.0), v=(0.0, 0.0, -0.3))
     scene = block(initial=lying, loads=(push,), friction=Friction(1.0, 0.02))
@@ -99,9 +99,10 @@ def test_corners_pass_their_contact_on_at_45_degrees() -> None:
     assert turned.size > 0
     at = result.t[turned[0]]
     passed = [event for event in result.events if abs(event["time"] - at) < 1.1e-3]
-    # one event, which is no touch, passes the contact from one pair to another: both pairs change at the same time
+    # both pairs change at the same time, in one event that is not counted as a touch
     assert {(int(e["pair"]), int(e["mode_from"]), int(e["mode_to"])) for e in passed} == {(4, 1, 0), (6, 0, 1)}
     assert passed[0]["time"] == passed[1]["time"]
+    # the force is continuous across the event, so its differences are continuous too
     force = result.force[:, [4, 6]].sum(axis=1)
     # the force continues smoothly, so its steps before, across and after the event grow alike
     steps = np.abs(np.diff(force[turned[0] - 3 : turned[0] + 2]))
@@ -120,7 +121,7 @@ def test_corners_fly_and_turn_without_end(spin: float) -> None:
 
 
 def mirrored(scene: Scene) -> Scene:
-    """Return the head with walls whose motion is the block's with the opposite sign, while it does not turn."""
+    """Return a head with walls. Without rotation, its motion is that of the block with the opposite sign."""
     q, v = scene.initial.q, scene.initial.v
     turned = tuple(replace(load, force_n=(-load.force_n[0], -load.force_n[1])) for load in scene.loads)
     return replace(
@@ -133,7 +134,7 @@ def mirrored(scene: Scene) -> Scene:
 
 
 STICK = Friction(0.2, stick_stiffness_n_m=1e6, stick_damping_n_s_m=20.0)
-#: A block with so much inertia that it does not turn. A locked angle would need kernels of its own.
+#: A block whose inertia is so large that it does not rotate. A locked angle would need additional kernels.
 GUIDED = block(
     head=Head(MASS, 1e12, carries="corners"),
     frame=Frame(0.3, 0.2),
@@ -169,7 +170,7 @@ def test_corners_that_turn_little_are_nearly_a_mirrored_head_with_walls() -> Non
         scene = replace(
             GUIDED,
             head=block().head,
-            # friction and load are negligible instead of absent, because the kernels of the test above have both
+            # friction and load are negligible but present, because the kernels of the test above contain both
             friction=replace(STICK, coefficient=1e-12),
             loads=(Harmonic("push", force_n=(1e-9, 0.0), omega_rad_s=9.0),),
             initial=Initial(q=(0.0, 0.0, angle), v=(0.4, -0.3, 0.0)),
@@ -177,8 +178,7 @@ def test_corners_that_turn_little_are_nearly_a_mirrored_head_with_walls() -> Non
         ends = [simulate(one, t_end=0.03, output_dt=1e-3, tol=1e-10).q for one in (scene, mirrored(scene))]
         return float(np.abs(ends[0] + ends[1]).max())
 
-    # the contacts of block and head have different arms; the arms differ by the ratio of clearance to size, and by the
-    # angle
+    # the arms of the contacts differ between block and head, by the ratio of clearance to size and by the angle
     assert difference(1e-3) < 0.1 * 0.03
 
 
@@ -187,7 +187,7 @@ def test_corners_move_the_same_by_fixed_steps(falls) -> None:
     np.testing.assert_allclose(fixed.q, falls.q[:51], atol=2e-4)
 
 
-# test_solve_falling has a live twin of a block in the quick run
+# in the quick run, test_solve_falling tests a live twin of a block
 @pytest.mark.stress
 def test_corners_move_the_same_by_a_live_twin(falls) -> None:
     twin = Twin(block())
@@ -197,8 +197,8 @@ def test_corners_move_the_same_by_a_live_twin(falls) -> None:
 
 
 def test_senses_of_corners_are_those_of_the_block() -> None:
-    # a moment turns the block counter-clockwise against its guide, so these sets stop a counter-clockwise swing; a
-    # larger moment would compile implicit steps
+    # a moment turns the block counter-clockwise against its guide; a larger moment would need implicit steps, which
+    # must be compiled
     scene = block(
         frame=Frame(0.3, 0.2), clearance=Clearance(0.01, 0.01), friction=Friction(1e-12, 0.05), gravity=Gravity(0.0),
         loads=(Constant("turn", moment_n_m=5.0),), initial=Initial(),
@@ -232,10 +232,10 @@ def test_estimate_refuses_a_block() -> None:
         Forward(block(), None)  # type: ignore[arg-type]
 
 
-@pytest.mark.stress  # these twins compile kernels of their own
+@pytest.mark.stress  # these twins compile additional kernels
 @pytest.mark.parametrize("radius", [pytest.param(None, id="sharp"), pytest.param(0.01, id="rounded")])
 def test_twins_with_walls_and_with_corners_share_no_compiled_code(radius: float | None) -> None:
-    """Both twins have the same terms; only the records of their constants differ."""
+    """Both twins have the same terms, and only the record types of their constants differ."""
     walls = replace(mirrored(block()), frame=Frame(SIDE, SIDE))
     corners = block(frame=Frame(SIDE, SIDE, corner_radius_m=radius))
     expected = simulate(corners, t_end=0.3, output_dt=0.1, energy_balance=True).q[-1]
@@ -246,14 +246,14 @@ def test_twins_with_walls_and_with_corners_share_no_compiled_code(radius: float 
         assert twins[0].signature != twins[1].signature
 
 
-@pytest.mark.stress  # this test compiles kernels of its own
+@pytest.mark.stress  # this test compiles additional kernels
 def test_strongly_damped_block_sinks_in_as_deep_as_its_weight_presses() -> None:
     """Two corners with overdamped contact creep to the static depth in implicit steps."""
     stiffness, start = 1e4, -WALL + 0.5 * SIDE
     damped = Contact("kelvin_voigt", stiffness=stiffness, damping=4e4)
     scene = block(contact=damped, initial=Initial((0.0, start, 0.0), (0.0, 0.0, 0.0)), friction=None)
     found = simulate(scene, t_end=60.0, output_dt=1.0)
-    # each corner moves by C x' = m g / 2 - K x, except during the first m / (2 C) = 13 us
+    # each corner obeys C x' = m g / 2 - K x, except in the first m / (2 C) = 13 us
     depth = 0.5 * MASS * 9.81 / stiffness * (1.0 - np.exp(-found.t * stiffness / 4e4))
     np.testing.assert_allclose(start - found.q[:, 1], depth, atol=2e-7)
     assert found.solver["steps"] < 2000

@@ -29,8 +29,8 @@ SCENES = {
     "locked": replace(PAPER, locked=("y",)),
 }
 SCENES["offset, ramp, wear"] = replace(SCENES["offset"], contact=SCENES["ramp"].contact, wear=SCENES["wear"].wear)
-# only the full run has these scenes, each of which compiles its own kernels; in the quick run test_solve_falling has
-# the law of `paper`
+# scenes of the full run only, because each compiles its own kernels; test_solve_falling covers the law of `paper` in
+# the quick run
 FULL_COUNT = ("paper", "bench_hc", "offset", "ramp", "wear", "locked")
 
 
@@ -57,7 +57,7 @@ def test_the_balance_changes_no_bit_of_the_motion_and_costs_nothing_when_off() -
 
 
 def test_a_wrong_motion_does_not_balance() -> None:
-    """The balance computes its own forces, so a solver with another stiffness is detected."""
+    """The balance computes its own forces, so that a solver with another stiffness is detected."""
     compiled = compile_scene(BENCH, 1e-9)
     motion = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)), outputs=True)
     motion.sums = new_balance()
@@ -67,7 +67,7 @@ def test_a_wrong_motion_does_not_balance() -> None:
     assert energy_balance_of(compiled, motion.state, motion.sums).relative_imbalance > 1e-10
 
 
-@pytest.mark.stress  # this test compiles kernels of its own
+@pytest.mark.stress  # this test compiles additional kernels
 def test_the_balance_of_fixed_steps_balance_to_their_order() -> None:
     coarse, fine = (
         simulate(PAPER, 2.0, method="rk4", dt=dt, output_dt=0.1, energy_balance=True).energy_balance

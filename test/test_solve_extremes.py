@@ -27,7 +27,7 @@ from plow_twin import (
     simulate,
 )
 
-#: A load that moves nothing. With this load a scene uses the presets' kernels; without loads it would need new kernels.
+#: A load that moves nothing. Scenes with this load use the kernels of the presets.
 PRESETS_TERMS = (Harmonic("nothing to speak of", (1e-9, 0.0), 2.0),)
 
 
@@ -39,7 +39,7 @@ def bouncing(contact: Contact, mass: float, gap: float = 0.01) -> Scene:
 @pytest.mark.parametrize("n", [1.0, 1.5])
 @pytest.mark.parametrize("stiffness", [1e3, 1e5, 1e7, 1e9, 1e11, 1e13])
 def test_stiffness_over_ten_decades(stiffness: float, n: float) -> None:
-    """A head comes to rest after sinking 0.5 mm into the softest wall, and at least 1 nm into the other walls."""
+    """The head comes to rest. Its depth is 0.5 mm in the softest wall, and at least 1 nm in the other walls."""
     mass = max(0.1, 2e-10 * stiffness)
     contact = Contact("exact_restitution", stiffness, n, restitution=0.3, impact_speed_floor_m_s=1e-2)
     scene = bouncing(contact, mass, gap=0.1)
@@ -56,7 +56,7 @@ def test_stiffness_over_ten_decades(stiffness: float, n: float) -> None:
 @pytest.mark.parametrize("mass", [10.0**k for k in range(-1, 6)])
 @pytest.mark.parametrize("e", [0.0, 0.5, 1.0])
 def test_mass_and_restitution_over_their_range(mass: float, e: float) -> None:
-    """The rebound speed is e times the impact speed for every mass; the damping's limit makes it 1/1000 at e = 0."""
+    """The rebound speed is e times the impact speed for all masses. At e = 0, the limit of the damping gives 1/1000."""
     contact = Contact("exact_restitution", 1e8, 1.5, restitution=e)
     result = simulate(with_presets_terms(wall_and_point(contact, speed=0.5, mass=mass)), 1.0, tol=1e-10)
     assert result.v[-1, 1] / 0.5 == pytest.approx(max(e, 1e-3), rel=1e-3)
@@ -89,7 +89,7 @@ def test_loads_that_are_no_numbers_are_refused(bad: float) -> None:
 
 
 def hourly(hours: int) -> np.ndarray:
-    """Return the impulse in N s of each pair in each hour of the paper's scene, shape (hours, 8)."""
+    """Return the impulse [N s] of each pair in each hour of the paper's scene, shape (hours, 8)."""
     twin = Twin(preset("paper"))
     rows = [twin.advance(3600.0 * (hour + 1)) for hour in range(hours)]
     assert all(row.status is Status.OK for row in rows)
@@ -99,7 +99,7 @@ def hourly(hours: int) -> np.ndarray:
 @pytest.mark.stress
 def test_ten_hours_of_driven_motion_do_not_drift() -> None:
     impulse = hourly(10)
-    # the motion and therefore its impulses are periodic, except in the first seconds
+    # except in the first seconds, the motion and its impulses are periodic
     assert abs(impulse[1:] / impulse[1] - 1.0).max() < 1e-3
 
 
@@ -135,7 +135,7 @@ def test_a_start_exactly_on_the_wall_is_solved(speed: float) -> None:
 
 
 def test_rows_within_a_step_show_the_wear_of_their_time() -> None:
-    """A clamped head relaxes as its pads wear, with F = K d0 exp(-K k_s v t / A)."""
+    """A clamped head relaxes as its pads wear: F = K d0 exp(-K k_s v t / A)."""
     stiffness, depth, k_s, area, speed = 1e7, 1e-4, 2e-9, 0.015, 2.0
     scene = Scene(
         Head(2000.0, 1000.0), Frame(0.3, 0.3), Clearance(0.02, -2.0 * depth),

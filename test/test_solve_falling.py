@@ -1,4 +1,4 @@
-"""A restitution that decreases with the impact: single impacts, no gain of energy, and no code without it."""
+"""A restitution that decreases with the speed of impact: single impacts, no gain of energy, and no unused code."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ LAW = Contact(
     "exact_restitution", 1e8, restitution=E, restitution_fall=FALL, restitution_speed_m_s=SPEED,
     impact_speed_floor_m_s=0.01,
 )  # fmt: skip
-#: A block that no impact turns. Its angle is not locked, but its inertia is huge; with negligible friction and the
-#: energy balance, all of these scenes use the same kernels.
+#: A block with a huge inertia, which no impact rotates. With negligible friction and the energy balance, all scenes of
+#: this file use the same kernels.
 HEAVY = Head(MASS, 1e12, carries="corners")
 SMOOTH = Friction(1e-12, 0.05)
 
 
 def impact(contact: Contact, v: tuple[float, float, float], angle: float = 0.0, **changes: object) -> Scene:
-    """Return a weightless block whose lower left corner is a micrometre above the table."""
+    """Return a weightless block whose lower left corner is one micrometre above the table."""
     lowest = 0.5 * SIDE * (math.sin(angle) + math.cos(angle))
     scene = Scene(
         Head(MASS, INERTIA, carries="corners"),
@@ -72,7 +72,7 @@ def returned(scene: Scene) -> float:
 
 
 @pytest.mark.parametrize("speed", [0.02, 0.1, 0.11, 0.7, 3.0, 40.0])
-# the quick run has the other exponent in `test_head_with_walls_reads_the_same_restitution`
+# in the quick run, `test_head_with_walls_reads_the_same_restitution` tests the other exponent
 @pytest.mark.parametrize("exponent", [1.0, pytest.param(1.5, marks=pytest.mark.stress)])
 def test_drop_returns_the_restitution_that_its_speed_leaves(speed: float, exponent: float) -> None:
     contact = replace(LAW, exponent=exponent, stiffness=1e8 * 1e3 ** (exponent - 1.0))
@@ -92,7 +92,7 @@ def test_every_law_is_asked_for_what_is_left(law: str) -> None:
 @pytest.mark.parametrize("power", [0.5, 1.3])
 def test_impact_counts_by_the_mass_at_the_corner(angle: float, omega: float, power: float) -> None:
     speed, arm = 2.0, 0.5 * SIDE * (math.cos(angle) - math.sin(angle))
-    # the contact is so hard that the block hardly turns during the impact
+    # the contact is so hard that the block hardly rotates during the impact
     contact = replace(LAW, stiffness=1e12, restitution_mass_power=power)
     found = returned(impact(contact, (0.0, -speed, omega), angle, pairs=("bottom_left_bottom",)))
     approach = speed + omega * arm
@@ -105,7 +105,7 @@ def test_restitution_falls_with_the_speed_along_the_wall(along: float) -> None:
     contact = Contact("exact_restitution", 1e8, restitution=E, restitution_fall_along_s_m=0.2)
     scene = impact(contact, (along, -1.0, 0.0), head=HEAVY, pairs=("bottom_left_bottom",))
     assert returned(scene) == pytest.approx(E - 0.2 * 1.5, abs=2e-5)
-    # by the law's formula the restitution would be negative here, so it is limited to zero
+    # the formula of the law would give a negative restitution, which is limited to zero
     fast = replace(scene, initial=replace(scene.initial, v=(10.0 * along, -1.0, 0.0)))
     assert 0.0 <= returned(fast) < 2e-3
 
@@ -119,7 +119,7 @@ def test_head_with_walls_reads_the_same_restitution() -> None:
     result = simulate(scene, t_end=2.5e-3, output_dt=5e-4)
     by_wall = [float(rate) for rate in result.v[-1, :2]]
     before = (0.5, 0.8)
-    # the head meets the lower wall first; at the left wall, the speed along the wall is what the first impact has left
+    # the head touches the lower wall first; the speed along the left wall is therefore the speed after this impact
     for axis, along in ((1, before[0]), (0, by_wall[1])):
         expected = E * (before[axis] / SPEED) ** -FALL - 0.1 * abs(along)
         assert -by_wall[axis] / before[axis] == pytest.approx(expected, abs=2e-5)
@@ -176,14 +176,14 @@ def test_block_with_a_falling_restitution_agrees_with_an_independent_integration
     found = simulate(only, t_end=0.006, output_dt=1e-3, tol=1e-9, energy_balance=True)
     z0 = [*scene.initial.q, *scene.initial.v]
     reference = solve_ivp(rate, (0.0, 0.006), z0, "DOP853", rtol=1e-10, atol=1e-12, max_step=1e-6)
-    # the touch comes after a flight of a microsecond, in which weight and turning change the speed a little
+    # the touch follows a flight of a microsecond, in which weight and rotation change the speed slightly
     assert (np.abs(found.v[-1] - reference.y[3:, -1]) < [1e-3, 1e-3, 0.05]).all()
 
 
 def test_live_twin_and_batch_have_the_motion_of_the_run() -> None:
     scene = impact(LAW, (0.2, -1.0, 3.0), 0.1, friction=Friction(0.2, 0.05), gravity=Gravity())
     run = simulate(scene, t_end=0.05, output_dt=0.01, energy_balance=True)
-    # the twin samples a zero load, because its kernel is then that of the batch
+    # the twin samples a zero load, for which the kernel of the batch is used
     twin = Twin(scene, excitation="sampled")
     np.testing.assert_allclose([twin.advance(float(t)).q for t in run.t[1:]], run.q[1:], atol=1e-9)
     rows = TwinBatch([scene, scene]).advance(0.05)
@@ -221,7 +221,7 @@ def test_what_a_falling_restitution_cannot_be_is_named(make: Callable[[], Contac
 
 
 def test_resting_block_comes_to_rest() -> None:
-    """Slow touches keep the restitution of the law's lowest speed, so bounces die out as with a constant one."""
+    """Slow touches have the restitution of the law's lowest speed, so bounces decay as with a constant restitution."""
     scene = impact(LAW, (0.0, -0.3, 0.0), gravity=Gravity(), loads=(Constant("press", (0.0, -5.0)),))
     result = simulate(scene, t_end=0.5, output_dt=0.01, energy_balance=True)
     assert abs(result.v[-1]).max() < 1e-4

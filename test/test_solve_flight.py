@@ -1,4 +1,4 @@
-"""Free flight in closed form, compared with the formula and the series; it never passes a wall."""
+"""Free flight in closed form, compared with the formula and with the series. It never passes through a wall."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from plow_twin.solve.state import new_work
 
 
 def swaying(drift: tuple[float, float, float] = (0.0, 0.0, 0.0), amplitude: float = 1e-3, omega: float = 20.0) -> Scene:
-    """Return a weightless head that drifts while a load swings it by `amplitude` metres."""
+    """Return a weightless head that drifts while a load moves it to and fro by `amplitude` [m]."""
     scene = preset("bench_kv")
     m, inertia = scene.head.mass_kg, scene.head.inertia_kg_m2
     force, moment = np.array([m, 0.5 * m]) * amplitude * omega**2, inertia * amplitude * omega**2
@@ -44,7 +44,7 @@ def test_an_hour_of_swinging_costs_36_steps_and_is_exact() -> None:
     scene, amplitude, omega = swaying(), 1e-3, 20.0
     result = simulate(scene, 3600.0, 3.7, energy_balance=True)
     assert result.solver["steps"] == 36 and len(result.events) == 0
-    # the errors come from rounding: a phase of 72,000 rad is rounded by 1e-11
+    # the errors are rounding errors: a phase of 72,000 rad is rounded by 1e-11
     shape = np.array([1.0, 0.5, 1.0]) * amplitude
     assert np.abs(result.q + shape * np.sin(omega * result.t)[:, None]).max() < 1e-13
     assert np.abs(result.v + shape * omega * np.cos(omega * result.t)[:, None]).max() < 2e-12
@@ -70,7 +70,7 @@ def test_a_drifting_head_meets_the_same_walls_as_the_series_find(seed: int) -> N
     assert flown.log["rate"][0] == pytest.approx(expanded.log["rate"][0], rel=1e-6)
 
 
-@pytest.mark.stress  # this test compiles kernels of its own
+@pytest.mark.stress  # this test compiles additional kernels
 def test_long_linear_pieces_and_harmonics_are_flown_together() -> None:
     scene = swaying()
     knots = np.array([0.0, 7.0, 31.0, 40.0])

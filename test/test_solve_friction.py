@@ -1,4 +1,4 @@
-"""Tangential friction: closed forms of a sliding block, with both solvers, and no code without friction."""
+"""Tangential friction: closed forms of a sliding block with both solvers, and no unused code."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ MASS, G, STIFFNESS, MU, SPEED = 800.0, 9.81, 1e8, 0.3, 0.02
 
 
 def block(push: float, speed: float) -> Scene:
-    """Return a head that hangs by its roof on the two upper corners, at rest vertically and free to slide.
+    """Return a head whose roof rests on the two upper corners, at rest vertically and free to slide.
 
-    With its inertia and its loads it uses the kernels of a pinned motion.
+    With its inertia and its loads, it uses the kernels of a pinned motion.
     """
     depth = MASS * G / (2.0 * STIFFNESS)
     return Scene(
@@ -54,7 +54,7 @@ def test_a_push_above_the_limit_accelerates_the_head_by_the_excess() -> None:
     assert (result.v[-1, 0] - result.v[-2, 0]) / 0.1 == pytest.approx(0.5 * MU * G, rel=1e-6)
 
 
-# test_solve_corners compares both solvers, and closes the balance, under friction in the quick run
+# in the quick run, test_solve_corners compares both solvers with friction and checks the balance
 @pytest.mark.stress
 @pytest.mark.parametrize("name", ["paper", "bench_hc"])
 def test_both_solvers_agree_and_the_energy_balances(name: str) -> None:

@@ -1,4 +1,6 @@
-"""Overdamped contact: implicit steps agree with explicit ones, are used only there, and cost no more when stiffer."""
+"""Overdamped contact: implicit steps agree with explicit steps, are used only if needed, and do not depend on
+stiffness.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,7 @@ def implicit_of(scene: Scene, tol: float = 1e-9) -> Implicit | None:
     return compiled_scene.compile_scene(scene, tol).parts.implicit
 
 
-# friction and the balance compile kernels of their own
+# friction and the balance need additional compiled kernels
 @pytest.mark.parametrize(
     ("damping", "friction", "balance"),
     [
@@ -90,7 +92,7 @@ CLAMPED = replace(BENCH, clearance=Clearance(-1e-3, -1e-3))
 
 
 def overdamped(law: str, damping: float) -> Contact:
-    """Return a contact with a damping or, if the law takes it, with a restitution up to 1."""
+    """Return a contact with a damping or, for laws with a restitution up to 1, with this restitution."""
     given = law in ("kelvin_voigt", "ramped_damping") or damping > 1.0
     return Contact(
         law, 1e9, 1.5 if law == "ramped_damping" else 1.0, damping=damping if given else None,
@@ -99,7 +101,7 @@ def overdamped(law: str, damping: float) -> Contact:
 
 
 def assert_within_the_gate(scene: Scene, tolerances: tuple[float, ...]) -> None:
-    """Check that errors stay within ten tolerances of a more accurate run, and steps within their limit."""
+    """Check that errors are within ten tolerances of a more accurate run, and that the number of steps is limited."""
     exact = simulate(scene, 2.0, output_dt=0.01, tol=1e-12)
     growth = 0.0
     for moved in ((1e-12, 0.0, 0.0), (0.0, 0.0, 1e-12)):
@@ -110,21 +112,21 @@ def assert_within_the_gate(scene: Scene, tolerances: tuple[float, ...]) -> None:
     for tol in tolerances:
         result = simulate(scene, 2.0, output_dt=0.01, tol=tol)
         assert result.solver["steps"] <= (15_000 if tol >= 1e-8 else 30_000), tol
-        # where displacements grow by more than this, the tolerance has no meaning
+        # if displacements grow by more than this factor, no method can keep the tolerance
         if growth < 1e3:
             assert pose_error(shown, result.q, exact.q) <= 10.0 * tol, (tol, growth)
 
 
 @pytest.mark.parametrize("damping", [1e8, 1e9, 1e10])
 def test_the_tolerance_holds_however_loose_it_is(damping: float) -> None:
-    """The tolerance determines the accuracy of a step, not its method."""
+    """The tolerance affects the accuracy of a step, but not the choice of its method."""
     scene = replace(BENCH, contact=overdamped("kelvin_voigt", damping))
     assert_within_the_gate(scene, (1e-2, 1e-4, 1e-6, 1e-8, 1e-10))
     for other in (THROWN, CLAMPED):
         assert_within_the_gate(replace(other, contact=scene.contact), (1e-4,))
 
 
-@pytest.mark.stress  # this test compiles kernels of its own
+@pytest.mark.stress  # this test compiles additional kernels
 def test_growth_while_dampers_hold_the_head_is_reported() -> None:
     """Rest on two corners at a depth of 1e-8 m amplifies rounding errors, but not during the whole rest."""
     scene = replace(BENCH, contact=overdamped("kelvin_voigt", 1e11), friction=Friction(0.2, 0.02))
@@ -155,7 +157,7 @@ def test_every_law_keeps_to_the_tolerance_and_to_bounded_work(start: Scene, law:
 
 @pytest.mark.parametrize("damping", [10.0**k for k in range(10, 14)])
 def test_damping_beyond_double_precision_or_the_model_is_refused(damping: float) -> None:
-    """A factor beyond its limit is refused, and so is a damper with which a pad wears faster than the head moves."""
+    """A damping is rejected above its limit, or if a pad wears faster than the damper lets the head move."""
     with pytest.raises(SceneError, match=r"contact.damping: got \S+, expected at most 1e\+09 s/m for hunt_crossley"):
         replace(BENCH, contact=overdamped("hunt_crossley", damping))
     wear = Wear(1e-12, 0.015, 2.0)
@@ -190,7 +192,7 @@ def test_a_start_inside_a_wall_leaves_as_from_the_middle_of_an_impact() -> None:
 
 @pytest.mark.parametrize("damping", [2e5, 1e9])
 def test_a_symmetric_drop_stays_symmetric(damping: float) -> None:
-    # a load, even along the line of symmetry, makes these the kernels of the tests above
+    # a load along the line of symmetry selects the kernels of the tests above
     load = Harmonic("up and down", (0.0, 500.0), omega_rad_s=2.0)
     scene = replace(BENCH, loads=(load,), gravity=Gravity(9.81), contact=overdamped("kelvin_voigt", damping))
     result = simulate(scene, 3.0, output_dt=0.01)

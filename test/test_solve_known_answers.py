@@ -1,6 +1,6 @@
-"""Answers known from elsewhere: Hertz, depth and time of an impact, statics, momentum. Each test names its source.
+"""Known solutions, each with its source: Hertz, depth and time of an impact, statics, momentum.
 
-The files test_known_* have more of them; docs/known_answers.md lists all.
+The files test_known_* contain further solutions. docs/known_answers.md lists all of them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from plow_twin.model.contact_laws import exact_damping_number
 
 
 def test_hertz_impact_of_a_sphere_on_a_rigid_plane() -> None:
-    """Chung and Ooi, Granular Matter 13 (2011) 643, test 2, give 49.7172 um, 11.36986 kN and 731.66 us."""
+    """Chung and Ooi, Granular Matter 13 (2011) 643, test 2: 49.7172 um, 11.36986 kN and 731.66 us."""
     radius, modulus, poisson, density = 0.1, 7e10, 0.30, 2699.0
     stiffness = 4.0 / 3.0 * modulus / (1.0 - poisson**2) * math.sqrt(radius)
     mass = 4.0 / 3.0 * math.pi * radius**3 * density
@@ -31,7 +31,7 @@ def test_hertz_impact_of_a_sphere_on_a_rigid_plane() -> None:
 
 @pytest.mark.parametrize(("n", "duration"), [(1.0, math.pi), (1.5, 2.94327518)])
 def test_depth_and_time_of_an_impact(n: float, duration: float) -> None:
-    """d_max^(n+1) = (n+1) m v0^2 / K (D - ln(1+D)) / D^2;  T = c_n d_max / v0 without damping."""
+    """d_max^(n+1) = (n+1) m v0^2 / K (D - ln(1+D)) / D^2. Without damping, T = c_n d_max / v0."""
     stiffness, mass, speed = 1e8, 2.0, 0.7
     scene = wall_and_point(Contact("hertz", stiffness, n), speed=speed, mass=mass)
     undamped = simulate(scene if n == 1.0 else with_presets_terms(scene), 0.1, tol=1e-11)
@@ -47,7 +47,7 @@ def test_depth_and_time_of_an_impact(n: float, duration: float) -> None:
 @pytest.mark.parametrize(
     ("n", "law"),
     [
-        # test_solve_extremes has a head that settles by these laws
+        # test_solve_extremes tests these laws with a head that comes to rest
         *(pytest.param(n, "exact_restitution", marks=pytest.mark.stress) for n in (1.0, 1.5)),
         (1.0, "kelvin_voigt"),
     ],
@@ -61,8 +61,7 @@ def test_a_constant_load_settles_on_statics(n: float, law: str) -> None:
     )  # fmt: skip
     end = simulate(scene, 30.0, output_dt=30.0, tol=1e-10)
     force, depth = end.force[-1], end.penetration[-1]
-    # the head rests with its roof on the two upper corners and, because it is pushed to the right, with its left wall
-    # on one or both left corners
+    # the roof of the head rests on the two upper corners, and its left wall touches one or both left corners
     c, s = math.cos(end.q[-1, 2]), math.sin(end.q[-1, 2])
     normal = np.array([[0, 1], [-1, 0], [0, 1], [1, 0], [0, -1], [1, 0], [0, -1], [-1, 0]]) @ np.array(
         [[c, s], [-s, c]]

@@ -1,4 +1,4 @@
-"""Scenes in the lanes of a SIMD vector: bits depend on the scene alone, and the motion is that of the single loop."""
+"""Scenes in SIMD lanes: results depend, bit for bit, on the scene alone, and agree with the loop of a single scene."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ FIELDS = (
 def draw(rng: np.random.Generator, powers: bool = False) -> Scene:
     """Draw geometry, law, stiffness, loads of several frequencies and directions, pairs and initial rates.
 
-    With `powers` the exponent is not 1.
+    With `powers`, the exponent is not 1.
     """
     mass, width, height = 10 ** rng.uniform(1.0, 3.5), *rng.uniform(0.1, 0.5, 2)
     stiffness = 10 ** rng.uniform(5.5, 10.0)
@@ -66,7 +66,7 @@ def draw(rng: np.random.Generator, powers: bool = False) -> Scene:
     ][rng.choice(4, p=[0.2, 0.4, 0.2, 0.2])]
     if powers:
         exponent = float(rng.choice([1.5, 2.0, 2.2, 3.0, 4.0], p=[0.5, 0.15, 0.1, 0.15, 0.1]))
-        # with this factor, the contact is as stiff at about 1 mm as with exponent 1
+        # with this factor, the contact at a depth of about 1 mm is as stiff as with exponent 1
         stiffness *= 1e3 ** (exponent - 1.0)
         contact = [
             Contact("hertz", stiffness, exponent),
@@ -92,9 +92,9 @@ def draw(rng: np.random.Generator, powers: bool = False) -> Scene:
     )
 
 
-#: Combinations of the harmonics' directions and the law's terms (viscous, hysteretic, integer, fraction). Each
-#: combination compiles its own kernels, so only a few are used, in which each value occurs at least once. The key says
-#: whether exponents differ from 1.
+#: Combinations of the directions of harmonics and the terms of the law (viscous, hysteretic, integer, fraction). Each
+#: combination needs its own compiled kernels, so each value occurs only in a few combinations. The key is True if
+#: exponents differ from 1.
 SOME = {
     False: {(0, 1, None, None, None), (1, 1, None, None, None)},
     True: {(1, None, 1, None, 1), (2, None, 1, 1, None)},
@@ -121,7 +121,8 @@ def same(one: Ensemble, i: int, other: Ensemble, k: int) -> bool:
 def test_a_scene_has_the_same_bits_alone_and_in_any_company(powers: bool, seed: int) -> None:
     scenes = drawn(seed, 19, powers=powers)
     together = simulate_many(scenes, 1.0, 0.05, 1e-7, workers=1)
-    assert together.events.min() < together.events.max() // 10  # lanes end at very different times and are filled again
+    # the lanes end at very different times and are filled again
+    assert together.events.min() < together.events.max() // 10
     backwards = simulate_many(scenes[::-1], 1.0, 0.05, 1e-7, workers=3)
     for index, scene in enumerate(scenes):
         assert same(together, index, simulate_many([scene], 1.0, 0.05, 1e-7), 0)
@@ -149,7 +150,7 @@ def _check_beside_the_loop(seed: int, count: int, some: bool, powers: bool) -> N
         alone = simulate(scene, 0.7, 0.02, tol=1e-12)
         error = pose_error(scene, many.q[index], alone.q)
         if error > 1e-9:
-            # the scene amplifies rounding errors, so even runs of the single loop differ, but two may agree by chance
+            # the scene amplifies rounding errors, so runs of the single loop with other tolerances differ too
             others = [simulate(scene, 0.7, 0.02, tol=tol).q for tol in (3e-12, 1e-11, 3e-11)]
             assert error < 300.0 * max(pose_error(scene, q, alone.q) for q in others), index
             continue

@@ -1,4 +1,4 @@
-"""The contract of a method (`solve.method.protocol`), checked for each method on states that it accepts and refuses."""
+"""The interface of a method (`solve.method.protocol`), checked on states that each method accepts and rejects."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from plow_twin.solve.step import METHODS
 #: Fields of the state that every method may write.
 OUTPUT = {"alpha", "beta", "sigma_end", "order", "ends_at_stop", "evaluations"}
 DECAY = {"implicit_size", "decay_times", "refused"}
-#: Further fields of the state that a single method may write.
+#: Additional fields of the state that a single method may write.
 OWN = {
     flight: {"in_flight"},
     rest: {"at_rest", "y"},
@@ -36,7 +36,7 @@ SPAN, TOLERANCE = 0.5, 1e-6
 
 @kernel(inline="source")
 def _weighed(p, parts, state, w):
-    """Prepare a step as `lay_out_step` does; return whether any pair is inside its wall."""
+    """Prepare a step as `lay_out_step` does. Return whether any pair is inside its wall."""
     terms = parts.terms
     state.alpha, state.beta = 1.0, 0.0
     return weigh_pairs(p, state, w, terms.viscous, terms.fraction, terms.ramp, terms.stick)
@@ -68,7 +68,7 @@ ASK: dict[Any, Callable[..., bool]] = {
 
 
 def pressed(damping: float, share: float) -> Scene:
-    """Return a head that gravity presses on two corners, at a share of the equilibrium depth, with the slow rate.
+    """Return a head that gravity presses on two corners, at a share of the equilibrium depth, with its slow velocity.
 
     After the time constant of the mass, C d' + K d = m g / 2 at each corner.
     """

@@ -1,8 +1,8 @@
-"""A search for scenes that break the solver: every answer obeys the energy balance or has a status that says why not.
+"""Search for scenes that break the solver: each result satisfies the energy balance, or its status names the failure.
 
-The structure of a scene, its parts and thus its compiled code, comes from a fixed list; its numbers are drawn over
-decades. The energy H, kinetic, potential and elastic, can only decrease, except for the work of loads that change in
-time: the damping of every law, the clipping of the force and the wear take energy.
+The structure of a scene, which determines its compiled code, is from a fixed list. Its numbers are drawn over decades.
+The sum of kinetic, potential and elastic energy can increase only by the work of loads that change in time. The damping
+of all laws, the clipping of the force and the wear decrease it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from plow_twin.solve.compiled_scene import compile_scene
 
 #: Largest number of steps of a request. A request that needs more steps ends with a status.
 BUDGET = 20_000
-#: A run ends after this number of steps.
+#: Number of steps after which a run ends.
 ENOUGH = 100_000
 
 
@@ -34,8 +34,8 @@ ENOUGH = 100_000
 class Case:
     scene: Scene
     tol: float
-    times: np.ndarray  # times of the requests in s, never decreasing
-    wrench: np.ndarray | None  # samples (n, 3), or None for the scene's own loads
+    times: np.ndarray  # times of the requests [s], non-decreasing
+    wrench: np.ndarray | None  # samples, shape (n, 3), or None for the loads of the scene
 
 
 def decades(low: float, high: float) -> st.SearchStrategy[float]:
@@ -49,7 +49,7 @@ Draw = Callable[[st.SearchStrategy], float]
 
 
 def a_contact(draw: Draw, law: str, exponent: float, weight: float, size: float, mass: float) -> Contact:
-    """Draw a contact that bears the weight at a depth of 1e-8 to 1e-2 of the size: about 1e3 to 1e13 N/m."""
+    """Draw a contact that supports the weight at a depth of 1e-8 to 1e-2 of the size: about 1e3 to 1e13 N/m."""
     depth = size * draw(decades(1e-8, 1e-2))
     stiffness = min(weight / depth**exponent, 1e13)
     if law == "kelvin_voigt":
@@ -113,7 +113,7 @@ def cases(draw: Draw, structure: str) -> Case:
         PAIR_NAMES if draw(st.booleans()) else tuple(draw(SOME_PAIRS)),
         Wear(draw(decades(1e-15, 1e-9)), 0.015, 2.0) if "wear" in structure else None,
     )  # fmt: skip
-    # the requests are a grid, with zero and tiny steps in it
+    # the requests are a grid with some intervals that are zero or tiny
     end = (
         draw(decades(1e-4, 2.0))
         if "harmonic" not in structure
@@ -132,7 +132,7 @@ def cases(draw: Draw, structure: str) -> Case:
 def mechanical_energy(
     scene: Scene, q: np.ndarray, v: np.ndarray, penetration: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return kinetic energy plus potential of gravity and constant loads plus elastic energy, in J for each row."""
+    """Return for each row kinetic energy, potential energy (gravity and constant loads) and elastic energy [J]."""
     mass, inertia, (rx, ry) = scene.head.mass_kg, scene.head.inertia_kg_m2, scene.head.com_offset_m
     c, s = np.cos(q[:, 2]), np.sin(q[:, 2])
     arm_x, arm_y = c * rx - s * ry, s * rx + c * ry
@@ -149,10 +149,10 @@ def mechanical_energy(
 
 
 def work_of_loads(case: Case, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the work in J done up to each row by loads that change, and a bound of its error.
+    """Return the work [J] of the changing loads up to each row, and a bound of its error.
 
-    The work is integrated by parts, F q - integral of F' q, because the pose is smoother than its rate. The linear
-    pieces of samples have a constant F'; the error of the trapezoid rule is F' q'' dt^3 / 12 for each row.
+    The work is integrated by parts, F q - integral of F' q, because the pose is smoother than its rate. Between
+    samples, F' is constant. The error of the trapezoidal rule is F' q'' dt^3 / 12 for each row.
     """
     if case.wrench is not None:
         load = case.wrench[: len(t)]
@@ -222,9 +222,9 @@ def check_energy(
     scale = kinetic.max() + elastic.max() + np.ptp(potential) + np.ptp(work)
     # the errors of hundreds of steps and impacts add up and are amplified
     slack = (1e3 * case.tol + 1e-9) * scale + work_error
-    # for speeds below a thousandth of the clearance per second the tolerance is absolute
+    # for speeds below a thousandth of the clearance per second, the tolerance is absolute
     slack += case.tol * length_scale(case.scene) * np.sqrt(2.0 * case.scene.head.mass_kg * kinetic.max())
-    # an error of the pose within the tolerance changes the energy by the force times the error
+    # a pose error within the tolerance changes the energy by the product of force and error
     slack += 100.0 * case.tol * length_scale(case.scene) * peak.sum(axis=1).max()
     rise = gain - np.minimum.accumulate(gain)
     assert (rise <= slack).all(), (rise.max() / scale, case.tol, int(rise.argmax()))
@@ -233,10 +233,10 @@ def check_energy(
 
 
 def has_kernels_of_others(case: Case) -> bool:
-    """Return whether a case needs no kernels of its own in the quick run.
+    """Return whether other tests compile the kernels of a case.
 
-    Own kernels are needed for harmonics so small that the head may rest, and for implicit steps with exponents like
-    1.5.
+    Additional kernels are needed if harmonics are so small that the head may rest, and for implicit steps with
+    exponents such as 1.5.
     """
     parts = compile_scene(case.scene, case.tol).parts
     swings = parts.terms.harmonics is None or parts.terms.rest is None
@@ -244,14 +244,14 @@ def has_kernels_of_others(case: Case) -> bool:
 
 
 def search(structure: str, examples: int) -> None:
-    """Check many scenes of one structure; the solver must reach the end for most of them."""
+    """Check many scenes of one structure. In most of them, the solver must reach the end."""
     ended: Counter[Status] = Counter()
 
-    # failing scenes are shrunk if there is time for it
+    # failing scenes are shrunk only in the stress run, which has time for it
     shrinking = settings.get_current_profile_name() == "stress"
     phases = [Phase.generate, Phase.shrink] if shrinking else [Phase.generate]
 
-    # the quick run draws only cases whose kernels other tests compile; the full run covers the other cases
+    # the quick run draws only cases with kernels that other tests compile
     drawn = cases(structure) if shrinking else cases(structure).filter(has_kernels_of_others)
 
     @settings(max_examples=examples, phases=phases, suppress_health_check=list(HealthCheck))
@@ -261,13 +261,13 @@ def search(structure: str, examples: int) -> None:
 
     every_scene_is_solved_or_named()
     assert ended[Status.OK] >= 0.5 * ended.total(), ended
-    # with explicit steps, an overdamped or very stiff contact needs more steps than it may take, so the request ends
-    # with a status
+    # with explicit steps, overdamped or very stiff contacts need more steps than allowed, so these requests end with a
+    # status
     assert ended[Status.BUDGET] < 0.2 * ended.total(), ended
     assert ended[Status.NON_FINITE] == 0, ended
 
 
-# each structure compiles all kernels, so the full run covers the other structures
+# each structure compiles all its kernels, so most structures are in the full run only
 @pytest.mark.parametrize("structure", ["factor, harmonic", "factor, sampled", "factor, n = 1.5, sampled"])
 def test_random_scenes_keep_the_energy_balance(structure: str) -> None:
     search(structure, 12)

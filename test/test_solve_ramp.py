@@ -77,7 +77,7 @@ def laws_restored() -> Iterator[None]:
 
 @pytest.mark.usefixtures("laws_restored")
 def test_a_law_of_one_s_own_works_like_the_others() -> None:
-    """Scenes, checks and every solver use a single definition of the law."""
+    """Scenes, checks and all solvers use a single definition of the law."""
     add_law("half_exact", ContactLaw("half exact", "of this test", lambda e: 0.5 * exact_damping_number(e)))
     stiffness, e = 1e8, 0.6
     contact = Contact("half_exact", stiffness, restitution=e, impact_speed_floor_m_s=0.05)
@@ -94,7 +94,7 @@ def test_a_law_of_one_s_own_works_like_the_others() -> None:
 
 
 def test_a_clipped_pair_pushes_again_before_it_parts_at_every_tolerance() -> None:
-    """Damping decreases with the ramp faster than the spring relaxes.
+    """The damping decreases with the ramp faster than the spring relaxes.
 
     The pair therefore pushes again and separates within a microsecond.
     """
@@ -107,9 +107,9 @@ def test_a_clipped_pair_pushes_again_before_it_parts_at_every_tolerance() -> Non
 
 
 def test_a_clipped_pair_does_not_push_before_its_time() -> None:
-    """The force is a cubic in penetration over ramp, which becomes large, so its series needs many terms.
+    """The force is a cubic in penetration / ramp, which becomes large, so its series needs many terms.
 
-    With steps as long as the motion allows, the force would act too early, with an error of 28 tolerances.
+    With steps as long as the motion allows, the force would begin too early, with an error of 28 tolerances.
     """
     scene = Scene(
         Head(9678.65468622175, 6223.158278044431), Frame(0.5358668741978295, 0.8164604022979493),

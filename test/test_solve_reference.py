@@ -1,4 +1,4 @@
-"""Trajectories compared with references in extended precision by another method, and with RK4 with a fixed step."""
+"""Trajectories compared with extended-precision references by another method, and with fixed-step RK4."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_tighter_tolerance_gives_a_smaller_error_within_the_tolerance(name: st
 
 
 def test_reconstruction_r1_gives_the_published_table() -> None:
-    """The figures are those of R1 over 60 s; the paper has 153 / 74 kN at a and 177 / 82 kN at b."""
+    """The figures are those of R1 over 60 s. The paper states 153 and 74 kN at a, and 177 and 82 kN at b."""
     result = simulate(preset("paper"), 60.0)
     ccw = {"a": "bottom_right_bottom", "b": "top_right_right", "c": "top_left_top", "d": "bottom_left_left"}
     cw = {"a": "bottom_right_right", "b": "top_right_top", "c": "top_left_left", "d": "bottom_left_bottom"}
@@ -80,7 +80,7 @@ VARIANTS = {
 
 
 def test_an_exponent_that_is_no_integer_keeps_to_the_tolerance_when_separations_are_slow() -> None:
-    """The slower a separation, the larger the neglected force before it; here damping slows a thrown head."""
+    """The slower a separation, the larger is the neglected force before it. Here, damping slows a thrown head."""
     scene = preset("bench_hc")
     contact = Contact("hunt_crossley", 3e9 * 1e-3**-1.2, 2.2, damping=3.0)
     scene = dataclasses.replace(scene, contact=contact, initial=Initial((0.0, 0.0, 0.0), (-1.1, 0.3, -6.0)))
@@ -89,7 +89,7 @@ def test_an_exponent_that_is_no_integer_keeps_to_the_tolerance_when_separations_
         assert pose_error(scene, simulate(scene, 3.0, output_dt=0.02, tol=tol).q, exact.q) < 3.0 * tol
 
 
-# each pairing compiles its own kernels, so the full run covers the other pairings
+# each combination needs its own compiled kernels, so most combinations are in the full run only
 @pytest.mark.parametrize(
     ("offset", "loads", "contact"),
     [
@@ -142,7 +142,7 @@ def test_locked_coordinates_stay_while_the_others_agree_with_rk4(locked: tuple[s
 def test_random_scenes_converge_to_one_motion(
     gx: float, gy: float, log_k: float, e: float, fx: float, fy: float, moment: float, omega: float
 ) -> None:
-    """Runs with three tolerances agree, pulse by pulse, until impacts amplify their differences."""
+    """Runs with three tolerances agree pulse by pulse until impacts have amplified their differences."""
     scene = Scene(
         Head(2430.0, 1265.0), Frame(0.33, 0.27), Clearance(gx, gy),
         Contact("exact_restitution", 10.0**log_k, 1.0, restitution=e), Gravity(9.81), (Harmonic("f", (fx, fy), omega,

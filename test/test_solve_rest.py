@@ -1,4 +1,4 @@
-"""Rest is recognised only if the contacts hold the head for good. A load that changes wakes the head."""
+"""Rest is recognised only if the contacts hold the head permanently. A changing load ends the rest."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def fallen(law: str = "kelvin_voigt") -> Scene:
 
 
 def fallen_under_a_harmonic(force: float, omega: float) -> Scene:
-    """Return the same head under a harmonic and its weight; at 23.2 rad/s the head on its three pairs resonates."""
+    """Return this head under a harmonic and its weight. At 23.2 rad/s, the head on its three pairs is in resonance."""
     return dataclasses.replace(fallen(), loads=(Harmonic("small", (force, 0.3 * force), omega, 0.3, 0.1 * force),))
 
 
 def static_pose(scene: Scene, guess: np.ndarray) -> np.ndarray:
-    """Solve the balance of weight and springs in another way, with scipy and forces in head axes."""
+    """Solve the balance of weight and springs with scipy, from forces in the axes of the head."""
     mass, g, arm = scene.head.mass_kg, scene.gravity.acceleration_m_s2, scene.gravity.arm_m
     rows, arms, contact = penetration_rows(scene), arm_rows(scene), scene.contact
 
@@ -48,7 +48,7 @@ def static_pose(scene: Scene, guess: np.ndarray) -> np.ndarray:
     return np.asarray(fsolve(balance, guess, xtol=1e-14))
 
 
-# the balance and the other law compile kernels of their own
+# the balance and the other law need additional compiled kernels
 @pytest.mark.parametrize(
     ("law", "balance"),
     [("kelvin_voigt", False), *(pytest.param(name, True, marks=pytest.mark.stress) for name in LAWS)],
@@ -65,7 +65,7 @@ def test_an_hour_at_rest_costs_next_to_nothing_and_is_in_balance(law: str, balan
         assert sums.imbalance_j < 1e-12 * sums.turnover_j
         assert np.abs(sums.momentum_imbalance).max() < 1e-12 * weight * 3600.0
     assert (result.energy_balance is not None) == balance
-    # during rest the pads bear the weight, so the totals grow
+    # during rest, the pads support the weight, so the totals grow
     carried = sum(row["impulse"] for row in result.statistics.values())
     before = sum(row["impulse"] for row in settled.statistics.values())
     assert carried == pytest.approx(before + result.force[-1].sum() * (3600.0 - 120.0), rel=1e-9)
@@ -74,7 +74,7 @@ def test_an_hour_at_rest_costs_next_to_nothing_and_is_in_balance(law: str, balan
 def test_a_load_that_changes_wakes_the_head() -> None:
     """The head rests for 50 s under samples and is then pushed.
 
-    The motion is the same with a tolerance at which rest comes later.
+    A run with a tolerance at which the rest begins later gives the same motion.
     """
     t = np.concatenate([np.arange(1, 51) * 1.0, 50.0 + np.arange(1, 501) * 1e-3])
     wrench = np.where(t[:, None] > 50.0, [4e4, 1e4, 2e3], [0.0, 0.0, 0.0])
@@ -96,7 +96,7 @@ def test_a_sliding_head_is_not_at_rest() -> None:
 
 @pytest.mark.parametrize("corners", [("left", "right"), ("left",)])
 def test_an_unstable_balance_is_not_rest(corners: tuple[str, ...]) -> None:
-    """On two upper corners the head rests; on one corner, with its weight right below, the smallest tilt grows."""
+    """On two upper corners, the head rests. On one corner above its weight, the smallest tilt grows."""
     scene, stable = fallen(), len(corners) == 2
     sunk = scene.head.mass_kg * 9.81 / len(corners) / scene.contact.stiffness + 0.5 * scene.clearance.vertical_m
     arm = 0.0 if stable else -0.5 * scene.frame.width_m
@@ -149,7 +149,7 @@ def test_a_spring_that_nothing_damps_goes_on_ringing() -> None:
 def test_a_harmonic_that_cannot_be_seen_lets_the_head_rest(
     force: float, omega: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The harmonic moves the head by less than a thousandth of the tolerance; a run without rest confirms this."""
+    """The harmonic moves the head by less than a thousandth of the tolerance, as a run without rest confirms."""
     tol, scene = 1e-6, fallen_under_a_harmonic(force, omega)
     rested = simulate(scene, 400.0, 0.317, tol=tol)
     assert rested.solver["steps"] == simulate(scene, 200.0, tol=tol).solver["steps"] + 2
@@ -160,13 +160,13 @@ def test_a_harmonic_that_cannot_be_seen_lets_the_head_rest(
     assert followed.solver["steps"] > 4 * rested.solver["steps"]
     way = tol * geometry.length_scale(scene)
     assert 0.0 < np.abs(rested.q - followed.q).max() < 1e-3 * way
-    # a harmonic a thousand times as large is not small compared with the tolerance, so the head follows it
+    # a harmonic that is a thousand times as large exceeds the tolerance, so the head follows it
     swing = np.ptp(larger.q[larger.t > 50.0], axis=0).max()
     assert swing > 1e-2 * way
 
 
 def test_loose_tolerances_find_the_same_rest() -> None:
-    """Steps near the limit of stability leave the stiffest pairs ringing a little, which hardly moves the head."""
+    """After steps near the limit of stability, the stiffest pairs vibrate slightly, which hardly moves the head."""
     steps = [simulate(fallen(), t_end, tol=1e-3).solver["steps"] for t_end in (100.0, 1000.0)]
     assert steps[1] == steps[0] + 9
 

@@ -1,4 +1,4 @@
-"""Rounded corners: a block that rolls on them, a frame that has them, and no effect on sharp corners."""
+"""Rounded corners: a block that rolls on them, a frame with rounded corners, and no effect on sharp corners."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ STICK = Friction(MU, stick_stiffness_n_m=1e6, stick_damping_n_s_m=20.0)
 
 
 def block(**changes: object) -> Scene:
-    """Return a rounded square block above a table 1 m below the cavity's centre."""
+    """Return a rounded square block above a table 1 m below the centre of the cavity."""
     scene = Scene(
         Head(MASS, INERTIA, carries="corners"),
         Frame(SIDE, SIDE, corner_radius_m=RADIUS),
@@ -53,7 +53,7 @@ def block(**changes: object) -> Scene:
 
 
 def in_guide(carries: str, **changes: object) -> Scene:
-    """Return a head that is driven against the walls of its guide and turns."""
+    """Return a rotating head that is driven against the walls of its guide."""
     scene = block(
         head=Head(MASS, 0.01, carries=carries),
         frame=Frame(0.3, 0.2, corner_radius_m=0.03),
@@ -65,7 +65,9 @@ def in_guide(carries: str, **changes: object) -> Scene:
 
 
 def on_table(t: float, z: np.ndarray) -> list[float]:
-    """Return the rate of z = (x, y, theta, vx, vy, omega) of the block; four discs touch at their lowest points."""
+    """Return the time derivative of z = (x, y, theta, vx, vy, omega). Four discs touch the table at their lowest
+    points.
+    """
     _, y, theta, vx, vy, omega = z
     c, s, half = math.cos(theta), math.sin(theta), 0.5 * SIDE - RADIUS
     fx = fy = moment = 0.0
@@ -85,14 +87,14 @@ def test_rounded_block_agrees_with_an_independent_integration_of_four_discs() ->
         on_table, (0.0, 0.4), [0.0, -0.85, 0.3, 0.4, 0.0, 6.0], "DOP853", found.t, rtol=1e-9, atol=1e-11, max_step=1e-4
     )
     np.testing.assert_allclose(found.q, reference.y[:3].T, atol=1e-6)
-    # the block has turned over a corner, and with sharp corners it moves differently
+    # the block has turned over a corner, and with sharp corners its motion differs
     assert abs(found.q[-1, 2]) > 1.0
     sharp = simulate(block(frame=Frame(SIDE, SIDE)), t_end=0.4, output_dt=0.004, energy_balance=True)
     assert np.abs(sharp.q - found.q).max() > 1e-3
 
 
 def test_disc_of_rounded_corners_rolls_without_sliding() -> None:
-    """A disc that is pushed along a table to which it sticks rolls, with x = -r theta and x'' = F / (m + I / r^2)."""
+    """A disc that is pushed along a table without slip rolls: x = -r theta and x'' = F / (m + I / r^2)."""
     radius = 0.5 * SIDE * (1.0 - 1e-9)
     inertia, push = 0.5 * MASS * radius**2, 0.5
     disc = block(
@@ -112,7 +114,7 @@ def test_disc_of_rounded_corners_rolls_without_sliding() -> None:
 
 
 def pairings(*quick: str) -> pytest.MarkDecorator:
-    """Return the pairings. Each compiles its own kernels, so only the full run covers pairings that are not named."""
+    """Return the combinations. Each needs its own compiled kernels; those not in `quick` are in the full run only."""
     drag = {"stick": STICK, "regularised": Friction(MU, SLIP_SPEED)}
     names = [(carries, name, f"{carries}, {name}") for carries in ("corners", "walls") for name in drag]
     parts = [
@@ -137,7 +139,7 @@ def test_rounded_corners_move_the_same_by_fixed_steps(carries: str, friction: Fr
     scene = in_guide(carries, friction=friction)
     run = simulate(scene, t_end=0.1, output_dt=0.01, energy_balance=True)
     fixed = simulate(scene, t_end=0.1, output_dt=0.01, method="rk4", dt=1e-5)
-    # fixed steps notice a touch or a slip only at the end of a step, so the bound is wide
+    # fixed steps detect a touch or a slip only at the end of a step, so the bound is wide
     np.testing.assert_allclose(fixed.q, run.q, atol=1e-3)
 
 
@@ -145,7 +147,7 @@ def test_rounded_corners_move_the_same_by_fixed_steps(carries: str, friction: Fr
 def test_rounded_corners_move_the_same_in_a_live_twin_and_a_batch(carries: str, friction: Friction) -> None:
     scene = in_guide(carries, friction=friction)
     run = simulate(scene, t_end=0.1, output_dt=0.01, energy_balance=True)
-    # between samples 10 us apart the loads differ from straight lines by 2e-6 of their size
+    # between samples 10 us apart, the loads differ from straight lines by 2e-6 of their size
     times = np.arange(1, 10_001) * 1e-5
     wrench = compile_loads(scene.loads).at(times)
     twin = Twin(scene, excitation="sampled").advance_samples(times, wrench)
@@ -154,9 +156,9 @@ def test_rounded_corners_move_the_same_in_a_live_twin_and_a_batch(carries: str, 
     np.testing.assert_array_equal(batch.q, [twin.q] * 2)
 
 
-@pytest.mark.stress  # this test compiles four kernels of its own
+@pytest.mark.stress  # this test compiles four additional kernels
 def test_rounded_corners_hold_with_implicit_steps_and_wear() -> None:
-    """The balance of energy also closes with a damper stronger than its spring, and with pads that wear by sliding."""
+    """The balance of energy closes with a damper stronger than its spring, and with pads that wear by sliding."""
     damped = in_guide(
         "corners",
         contact=Contact("kelvin_voigt", 1e6, damping=2e5),

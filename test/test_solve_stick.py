@@ -1,4 +1,4 @@
-"""Friction with stick: closed forms of slip-stick, a hold without creep, Painleve's case, and no unused code."""
+"""Friction with stick: closed forms of stick-slip, a hold without creep, Painleve's case, and no unused code."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from plow_twin.solve import compiled_scene
 from plow_twin.solve.state import STATE
 
 GRIP = 1e9
-#: The block hangs from two corners. Tangential damping of each corner [N s/m].
+#: Tangential damping [N s/m] of each of the two corners from which the block hangs.
 HELD_DAMPING = 2e5
 #: Friction of each of these corners.
 HELD = Friction(MU, stick_stiffness_n_m=GRIP, stick_damping_n_s_m=HELD_DAMPING)
@@ -42,7 +42,7 @@ HELD = Friction(MU, stick_stiffness_n_m=GRIP, stick_damping_n_s_m=HELD_DAMPING)
 
 @dataclass
 class Slider:
-    """Closed form of m x'' + spring x = F(t) - T, phase by phase; in stick, T is a spring `grip` from an anchor."""
+    """Closed form of m x'' + spring x = F(t) - T, phase by phase. In stick, T is the force of a spring `grip`."""
 
     mass: float
     spring: float
@@ -54,7 +54,7 @@ class Slider:
     def phase(
         self, t0: float, x0: float, v0: float, stiffness: float, constant: float
     ) -> Callable[[float], np.ndarray]:
-        """Return x, v of m x'' + stiffness x = F(t) + constant, starting from a state."""
+        """Return x and v of m x'' + stiffness x = F(t) + constant, starting from a state."""
         rate, amplitude, omega = self.load
         m, w = self.mass, math.sqrt(stiffness / self.mass)
 
@@ -82,12 +82,12 @@ class Slider:
         return motion
 
     def left(self, motion: Callable[[float], np.ndarray], slip: int, anchor: float, t: float) -> float:
-        """Return a margin that is zero at the block's next slip or stick."""
+        """Return a function of time whose zero is the next slip or stick of the block."""
         x, v = motion(t)
         return slip * v if slip else self.static - abs(self.grip * (x - anchor))
 
     def run(self, times: np.ndarray) -> tuple[np.ndarray, list[float]]:
-        """Return x, v at the times, shape (n, 2), and the times at which the block slips or sticks."""
+        """Return x and v at the given times, shape (n, 2), and the times at which the block begins to slip or stick."""
         rows, switches = [], []
         t, state, anchor, slip = 0.0, np.zeros(2), 0.0, 0
         while len(rows) < len(times):
@@ -114,7 +114,9 @@ class Slider:
 
 
 def test_a_block_pulled_back_and_forth_sticks_and_slips_as_in_closed_form() -> None:
-    """The load swings beyond mu N; the block slips while the load is above mu N, and holds elastically in between."""
+    """The load exceeds mu N periodically. The block slips as long as the load exceeds mu N, and is held elastically
+    otherwise.
+    """
     normal, amplitude, omega = MASS * G, 1.6 * MU * MASS * G, 12.0
     friction = Friction(MU, stick_stiffness_n_m=GRIP)
     scene = replace(block(0.0, 0.0), friction=friction, loads=(Harmonic("pull", (amplitude, 0.0), omega_rad_s=omega),))
@@ -126,9 +128,10 @@ def test_a_block_pulled_back_and_forth_sticks_and_slips_as_in_closed_form() -> N
 
 
 def belt(speed: float) -> tuple[Scene, Slider]:
-    """Return a block on a moving belt, seen from the belt: four corners clamp it, and springs that move away hold it.
+    """Return a block on a moving belt, in the frame of the belt: four corners clamp it, and moving springs hold it.
 
-    At first the springs move like a slow sine. The damping has no effect, but lets other tests' kernels be used again.
+    At first, the springs move like a slow sine. The damping has no effect on the motion; with it, the kernels of other
+    tests are used.
     """
     stiffness, deep, wide, static, kinetic, omega = 1e6, 1e-3, 0.02, 0.5, 0.3, 0.05
     friction = Friction(kinetic, stick_stiffness_n_m=1e7, static_coefficient=static)
