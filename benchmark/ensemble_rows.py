@@ -44,10 +44,10 @@ def clearance_pairs(columns: int, rows: int, name: str = "kv") -> list[Scene]:
 
 
 def ensemble_rows(columns: int, rows: int, lean_steps: Sequence[float], repeats: int, notify: Notify) -> Iterator[Row]:
-    """Yield rows for tolerances down to the first that is tight enough for all pairs, then rows of peers and listed
-    pairs.
+    """Yield rows of an ensemble for several tolerances, and rows of peers and of listed pairs.
 
-    The peers are run only if `lean_steps` are given.
+    The tolerances end at the first tolerance that is tight enough for all pairs. The peers are run only if `lean_steps`
+    are given.
     """
     scenes = clearance_pairs(columns, rows)
     name = f"kv, {len(scenes)} clearance pairs"

@@ -51,8 +51,9 @@ USEFUL_M = 4e-3
 
 @dataclass(frozen=True)
 class Kind:
-    """Differences between a machine and the model. If the sign of a share or size is random, the number is a standard
-    deviation.
+    """Differences between a machine and the model.
+
+    If the sign of a share or size is random, the number is a standard deviation.
     """
 
     title: str

@@ -90,8 +90,9 @@ def _build(p: Array) -> tuple[Any, Any, list[Any]]:
 
 
 def prepare(p: Array, solver: str, dt: float, rtol: float | None, output_dt: float) -> Callable[[], Sample]:
-    """Prepare an explicit solver with a fixed step or, if `rtol` is given, with step control. Each run builds a new
-    system.
+    """Prepare an explicit solver with a fixed step or, if `rtol` is given, with step control.
+
+    Each run builds a new system.
     """
 
     def run() -> Sample:

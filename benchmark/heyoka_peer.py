@@ -38,8 +38,9 @@ def _pairs(p: Array, state: Sequence[Any], hy: Any) -> list[tuple[Any, ...]]:
 
 
 def _equations(p: Array, begin: float) -> tuple[list[tuple[Any, Any]], list[tuple[Any, Any]]]:
-    """Return the rates of the state, and for each pair the penetration and a function that is positive until its force
-    pulls.
+    """Return the rates of the state, and two functions for each pair.
+
+    The first function is the penetration. The second is positive until the force of the pair would pull.
     """
     import heyoka as hy
 
@@ -77,10 +78,10 @@ def _begin_of(tol: float) -> float:
 
 
 def _events(guards: list[tuple[Any, Any]], inside: Array, event: Any) -> list[Any]:
-    """Return the terminal events that set the modes: begin and end of a touch, and begin and end of an attractive
-    force.
+    """Return the terminal events that set the modes.
 
-    In a batch, the callbacks receive the lane of the event. `inside` has the shape of the modes.
+    A touch and an attractive force each have an event for begin and end. In a batch, the callbacks receive the lane of
+    the event. `inside` has the shape of the modes.
     """
 
     def touches(pair: int) -> Callable[..., bool]:

@@ -180,8 +180,9 @@ def source(rate_hz: float, seconds: float) -> subprocess.Popen[bytes]:
 
 
 def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, float]:
-    """Run an answering process. Return the samples sent, used and lost, its share of a core, and the ages of its
-    messages.
+    """Run an answering process.
+
+    Return the samples sent, used and lost, its share of a core, and the ages of its messages.
     """
     with running(answerer) as (probe, process_id):
         sender, ages, figures = source(rate_hz, seconds), probe.ages, probe.figures
@@ -355,8 +356,9 @@ def _append_age(ages: list[float], data: bytes) -> None:
 
 
 def cpu_s(process_id: int) -> float:
-    """Return the CPU time [s] of all threads of a process. The scheduler's file is more precise than the ticks of
-    `stat`.
+    """Return the CPU time [s] of all threads of a process.
+
+    The scheduler's file is more precise than the ticks of `stat`.
     """
     tasks = Path(f"/proc/{process_id}/task").iterdir()
     return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) * 1e-9

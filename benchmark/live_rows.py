@@ -100,9 +100,7 @@ print(json.dumps({
 
 
 def start_rows(notify: Notify) -> Iterator[Row]:
-    """Yield a row for the start of a process with an empty cache, and a row for the next start (`value`: compiled
-    kernels).
-    """
+    """Yield two rows with the number of compiled kernels as `value`: a start with an empty cache, and the next start."""
     with tempfile.TemporaryDirectory() as cache:
         for name in ("cold start", "second start"):
             notify(name)

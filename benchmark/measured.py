@@ -377,8 +377,9 @@ class Square:
     def fit(
         self, chosen: np.ndarray, start: np.ndarray, names: tuple[str, ...], rounds: int = 3
     ) -> tuple[np.ndarray, Marker]:
-        """Fit block and marker to the chosen drops. Large distances are bounded, and the second bounce has a smaller
-        weight.
+        """Fit block and marker to the chosen drops.
+
+        Large distances are bounded, and the second bounce has a smaller weight.
         """
 
         def numbers(x: np.ndarray) -> tuple[np.ndarray, Marker]:
@@ -442,8 +443,9 @@ class Square:
         return {"pairs": len(apart), "distance_mm": round(1e3 * float(np.median(apart)), 1)}
 
     def held_out(self, start: np.ndarray = SQUARE, names: tuple[str, ...] = FITTED) -> dict[str, Any]:
-        """Fit block and marker to each half of the drops. Return the errors on the other half over one, two and three
-        bounces.
+        """Fit block and marker to each half of the drops.
+
+        Return the errors on the other half over one, two and three bounces.
         """
         half = np.random.default_rng(1).permutation(len(self.usable)) % 2
         far: list[list[np.ndarray]] = [[], [], []]

@@ -85,8 +85,9 @@ def visit(one: Machine, worn: Scene, rng: np.random.Generator) -> tuple[Load, Po
 
 
 def one_month(seed: int, day_m: float) -> dict[str, Any]:
-    """Estimate the clearances on each of the `DAYS`, and the coefficient, with `day_m` of travel along the face per
-    day.
+    """Estimate the clearances on each of the `DAYS`, and the wear coefficient.
+
+    `day_m` is the travel along the face per day [m].
     """
     rng = np.random.default_rng([20261123, seed])
     one = machine(rng)

@@ -64,9 +64,7 @@ class RandomScenes:
     events: NDArray[np.int64]
 
     def chaotic(self, tol: float) -> NDArray[np.bool_]:
-        """Return a mask of the scenes without a reference for `tol`: their two runs differ by at least a tenth of
-        `tol`.
-        """
+        """Return a mask of the scenes without a reference for `tol`, because two runs differ by at least a tenth of it."""
         return ~(self.disagreement <= 0.1 * tol)
 
 

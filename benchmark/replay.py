@@ -3,8 +3,9 @@
 The paper's head is recorded at 1 kHz with all outputs. The program prints the size of the recording, and speeds as
 multiples of real time:
 
-- replay of all messages, and replay of digests alone - upper bounds of the replay: the motion alone, and decompression
-alone - drawing of a long run, and reading of the file with `mcap` and `rosbags`
+- replay of all messages, and replay of digests alone
+- upper bounds of the replay: the motion alone, and decompression alone
+- drawing of a long run, and reading of the file with `mcap` and `rosbags`
 
 Times are processor times of one thread, the shortest of several runs. The start of a replay (scene, twin, and loading
 of compiled code) has its own row. The last column of a replay excludes the start.

@@ -37,8 +37,9 @@ def rigid_toss(initial: np.ndarray, rows: int, block: np.ndarray, impact: Impact
 
 
 def deepest(z: np.ndarray, block: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the depth of each corner [m] and the arms (across, up) from the centre to its lowest point, shape (m, 4)
-    each.
+    """Return the depth of each corner [m], and the arms of its lowest point, shape (m, 4) each.
+
+    The arms (across, up) are measured from the centre.
     """
     signs = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0]]) * float(block["half"])
     c, s = np.cos(z[:, 2:3]), np.sin(z[:, 2:3])

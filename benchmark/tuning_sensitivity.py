@@ -63,8 +63,9 @@ def varied(name: str, value: tuning.Value) -> Iterator[None]:
 
 
 def run(truth: Truth) -> dict[str, Any]:
-    """Return errors, intervals and states of one estimate. If the estimate raises an error, return the error as
-    `failed`.
+    """Return errors, intervals and states of one estimate.
+
+    If the estimate raises an error, return the error as `failed`.
     """
     try:
         found = estimate(truth.nominal, truth.load, truth.poses, forces=truth.forces)

@@ -20,9 +20,7 @@ def plow_twin(*arguments: str | Path, cwd: Path | None = None) -> subprocess.Com
 
 @contextmanager
 def started(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[str]]:
-    """Start a program, and kill it at the end of the context; a `Popen` context would wait for the program without
-    limit.
-    """
+    """Start a program, and kill it at the end of the context. A `Popen` context would wait without limit."""
     with subprocess.Popen(command, text=True, **options) as process:
         try:
             yield process

@@ -67,9 +67,7 @@ def _header() -> dict[str, str]:
 
 
 def run(*entries: str, more: bytes = b"", **changed: str) -> bytes:
-    """Return a run of plow_twin with 20 samples, the given journal entries, more records, and changed keys of the
-    header.
-    """
+    """Return a run of plow_twin with 20 samples, more journal entries and records, and changed keys of the header."""
     samples = [WrenchStamped(_T0 + n * 1_000_000, "slide_frame", (1e3 * n, 0.0, 0.0), (0.0,) * 3) for n in range(20)]
     body = b"".join(message(1, n, encode(sample)) for n, sample in enumerate(samples))
     body += b"".join(message(2, 20 + n, encode(Text(entry))) for n, entry in enumerate(entries))

@@ -170,9 +170,7 @@ class Probe:
         return send
 
     def pace(self, index: int) -> None:
-        """Pause after every 50 samples, because best-effort subscribers drop messages that arrive faster than they
-        read.
-        """
+        """Pause after every 50 samples, because best-effort subscribers drop messages if they cannot keep up."""
         if index % 50 == 49:
             self.pause(0.04)
 

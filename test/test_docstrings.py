@@ -98,9 +98,7 @@ def test_errors_that_a_function_raises_are_documented(package: griffe.Module) ->
 
 
 def test_no_docstring_begins_with_a_word_that_names_nothing() -> None:
-    """The first word of a docstring is a verb or the name of its subject, for example `Return whether`, not `Tell
-    whether`.
-    """
+    """A docstring begins with a verb or the name of its subject, for example `Return whether`, not `Tell whether`."""
     found = []
     for folder in ("plow_twin", "test", "benchmark", "tools", "studies", "examples", "launch"):
         for path in (ROOT / folder).rglob("*.py"):

@@ -141,8 +141,9 @@ def test_the_intervals_of_a_machine_that_does_not_differ_stay_narrow() -> None:
 @pytest.mark.stress
 @pytest.mark.parametrize("seed", [43202, 43210])
 def test_intervals_hold_between_soft_and_hard_contacts(seed: int) -> None:
-    """The first machine is treated as if its contact were hard. Errors of the frame, which are zero here, widen its
-    intervals.
+    """The first machine is treated as if its contact were hard.
+
+    Errors of the frame, which are zero here, widen its intervals.
     """
     truth = draw(GROUPS["middle"], seed)
     result = estimate(truth.nominal, truth.load, truth.poses)
@@ -364,9 +365,7 @@ def test_ten_poses_a_second_are_fitted_to_the_end_and_the_sensor_is_not_suspect(
 
 
 def test_a_load_with_a_little_noise_is_followed_in_long_swings() -> None:
-    """If each change of the load began a new swing, the short swings would make the estimate of this correct model
-    invalid.
-    """
+    """If each change of the load began a new swing, the estimate of this correct model would be withdrawn."""
     truth = draw(replace(GROUPS["plain"], load_step=1e-3, periods=8.0), 42004)
     noise = 0.01 * truth.load.wrench.std(axis=0) * np.random.default_rng(1).standard_normal(truth.load.wrench.shape)
     result = estimate(truth.nominal, Load(truth.load.t, truth.load.wrench + noise), truth.poses)

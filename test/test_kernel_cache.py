@@ -132,8 +132,9 @@ def test_a_disk_that_takes_no_cache_is_one_warning_and_the_run_goes_on(tmp_path:
 
 
 def test_no_kernel_assigns_an_array_to_a_slice() -> None:
-    """Numba would also compile the formatting of its error message, which takes 2 s in each process. `copy_into` has
-    none.
+    """Numba would also compile the formatting of its error message, which takes 2 s in each process.
+
+    `copy_into` has none.
     """
     found = []
     for folder in KERNEL_FOLDERS:

@@ -198,8 +198,9 @@ def test_another_machine_is_followed_from_its_prior(truth: Truth, change: Entry)
 
 @pytest.mark.parametrize("before", ["nothing", "withdrawn", "other numbers"])
 def test_without_an_estimate_poses_leave_the_median_twin_alone(truth: Truth, before: str) -> None:
-    """The clearances of the machine are larger by 1.5 mm. The nominal twin, steered to its poses, would press its
-    walls.
+    """The clearances of the machine are larger by 1.5 mm.
+
+    The nominal twin, steered to its poses, would press its walls.
     """
     clearance, begin, end = truth.nominal.clearance, 0.0 if before == "nothing" else 1.0, 3.0
     wider = Clearance(clearance.horizontal_m + 1.5e-3, clearance.vertical_m + 1.5e-3)

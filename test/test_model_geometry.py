@@ -25,9 +25,7 @@ def penetration(scene: Scene, q: np.ndarray) -> np.ndarray:
 
 
 def distance_sum_excess(scene: Scene, q: np.ndarray, pair: int) -> float:
-    """Return the value of the paper's test (eq. 2): the sum of the distances to the wall and its opposite, minus the
-    side.
-    """
+    """Return the paper's criterion (eq. 2): the distances to the wall and its opposite, minus the side."""
     width = scene.frame.width_m + scene.clearance.horizontal_m
     height = scene.frame.height_m + scene.clearance.vertical_m
     x, y, theta = q

@@ -183,8 +183,9 @@ def test_an_overrun_of_the_queue_is_counted_as_loss_and_reported(tmp_path: Path)
         sent, figures = 1000, probe.figures("input")
 
         def accounted() -> bool:
-            """Send one more message, which reveals missing messages before it. A busy middleware may lose many
-            messages.
+            """Send one more message, which reveals missing messages before it.
+
+            A busy middleware may lose many messages.
             """
             nonlocal sent
             send(T0 + sent * MS, (1.0, 2.0, 3.0))

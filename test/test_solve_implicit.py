@@ -1,6 +1,4 @@
-"""Overdamped contact: implicit steps agree with explicit steps, are used only if needed, and do not depend on
-stiffness.
-"""
+"""Overdamped contact: implicit steps agree with explicit steps, and are used only if they are needed."""
 
 from __future__ import annotations
 

@@ -65,8 +65,9 @@ def in_guide(carries: str, **changes: object) -> Scene:
 
 
 def on_table(t: float, z: np.ndarray) -> list[float]:
-    """Return the time derivative of z = (x, y, theta, vx, vy, omega). Four discs touch the table at their lowest
-    points.
+    """Return the time derivative of z = (x, y, theta, vx, vy, omega).
+
+    Four discs touch the table at their lowest points.
     """
     _, y, theta, vx, vy, omega = z
     c, s, half = math.cos(theta), math.sin(theta), 0.5 * SIDE - RADIUS

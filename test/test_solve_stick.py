@@ -114,8 +114,9 @@ class Slider:
 
 
 def test_a_block_pulled_back_and_forth_sticks_and_slips_as_in_closed_form() -> None:
-    """The load exceeds mu N periodically. The block slips as long as the load exceeds mu N, and is held elastically
-    otherwise.
+    """The load exceeds mu N periodically.
+
+    The block slips as long as the load exceeds mu N, and is held elastically otherwise.
     """
     normal, amplitude, omega = MASS * G, 1.6 * MU * MASS * G, 12.0
     friction = Friction(MU, stick_stiffness_n_m=GRIP)

@@ -1,6 +1,4 @@
-"""Files from other programs: truncated, incomplete, exported by a spreadsheet, and in encodings other than that of ROS
-2.
-"""
+"""Files from other programs: truncated, incomplete, exported by a spreadsheet, or in encodings unknown to ROS 2."""
 
 from __future__ import annotations
 

@@ -12,8 +12,9 @@ from plow_twin.record.alarms import alarms_of
 
 
 def facts_of(scene: Scene, parameters: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """Return the facts of a scene, given the twin's `parameters`. `source` is a description of the origin of the
-    samples.
+    """Return the facts of a scene, given the twin's `parameters`.
+
+    `source` is a description of the origin of the samples.
     """
     letters = {corner: letter for letter, corner in scene.frame.labels.items()}
     places = zip(PAIR_NAMES, CORNER_X, CORNER_Y, NORMAL_X, NORMAL_Y, strict=True)

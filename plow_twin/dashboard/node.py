@@ -79,8 +79,9 @@ class NodeWatch:
         self._executor.spin_once(timeout_sec=0.1)
 
     def facts(self, scene: str | None) -> dict[str, Any]:
-        """Return the facts of the node. `scene` replaces the scene of the node if its file cannot be read on this
-        machine.
+        """Return the facts of the node.
+
+        `scene` replaces the scene of the node if its file cannot be read on this machine.
 
         Raises `DashboardError` if the node does not answer, and `SceneError` if the scene cannot be read.
         """

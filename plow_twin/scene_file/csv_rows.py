@@ -36,8 +36,9 @@ def open_csv(path: Path) -> IO[str]:
 
 
 def tables(folder: Path) -> list[Path]:
-    """Return the CSV and Parquet files of a folder, sorted by name. A Parquet file with the name of a CSV file is
-    omitted.
+    """Return the CSV and Parquet files of a folder, sorted by name.
+
+    A Parquet file with the name of a CSV file is omitted.
     """
     found = {path.stem: path for ending in (SUFFIX, ".csv") for path in folder.glob(f"*{ending}")}
     return [found[name] for name in sorted(found)]
@@ -53,8 +54,9 @@ _OTHERS: Final = {
 
 
 def check_text(begin: bytes) -> None:
-    """Raise a `csv.Error` if the first bytes show UTF-16 text (the "Unicode text" of spreadsheets), a workbook or an
-    archive.
+    """Raise a `csv.Error` if the first bytes are those of UTF-16 text, a workbook or an archive.
+
+    Spreadsheets save UTF-16 text as "Unicode text".
     """
     for first, kind in _OTHERS.items():
         if begin.startswith(first):

@@ -116,8 +116,9 @@ def _explain(error: ValidationError, whole: str) -> Iterator[Problem]:
 
 
 def _closest_branch(key: str, error: ValidationError, whole: str) -> Iterator[Problem]:
-    """Yield the problems of the `anyOf` branch for the type of the value. If there is none, yield one problem of the
-    key.
+    """Yield the problems of the `anyOf` branch for the type of the value.
+
+    If there is none, yield one problem of the key.
     """
     branches: dict[Any, list[ValidationError]] = {}
     for inner in error.context or ():

@@ -29,8 +29,9 @@ def connect(address: str) -> Client:
 
 
 def completed(client: Client, futures: Iterable[Future[Any]]) -> Iterator[Future[Any]]:
-    """Yield futures in order of completion, or raise a `StudyError` if the cluster has no worker for
-    `WORKER_TIMEOUT_S`.
+    """Yield futures in order of completion.
+
+    Raises a `StudyError` if the cluster has no worker for `WORKER_TIMEOUT_S`.
     """
     from distributed import as_completed
 

@@ -33,7 +33,7 @@ Value = float | str
 WORDS: Final = ("contact.law", "head.rotation", "frame.labels")
 _CORNERS_CCW: Final = ("bottom_right", "top_right", "top_left", "bottom_left")
 _DERIVED: Final = ("sign", "arm_sign", "scale")
-#: Friction of a scene without friction, at the start of a study that varies the friction.
+#: Initial friction of a study that varies the friction of a scene without friction.
 _NO_FRICTION: Final = Friction(0.0)
 _INDEX: Final = re.compile(r"(.+)\[(\d+)\]")
 
@@ -154,7 +154,7 @@ def _label_words() -> dict[str, dict[str, str]]:
 
 
 def check_word(path: str, word: str) -> str:
-    """Return the word if the path in `WORDS` can take it; otherwise raise a `StudyError`."""
+    """Return the word if it is a valid value of `path`, a member of `WORDS`; otherwise raise a `StudyError`."""
     (rotation,) = (spec for spec in fields(Head) if spec.name == "rotation")
     words = {"contact.law": LAWS, "head.rotation": rotation.metadata["choices"], "frame.labels": _label_words()}[path]
     if word not in words:

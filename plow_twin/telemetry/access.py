@@ -84,9 +84,7 @@ class Credentials:
         return str(path)
 
     def secret(self, section: str, key: str, variable: str) -> str:
-        """Return the first line of the given file; without a file, return the environment variable
-        `PLOW_TWIN_<variable>`.
-        """
+        """Return the first line of the given file, or the environment variable `PLOW_TWIN_<variable>` without a file."""
         path = self.file(section, key)
         return os.environ.get(f"PLOW_TWIN_{variable}", "") if path is None else read_secret(Path(path))
 
@@ -173,8 +171,9 @@ def _broker_options(host: str, port: int, credentials: Credentials, *, tls: bool
 def _address(
     option: str, url: str, schemes: tuple[str, ...], expected: str, *, plain: bool
 ) -> tuple[str, int, str, bool]:
-    """Return host, port and path of an address, and whether its scheme is the last of `schemes`, which means
-    encryption.
+    """Return host, port and path of an address, and whether the address is encrypted.
+
+    The address is encrypted if its scheme is the last of `schemes`.
     """
     try:
         parts = urlsplit(url)

@@ -74,8 +74,9 @@ class Influx:
         self._client.close()
 
     def _fail(self, error: Any, count: int) -> None:
-        """Record a failure. Lines are dropped if the database has rejected their content; otherwise they stay in the
-        queue.
+        """Record a failure.
+
+        Lines are dropped if the database has rejected their content; otherwise they stay in the queue.
         """
         self.state.connected = False
         status = getattr(error, "status", None)

@@ -36,8 +36,9 @@ def masks_of(force: Array) -> Indexes:
 
 
 class ContactSets:
-    """Writer of the changes of the contact set. In a thinned run, it writes the first change and the last set of each
-    span.
+    """Writer of the changes of the contact set.
+
+    In a thinned run, it writes the first change and the last set of each span.
     """
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis, labels: tuple[str, ...], span_ns: int) -> None:
@@ -65,8 +66,9 @@ class ContactSets:
         )
 
     def name(self, mask: int) -> str:
-        """Return the name of a set of pairs: the corners that stop a ccw rotation, then the corners that stop a cw
-        rotation.
+        """Return the name of a set of pairs.
+
+        The name contains the corners that stop a ccw rotation, then the corners that stop a cw rotation.
         """
         parts = []
         for word, bits in (("ccw", mask & _CCW_BITS), ("cw", mask & ~_CCW_BITS)):

@@ -324,8 +324,9 @@ class Drawing:
         self.band.add(stamps, steps, np.where(bound[:, None], sides[:, :, 1], sides[:, :, 0]))
 
     def _color_bands(self, stamps: Indexes, steps: Indexes) -> None:
-        """Set the colours of the bands. The first stroke is opaque, because the legend shows its colour; all others are
-        faint.
+        """Set the colours of the bands.
+
+        The first stroke is opaque, because the legend shows its colour; all others are faint.
         """
         behind = int(np.searchsorted(stamps, stamps[0] + 2 * self.band.span_ns))
         changes = [0, min(max(1, behind), len(stamps) - 1)]

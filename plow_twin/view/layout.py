@@ -217,15 +217,15 @@ An arrow of {1e5 * ARROW_MM_PER_N:g} mm means 100 kN. Everything except the oute
 - Colours: the frame and its corners are grey, the cavity and the schematic body of the head are white, and the load on
   the head is violet.
 - Force curves show the largest force between two messages. `force_at_stamp` shows the force at the stamp of a message.
-- The cross-section is drawn at a limited rate; curves contain all rows or their extremes. - The growth of the clearance
-is measured from the clearance without wear [µm]. The band is its 90 % interval. - The outline of the head and the
-corners that carry force are blue if they stop a counter-clockwise swing, orange if
+- The cross-section is drawn at a limited rate; curves contain all rows or their extremes.
+- The growth of the clearance is measured from the clearance without wear [µm]. The band is its 90 % interval.
+- The outline of the head and the corners that carry force are blue if they stop a counter-clockwise swing, orange if
   they stop a clockwise swing, and violet for both.
-- The force along the face is the largest force in each piece of the face. The newest pass is bright. - A residual is a
-measured pose minus the pose of the model. - If the twin follows its machine (`follow: full`), the forces at the stamps
-are shown with their 90 % interval. - On the timeline `{ROS_TIME}`, time is the stamp. `{RUN_TIME}` counts from the
-first stamp, and `{STEP}` counts advances. - The second cross-section widens the clearance, which also exaggerates the
-slope of the walls. Walls that touch are
+- The force along the face is the largest force in each piece of the face. The newest pass is bright.
+- A residual is a measured pose minus the pose of the model.
+- If the twin follows its machine (`follow: full`), the forces at the stamps are shown with their 90 % interval.
+- The timeline `{ROS_TIME}` shows the stamp. `{RUN_TIME}` counts from the first stamp, `{STEP}` counts advances.
+- The second cross-section widens the clearance, which also exaggerates the slope of the walls. Walls that touch are
   orange. Bars inside the frame show the wear of its pads, {1e-3 * PAD_MM_PER_MM:g} mm for each µm.
 
 | | |

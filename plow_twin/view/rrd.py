@@ -65,8 +65,9 @@ def to_rrd(
     others: Mapping[str, Scene] | None = None,
     on_progress: Callable[[float], object] | None = None,
 ) -> ViewSummary:
-    """Write a complete or truncated recording as a rerun file. Only a few chunks of the recording are in memory at a
-    time.
+    """Write a complete or truncated recording as a rerun file.
+
+    Only a few chunks of the recording are in memory at a time.
 
     Parameters
     ----------
@@ -115,8 +116,6 @@ def to_rrd(
 
 
 def _span_ns(reader: RunReader, duration_s: float, most_rows: int) -> int:
-    """Return the length of a span [ns], of which two rows are written, or 0 for a short run, of which all rows are
-    written.
-    """
+    """Return the length [ns] of a span, of which two rows are written, or 0 if all rows are written."""
     rows = reader.size() / _BYTES_PER_ROW
     return 0 if rows <= most_rows else max(1, round(2e9 * duration_s / most_rows))

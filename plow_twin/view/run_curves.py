@@ -173,8 +173,9 @@ class RunCurves:
             self._break_lines()
 
     def _failed(self, stamp_ns: int, since_ns: int, advances: int) -> None:
-        """Add a series of failed advances: the first call is for the first advance, the last call for the remaining
-        advances.
+        """Add a series of failed advances.
+
+        The first call is for the first advance of the series, and the last call for all remaining advances.
         """
         first = self.first_ns or 0
         self.failed += advances

@@ -93,8 +93,9 @@ class Section:
         return np.roll(_placed(corners, (x, y, theta)), -round(theta / (0.5 * math.pi)), axis=0)
 
     def head_strips(self, pose: Iterable[float]) -> Array:
-        """Outlines of the head at a pose x, y [m], theta [rad]: cavity and body, shape (2, 5, 2), or block, shape (1,
-        n, 2).
+        """Outlines of the head at a pose x, y [m], theta [rad].
+
+        The shape is (2, 5, 2) for cavity and body, or (1, n, 2) for a block.
         """
         if self.is_block:
             return _placed(outline(self.frame, self.radius)[None], pose)

@@ -19,8 +19,9 @@ from plow_twin.view.columns import Array, Curves, Indexes, TimeAxis
 
 
 class WhatIf:
-    """Simulation of other scenes with the journal of a run, and curves of their forces. Without scenes, nothing is
-    drawn.
+    """Simulation of other scenes with the journal of a run, and curves of their forces.
+
+    Without scenes, nothing is drawn.
 
     If the run used the loads of its own scene, its journal contains no load, and `RecordingError` is raised.
     """

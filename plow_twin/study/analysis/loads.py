@@ -124,10 +124,10 @@ class LoadTotals:
         self._last = (int(stamps[-1]), *(column[-1].copy() for column in last))
 
     def _contact_loss(self, walked: Walked, steps: Array) -> Array:
-        """Return the energy [J] that the contacts dissipate between rows: the work of the load minus the gain in
-        energy.
+        """Return the energy [J] that the contacts dissipate between rows.
 
-        The work of the load between two rows is the mean load of the two rows times the displacement.
+        This energy is the work of the load minus the gain in energy. The work of the load between two rows is the mean
+        load of the two rows times the displacement.
         """
         now = walked.wrench, walked.rows.q, walked.rows.v, walked.rows.penetration
         first = (column[0] for column in now) if self._last is None else self._last[1:]

@@ -90,8 +90,9 @@ def counted_once(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
 
 
 def _identity(path: Path) -> object:
-    """Return a key that is equal for two copies of a recording: the random id and part number of a run, or else the
-    path.
+    """Return a key that is equal for two copies of a recording.
+
+    The key is the random id and the part number of a run, or the path of another recording.
     """
     try:
         header = read_header(mcap_path(path))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Largest lag [s] of the search. Larger lags come close to a period of the load, at which signals are similar again.
+#: Largest lag [s] of the search. At a lag of one load period, the signals would be similar again.
 LARGEST_LAG_S: Final = 1.0
 _FEWEST: Final = 8
 _MOST_POINTS: Final = 400_000

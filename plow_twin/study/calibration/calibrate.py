@@ -2,8 +2,8 @@
 
 The fit consists of independent starts. Each start has three stages:
 
-1. The objective is evaluated at `screen` random points of the unit cube. 2. The best of these points are the first
-population of a differential evolution (scipy). Each generation is one
+1. The objective is evaluated at `screen` random points of the unit cube.
+2. The best of these points are the first population of a differential evolution (scipy). Each generation is one
    ensemble of runs.
 3. The best point is improved by least squares in all unknowns that have a range (trust region reflective, scipy). One
    ensemble gives the finite-difference Jacobian. A Nelder-Mead simplex follows if `Search.simplex` is positive, because
@@ -105,7 +105,7 @@ def calibrate(
         points, values = _evolve(space, objective, rng, search, known, report)
         point, best = _polish(space, objective, points[np.argmin(values)], search)
         populations.append((points, values))
-        # least squares may end at a larger objective than its start
+        # least squares may end at a larger objective than that of its starting point
         if values.min() < best:
             point, best = points[np.argmin(values)], float(values.min())
         point = space.settled(point)

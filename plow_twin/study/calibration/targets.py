@@ -63,8 +63,9 @@ class Target:
         return (*self.statistics, *self.others)
 
     def residual(self, table: Array) -> Array:
-        """Return the residuals r of m candidates, shape (m,), given their statistics `table`, shape (m, settings,
-        paths).
+        """Return the residuals r of m candidates, shape (m,).
+
+        `table`, shape (m, settings, paths), contains the statistics of the candidates.
         """
         mine = table[:, :, : len(self.statistics)].min(axis=2)
         if self.kind == "trend":

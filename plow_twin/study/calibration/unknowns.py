@@ -28,8 +28,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Unknown:
-    """An unknown: a number from `low` to `high`, or one of `choices`. With `log`, the logarithm is distributed
-    uniformly.
+    """An unknown: a number from `low` to `high`, or one of `choices`.
+
+    With `log`, the logarithm is distributed uniformly.
     """
 
     path: str
@@ -47,8 +48,9 @@ class Unknown:
         return float(self.low + (self.high - self.low) * place)
 
     def place(self, value: Value) -> float:
-        """Return the place of a value. Each choice has an equal share of 0..1, and its place is the middle of the
-        share.
+        """Return the place of a value.
+
+        Each choice has an equal share of 0..1, and its place is the middle of the share.
         """
         if self.choices:
             return (self.choices.index(value) + 0.5) / len(self.choices)

@@ -12,8 +12,7 @@ from scipy.stats import t as student
 
 Array = NDArray[np.float64]
 
-#: Number of bootstrap draws. Each end of a 95 % interval then has a standard error of 0.5 % in its probability of 2.5
-#: %.
+#: Number of bootstrap draws. The share of draws below the 2.5 % point then has a standard error of 0.5 %.
 _DRAWS: Final = 1000
 FEWEST: Final = 8
 #: Smallest standard deviation of the load within the groups, relative to the mean load. Below this value, the effect of

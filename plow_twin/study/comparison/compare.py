@@ -17,8 +17,8 @@ from plow_twin.record.recording import read_recording
 from plow_twin.study.comparison.change import Change, Drawn, changes, points, with_neighbours
 from plow_twin.study.comparison.windows import FULL, QUANTITIES, Windows, windows_of
 
-#: Smallest stamp [ns] that is treated as a date. Smaller stamps, before the year 2001, count from the start of a
-#: device.
+#: Smallest stamp [ns] that is treated as a date. Smaller stamps, before the year 2001, count from an
+#: arbitrary start.
 _DATES_NS: Final = 10**18
 SHIFTS: Final = (time(6), time(14), time(22))
 
@@ -174,7 +174,7 @@ def _overlapping(windows: Windows, others: Windows) -> np.ndarray[Any, Any]:
         for part in (windows, others)
     )
     starts, stops = starts[order], stops[order]
-    before = np.searchsorted(starts, ends) - 1  # the last of the others that begins before the end of each window
+    before = np.searchsorted(starts, ends) - 1  # index of the last window that begins before each end
     return np.asarray((before >= 0) & (stops[before] > begins))
 
 
@@ -205,9 +205,7 @@ class WindowsTask:
         return None
 
     def run(self) -> dict[str, Any]:
-        """Return the windows of the run (`windows`), its losses (`lost`), and the name and contents of its scene
-        (`scene`).
-        """
+        """Return the windows of the run (`windows`), its losses (`lost`), and name and contents of its scene (`scene`)."""
         recording = read_recording(self.path)
         windows = windows_of(recording, self.window_s)
         scene = Path(str(recording.header.parameters.get("scene", ""))).name

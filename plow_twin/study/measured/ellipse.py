@@ -64,10 +64,10 @@ ELLIPSE: Final = EllipseContact()
 
 
 def contact_arms(theta: Array) -> tuple[Array, Array]:
-    """Return the lowest point relative to the centre: its coordinates [m] along and away from the surface, shape (n,)
-    each.
+    """Return the coordinates [m] of the lowest point relative to the centre, shape (n,) each.
 
-    `theta` is the counter-clockwise angle [rad], shape (n,).
+    The first coordinate is along the surface, the second away from it. `theta` is the counter-clockwise angle [rad],
+    shape (n,).
     """
     a, b = SEMI_AXES
     c, s = np.cos(theta), np.sin(theta)

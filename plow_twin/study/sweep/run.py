@@ -16,7 +16,7 @@ from plow_twin.study.store import Store
 from plow_twin.study.sweep.table import Sweep, Table, run_members_of
 
 Array = NDArray[np.float64]
-OnProgress = Callable[[int], object]  # Callback that receives the number of finished members.
+OnProgress = Callable[[int], object]  # callback that receives the number of finished members
 
 
 def run_here(store: Store, workers: int | None = None, on_progress: OnProgress = lambda count: None) -> Table:
