@@ -100,7 +100,7 @@ print(json.dumps({
 
 
 def start_rows(notify: Notify) -> Iterator[Row]:
-    """Yield two rows with the number of compiled kernels as `value`: a start with an empty cache, and the next start."""
+    """Yield rows for a start with an empty cache and for the next start; `value` is the number of compiled kernels."""
     with tempfile.TemporaryDirectory() as cache:
         for name in ("cold start", "second start"):
             notify(name)

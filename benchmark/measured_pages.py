@@ -53,7 +53,7 @@ def measured_drops() -> str:
 
 
 def measured_rigid() -> str:
-    """Return the table of errors of rigid and compliant impacts, with and without simultaneous touches of two corners."""
+    """Return the table of errors of rigid and compliant impacts, with and without simultaneous touches."""
     found = _part("square_rigid")
     e, mu = found["e, mu"]
     names = {

@@ -64,7 +64,7 @@ class RandomScenes:
     events: NDArray[np.int64]
 
     def chaotic(self, tol: float) -> NDArray[np.bool_]:
-        """Return a mask of the scenes without a reference for `tol`, because two runs differ by at least a tenth of it."""
+        """Return a mask of the scenes without a reference for `tol`: their runs differ by a tenth of it or more."""
         return ~(self.disagreement <= 0.1 * tol)
 
 

@@ -462,7 +462,7 @@ def test_no_line_is_drawn_over_a_part_that_is_not_there(
             assert (behind > -(10**8)).all() and (behind <= 1).all() and after - before > 10**8
         assert [state for state in tables["/contact_set"]["StateChange:state"].to_pylist() if not state] == [[], []]
     lines = [text[0] for text in tables["/events"]["TextLog:text"].to_pylist()]
-    assert lines[-1] == "recording: 1 missing parts" and sum("are not there after this" in line for line in lines) == 1
+    assert lines[-1] == "recording: 1 missing parts" and sum("are missing after this" in line for line in lines) == 1
     figures = kept_figures(monkeypatch)
     assert cli(["view", str(run.folder), "--png", str(tmp_path / "run.png")]) == 3
     assert "lost missing_parts: 1" in capsys.readouterr().err

@@ -84,7 +84,7 @@ class Credentials:
         return str(path)
 
     def secret(self, section: str, key: str, variable: str) -> str:
-        """Return the first line of the given file, or the environment variable `PLOW_TWIN_<variable>` without a file."""
+        """Return the first line of the given file; without it, return the variable `PLOW_TWIN_<variable>`."""
         path = self.file(section, key)
         return os.environ.get(f"PLOW_TWIN_{variable}", "") if path is None else read_secret(Path(path))
 

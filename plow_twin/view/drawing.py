@@ -180,7 +180,7 @@ class Drawing:
         self._sample_ns, self._wrench = None, np.full(3, np.nan)
         self.events.forget()
         if not isinstance(after.entries.others.get(0), Loss):  # a `Loss` in the journal is drawn as an event of its own
-            text = f"{count} journal entries are not there after this"
+            text = f"{count} journal entries are missing after this"
             self.events.add(self.stamp_ns, max(self.step, 0), text, "ERROR")
 
     def _whole(self, batch: Batch) -> None:

@@ -205,7 +205,7 @@ class WindowsTask:
         return None
 
     def run(self) -> dict[str, Any]:
-        """Return the windows of the run (`windows`), its losses (`lost`), and name and contents of its scene (`scene`)."""
+        """Return the windows (`windows`), losses (`lost`), and name and contents of the scene (`scene`) of the run."""
         recording = read_recording(self.path)
         windows = windows_of(recording, self.window_s)
         scene = Path(str(recording.header.parameters.get("scene", ""))).name
