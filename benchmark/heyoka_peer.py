@@ -80,8 +80,8 @@ def _begin_of(tol: float) -> float:
 def _events(guards: list[tuple[Any, Any]], inside: Array, event: Any) -> list[Any]:
     """Return the terminal events that set the modes.
 
-    A touch and an attractive force each have an event for begin and end. In a batch, the callbacks receive the lane of
-    the event. `inside` has the shape of the modes.
+    A touch and an attractive force each have an event for their start and one for their end. In a
+    batch, the callbacks receive the lane of the event. `inside` has the shape of the modes.
     """
 
     def touches(pair: int) -> Callable[..., bool]:

@@ -141,7 +141,7 @@ class Comparison:
 
 
 def phases(touching: NDArray[np.bool_], t: Array) -> list[tuple[float, float]]:
-    """Return begin and end of each rest, which is an uninterrupted contact of at least 1 ms."""
+    """Return the start and the end of each rest, which is an uninterrupted contact of at least 1 ms."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], touching.astype(int), [0]]))).reshape(-1, 2)
     whole = [(float(t[first]), float(t[last - 1])) for first, last in edges.tolist()]
     return [(begin, end) for begin, end in whole if end - begin >= 1e-3]

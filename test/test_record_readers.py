@@ -39,7 +39,7 @@ def test_mcap_s_own_reader_in_javascript_finds_every_message(run: Run, tmp_path:
     reader = RunReader(run.folder)
     assert [*reader.batches()]
     assert found["counts"] == dict(reader.counts) and found["counts"]["/contact_forces"] == COUNT
-    # the script also reads the file from begin to end and compares all checksums
+    # the script also reads the file from start to end and compares all checksums
     assert found["inOrder"] and found["done"] and found["streamed"] == reader.counts.total()
     assert found["profile"] == "ros2" and found["metadata"] == ["plow_twin", "plow_twin_loss"]
     assert "sensor_msgs/msg/JointState ros2msg" in found["schemas"]

@@ -53,7 +53,7 @@ def test_two_masses_pressed_together_move_as_their_eigenmodes() -> None:
     omega, amplitude = 40.0, 4e3
     scene = pressed(Harmonic("up and down", (0.0, amplitude), omega_rad_s=omega))
     result = simulate(scene, 1.0, output_dt=0.01, tol=1e-10)
-    # The state contains y of the head and v of the frame, both measured from the begin of contact, and their rates. The
+    # The state contains y of the head and v of the frame, both measured from the start of contact, and their rates. The
     # weight, and sine and cosine of the load, follow.
     k, c, mass = 2.0 * LAW.stiffness, 2.0 * (LAW.damping or 0.0), HEAD.mass_kg
     matrix = np.zeros((7, 7))

@@ -382,7 +382,7 @@ def test_contacts_under_gravity_alone_take_the_energy_of_the_height_lost(rotatio
 
 
 def test_energy_stored_where_a_recording_begins_is_no_gain_of_the_contacts(tmp_path: Path) -> None:
-    """Contacts almost without damping dissipate nothing, although 66 J are stored at the begin of the recording."""
+    """Contacts almost without damping dissipate nothing, although 66 J are stored at the start of the recording."""
     scene = load_scene(PAPER)
     scene = replace(scene, initial=Initial(q=(0.0151, 0.0, 0.0)), contact=replace(scene.contact, damping=1e-9))
     (tmp_path / "scene.yaml").write_text(dump_scene(scene))

@@ -194,7 +194,7 @@ def show_node(
     stopped: Callable[[], bool],
     on_open: Callable[[Screen], object],
 ) -> None:
-    """Show a node until `stopped`; the errors are those of `NodeWatch`, `NodeWatch.facts` and `Screen`."""
+    """Show a node until `stopped` returns True. The errors are those of `NodeWatch`, `NodeWatch.facts` and `Screen`."""
     with ExitStack() as opened:
         opened.enter_context(ros())
         watch = opened.enter_context(closing(NodeWatch(namespace, name, wait_s, stopped)))

@@ -57,7 +57,7 @@ _POSE_HZ: Final = 100.0
 _POSE_NOISE: Final = np.array([5e-4, 5e-4, 2e-3])
 #: Time [s] without an answer after which samples are counted as lost.
 _STALL_S: Final = 2.0
-#: Begin of a serialised message that begins with a stamp: 4 bytes of encapsulation, sec and nanosec.
+#: First bytes of a serialised message that begins with a stamp: 4 bytes of encapsulation, sec and nanosec.
 _STAMP: Final = struct.Struct("<4xiI")
 
 

@@ -29,8 +29,7 @@ class RunSummary:
     ----------
     largest, mean_in_contact : ndarray, shape (8,)
         Largest force, and impulse divided by the time in contact [N]. The time in contact is a sum of sample intervals,
-        so
-        each touch adds an uncertainty of one interval.
+        so each touch adds an uncertainty of one interval.
     makes : ndarray, shape (8,)
         Number of touches.
     contact_sets : dict

@@ -25,7 +25,6 @@ def read_table(path: Path, columns: Sequence[str] | None = None, key: str = "fil
     `columns` are the names of the columns of time, Fx, Fy and M. The default names are `t` (or `time`), `fx`, `fy` and
     `m`. Lines that start with `#` are skipped. `key` is the name of the file in error messages.
 
-
     Raises
     ------
     SceneError

@@ -40,9 +40,9 @@ _NO_TOPIC: Final = re.compile(r"[+#\x00-\x1f]|^\$")
 class WayOut:
     """Description of an output.
 
-    `name` is its part of the diagnostics, and the address contains no credentials. The modules are those that the
-    process of the output imports. The first message to the process contains the options. `may_acknowledge` is True if
-    an operator at the destination may acknowledge alarms.
+    `name` is the part of the diagnostics for the output. `address` contains no credentials. `modules` are the modules
+    that the process of the output imports. `first` is the first message to this process, with the options.
+    `may_acknowledge` is True if an operator at the destination may acknowledge alarms.
     """
 
     name: str

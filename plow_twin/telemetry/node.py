@@ -22,7 +22,7 @@ def send_node(
     stopped: Callable[[], bool],
     on_error: Callable[[str], object],
 ) -> int:
-    """Send the results of a node until `stopped`. Return the number of messages that were lost on the way.
+    """Send the results of a node until `stopped` returns True. Return the number of messages that were lost on the way.
 
     `scene` is needed if the file of the node's scene cannot be read on this machine. `on_error` receives a text
     whenever the receiver of an output stops or resumes accepting messages.

@@ -3,7 +3,6 @@
 The messages have the format of `sparkplug_b.proto` of Eclipse Tahu. The format is built here from the published field
 numbers, because that file has another licence.
 
-
 References
 ----------
 Eclipse Sparkplug specification 3.0.0, sections 5 (sequence, birth and death) and 6 (payloads).

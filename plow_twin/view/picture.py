@@ -185,7 +185,7 @@ def _curves(
     """Draw curves. If the rows are in bins, draw the band from the least to the largest value of each bin.
 
     `only_largest` omits the bands, for forces whose least value is nearly always zero. Lines are interrupted at the
-    `gaps` (begin and end [s]).
+    `gaps` (start and end [s]).
     """
     axis.set_ylabel(label)
     if not rows:

@@ -150,7 +150,7 @@ class RunCurves:
         self._samples(batch.entries.stamp_ns[samples[samples >= done]])
 
     def _samples(self, stamps: NDArray[np.int64]) -> None:
-        """Add the stamps of samples. The first sample after the begin of a hold ends the hold."""
+        """Add the stamps of samples. The first sample after the start of a hold ends the hold."""
         if not len(stamps):
             return
         behind = stamps[stamps > (self._held_since_ns or 0)]

@@ -169,7 +169,7 @@ def _overlapping(windows: Windows, others: Windows) -> np.ndarray[Any, Any]:
         return np.zeros(len(windows.start_ns), bool)
     order = np.argsort(others.start_ns)
     (begins, ends), (starts, stops) = (
-        # begin and end of the part of a window that certainly contains messages
+        # start and end of the part of a window that certainly contains messages
         ((part.start_ns + (1.0 - FULL) * part.length_ns), (part.start_ns + FULL * part.length_ns))
         for part in (windows, others)
     )

@@ -114,7 +114,6 @@ def run_all(
     by the ratio of the scene's clearance to the published clearance. The runs of section 5 end at 20 s, or at `t_end`
     if it is smaller. Rows whose run fails are not computed.
 
-
     Raises
     ------
     SceneError
