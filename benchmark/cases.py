@@ -147,7 +147,6 @@ def pose_error(reference: Array, scale: Sequence[float]) -> Callable[[Array], fl
 
 
 def table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table."""
     body = ["| " + " | ".join(line) + " |" for line in (head, *lines)]
     return "\n".join([body[0], "|" + "---|" * len(head), *body[1:]])
 

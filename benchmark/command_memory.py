@@ -38,7 +38,6 @@ COMMANDS = {
 
 
 def write_poses(path: Path, load: Path, count: int) -> None:
-    """Write every tenth pose of the motion under a load, with noise."""
     twin, rng = Twin(load_scene(scene_path("paper")), excitation="sampled"), np.random.default_rng(1)
     rows = np.zeros(_BATCH, ROW)
     with load.open() as loads, path.open("w") as file:

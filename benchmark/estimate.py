@@ -91,7 +91,6 @@ def summary(name: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def as_markdown(groups: Sequence[dict[str, Any]]) -> str:
-    """Return the results as a Markdown table."""
     lines = [
         "| group | truths | RMSE gx, gy [mm] | coverage gx, gy | median width [mm] | flagged as it should be | "
         "range of motion [mm] | CPU [s] |",
@@ -126,7 +125,6 @@ def load_rows(path: Path) -> list[dict[str, Any]]:
 @click.option("--periods", type=float, help="Load periods of data; the group's by default.")
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "estimate.jsonl", show_default=True)
 def main(groups: tuple[str, ...], truths: int, seed: int, periods: float | None, out: Path) -> None:
-    """Run the groups, and write one line of JSON for each truth."""
     warm_up(draw(type(GROUPS["plain"])("start", periods=1.0), 0).nominal)
     rows = load_rows(out)
     done = {(row["group"], row["seed"]) for row in rows}

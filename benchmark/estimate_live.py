@@ -55,7 +55,6 @@ def shares(truth: Truth, load: Load, members: int) -> list[float]:
 @click.option("--members", default=256, show_default=True)
 @click.option("--seed", default=25_000, show_default=True)
 def main(members: int, seed: int) -> None:
-    """Print the shares of a core for each load."""
     rng = np.random.default_rng(seed)
     click.echo(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores")
     for name in ("plain", "stochastic"):

@@ -272,7 +272,6 @@ def _correlated(rng: np.random.Generator, t: Array, time_s: float = 0.5) -> Arra
 
 
 def _measured(kind: Kind, rng: np.random.Generator, t: Array, fine: Array, motion: Array) -> tuple[Array, Array]:
-    """Return the stamps and poses of the sensor."""
     turned = motion.copy()
     angle = rng.uniform(0.0, 2.0 * np.pi)
     arm = kind.lever_m * np.array([np.cos(angle), np.sin(angle)])
@@ -360,7 +359,6 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
 
 
 def as_markdown(groups: dict[str, dict[str, float]]) -> str:
-    """Return the results as a Markdown table."""
     lines = [
         "| what differs | clearances | published | interval below 4 mm | RMSE [mm] | coverage | median width [mm] | "
         "beyond 3 deviations | CPU [s] |",
@@ -380,7 +378,6 @@ def as_markdown(groups: dict[str, dict[str, float]]) -> str:
 @click.option("--seed", default=80000, show_default=True, help="First seed.")
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "estimate_mismatch.jsonl", show_default=True)
 def main(kinds: tuple[str, ...], truths: int, seed: int, out: Path) -> None:
-    """Run the kinds of machines, and write one line of JSON for each truth."""
     warm_up(load_scene(ROOT / "config" / "paper.yaml"))
     rows = load_rows(out)
     done = {(row["kind"], row["seed"]) for row in rows}

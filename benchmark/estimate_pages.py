@@ -191,7 +191,6 @@ def filter_table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def filters() -> str:
-    """Return the table of the two filters for the truths of the estimate."""
     return filter_table(load_rows(RESULTS / "filter_peers.jsonl"))
 
 

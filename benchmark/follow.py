@@ -161,7 +161,6 @@ def as_markdown(rows: Sequence[dict[str, Any]]) -> str:
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS, show_default=True)
 @click.option("--table", "alone", is_flag=True, help="Run nothing.")
 def main(groups: tuple[str, ...], truths: int, seed: int, members: int, out: Path, alone: bool) -> None:
-    """Run the groups, and write one line of JSON for each truth."""
     rows = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
     done = {(row["group"], row["seed"]) for row in rows}
     warm_up(draw(Group("start", periods=1.0), 0).nominal)

@@ -101,7 +101,6 @@ def _play(runtime: Runtime, truth: Truth) -> tuple[list[int], list[int]]:
 
 @click.command()
 def main() -> None:
-    """Print the table of CPU times in ms."""
     click.echo("| contact | `follow` | forces out: median, 90 %, 99 % | all: median, mean |\n|---|---|---|---|")
     for title, stiffness in (("soft", (3e6, 3e8)), ("hard", (1e9, 1e11))):
         truth = draw(replace(GROUPS["plain"], stiffness=stiffness, periods=2.2), 71003)

@@ -32,7 +32,6 @@ def measured_laws() -> str:
 
 
 def measured_drops() -> str:
-    """Return the table of distances, angles, coverage and scores of the drops."""
     rows = []
     for name, one in _part("square").items():
         coverage = ["x {:.2f}, z {:.2f}, theta {:.2f}".format(*each) for each in one["coverage"]]
@@ -65,7 +64,6 @@ def measured_rigid() -> str:
 
 
 def measured_table() -> str:
-    """Return the table of errors of the estimated height of the table."""
     found = _part("table")
     rows = {
         "estimated": f"{found['estimated']} of {found['drops']} drops",

@@ -118,7 +118,6 @@ def one_month(seed: int, day_m: float) -> dict[str, Any]:
 
 
 def true_path(one: Machine, rng: np.random.Generator, day_m: float) -> life.Path:
-    """Return the path of the true wear over the month."""
     jump, periods = tuning.JUMP, tuning.MEAN_PERIODS
     tuning.JUMP, tuning.MEAN_PERIODS = (jump[0] / 4.0, jump[1]), (periods[0], 4 * periods[1])
     try:

@@ -35,7 +35,6 @@ _DENSE_ONLY = ("MuJoCo", "Exudyn")
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Draw error against run time for both bench scenes."""
     figure, panels = plt.subplots(1, 2, figsize=(12.5, 5.6), sharey=True, layout="constrained")
     titles = {"kv": "Kelvin-Voigt, F = max(0, K d + C d')", "hc": "Hunt-Crossley, F = max(0, K d$^{1.5}$ (1 + λ d'))"}
     for panel, (scene, title) in zip(panels, titles.items(), strict=True):

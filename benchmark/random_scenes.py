@@ -199,7 +199,6 @@ def make() -> None:
 
 
 def load() -> RandomScenes:
-    """Read the stored scenes and references."""
     with np.load(DATA) as saved:
         restitution = json.loads(str(saved["restitution"]))
         scenes = [_scene_of(line, e) for line, e in zip(saved["lines"], restitution, strict=True)]

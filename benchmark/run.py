@@ -60,7 +60,6 @@ Fill = Callable[[Sequence[Row]], None]
 )
 @click.option("--summary", "page", type=click.Path(path_type=Path, dir_okay=False), help="Markdown file of the tables.")
 def main(quick: bool, only: tuple[str, ...], repeats: int, out: Path | None, page: Path | None) -> None:
-    """Run the benchmark."""
     complete = not quick and not only
     if out is None and not complete:
         raise click.UsageError("a part is not the committed table: name a file with --out")

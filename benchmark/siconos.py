@@ -148,7 +148,6 @@ def phases(touching: NDArray[np.bool_], t: Array) -> list[tuple[float, float]]:
 
 
 def compare(name: str, data: Array) -> list[Comparison]:
-    """Compare one reference with our slider under the load of its mechanism."""
     t, angles, rates = data[:, _TIME], np.c_[2.0 * np.pi * data[:, _TURNS], data[:, _ROD]], data[:, _RATES]
     ours = our_slider(t, angles, rates, 1e9, 1e-4)
     theirs = GAP * data[:, _HEIGHT]

@@ -69,13 +69,11 @@ class Page:
                 self.errors.append(str(entry))
 
     def evaluate(self, expression: str) -> Any:
-        """Return the value of an expression in the page."""
         found = self.call("Runtime.evaluate", expression=expression)
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
     def picture(self) -> bytes:
-        """Return a picture of the page as PNG."""
         return base64.b64decode(self.call("Page.captureScreenshot")["data"])
 
 
@@ -141,7 +139,6 @@ class FirefoxPage:
         return found["result"].get("value")
 
     def picture(self) -> bytes:
-        """Return a picture of the page as PNG."""
         return base64.b64decode(self._call("browsingContext.captureScreenshot", context=self._context)["data"])
 
 

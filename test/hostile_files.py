@@ -34,7 +34,6 @@ def _pairs(pairs: dict[str, str]) -> bytes:
 
 
 def record(opcode: int, body: bytes) -> bytes:
-    """Return an MCAP record."""
     return struct.pack("<BQ", opcode, len(body)) + body
 
 

@@ -14,7 +14,6 @@ def _record(opcode: int, body: bytes) -> bytes:
 
 
 def beginning() -> bytes:
-    """Return magic, header and metadata record of a run."""
     pairs = _text("layout_version") + _text("4")
     metadata = _text("plow_twin") + struct.pack("<I", len(pairs)) + pairs
     return b"\x89MCAP0\r\n" + _record(0x01, _text("ros2") + _text("plow_twin")) + _record(0x0C, metadata)

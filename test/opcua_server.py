@@ -38,8 +38,6 @@ class OneUser(UserManager):
 
 
 class Plant:
-    """A server with three nodes and their history."""
-
     def __init__(self, server: Server, nodes: list[Any]) -> None:
         self._server, self._nodes = server, nodes
 
@@ -79,7 +77,6 @@ class Plant:
         self._server.iserver.history_manager.storage.read_node_history = read
 
     async def refuse(self, refused: bool) -> None:
-        """Refuse subscriptions, or accept them again."""
         service = self._server.iserver.subscription_service
         if refused:
 

@@ -33,7 +33,6 @@ PAPER_AMPLITUDE = (32_000.0, -11_000.0, -45_495.0)
 
 
 def paper_sample(index: int, first_ns: int = BASE_NS) -> Sample:
-    """Return a sample of the paper's load at 1 kHz."""
     phase = float(np.sin(2e-3 * index))
     fx, fy, moment = (phase * amplitude for amplitude in PAPER_AMPLITUDE)
     return Sample(first_ns + index * STEP_NS, (fx, fy, moment))
@@ -51,8 +50,6 @@ def paper_entries(count: int) -> list[Entry]:
 
 @dataclass
 class Run:
-    """A recording, and all entries and messages that were written to it."""
-
     folder: Path
     file: Path
     loss: LossReport

@@ -117,7 +117,6 @@ class Probe:
         return heard
 
     def until(self, reached: Callable[[], Any], what: str, timeout_s: float = WAIT_S) -> None:
-        """Wait until a condition is true."""
         give_up = time.monotonic() + timeout_s
         while not reached():
             assert time.monotonic() < give_up, f"{what}: not within {timeout_s} s; last status {self.status[-1:]}"
@@ -233,5 +232,4 @@ def bench(folder: Path, lifecycle: str = "active", arguments: Sequence[str] = ()
 
 
 def value(status: DiagnosticStatus, key: str) -> str:
-    """Return the value of a key in a status."""
     return {item.key: item.value for item in status.values}[key]

@@ -171,7 +171,6 @@ def test_view_writes_to_the_given_file(run: Run, tmp_path: Path) -> None:
 
 
 def ports_of(address: str) -> list[int]:
-    """Return the ports of a page and of its data."""
     return [int(port) for port in re.findall(r"127\.0\.0\.1(?::|%3A)(\d+)", address)]
 
 

@@ -293,7 +293,6 @@ def _twin(*options: str | Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 
 def _said(process: subprocess.Popen[str], begin: str) -> str:
-    """Return the line on standard error that begins with the text `begin`."""
     assert process.stderr is not None
     while line := process.stderr.readline():
         if line.startswith(begin):

@@ -35,7 +35,6 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def nested(opening: str, levels: int) -> str:
-    """Return collections that are opened but never closed."""
     return opening * levels
 
 
@@ -56,7 +55,6 @@ def merges(levels: int, times: int = 9) -> str:
 
 
 def keys(count: int) -> str:
-    """Return a mapping with `count` keys."""
     return "\n".join(f"key{number:07d}: 1" for number in range(count))
 
 

@@ -439,15 +439,12 @@ def test_a_live_twin_whose_standard_output_nobody_reads_goes_on_and_ends_when_it
 
 
 def _metric(port: int, name: str) -> float:
-    """Return a value of the page for Prometheus."""
     with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as page:
         lines = [line.split() for line in page.read().decode().splitlines() if line.startswith(f"{name} ")]
     return float(lines[0][1]) if lines else 0.0
 
 
 class Live:
-    """`plow-twin live --lines` in a separate process."""
-
     def __init__(self, *arguments: str, **options: Any) -> None:
         environment = os.environ | {"PYTHONPATH": str(ROOT), **options.pop("environment", {})}
         self.process = subprocess.Popen(
@@ -824,7 +821,6 @@ def test_readers_of_metrics_that_ask_nothing_are_bounded() -> None:
 
 
 def _expressions(board: dict[str, Any]) -> list[str]:
-    """Return the queries in a Grafana dashboard."""
     return [target["expr"] for panel in board["panels"] for target in panel["targets"]]
 
 

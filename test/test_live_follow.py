@@ -92,7 +92,6 @@ def _poses(truth: Truth, begin: float, end: float) -> list[Pose]:
 
 
 def _in_turn(truth: Truth, begin: float, end: float) -> list[Entry]:
-    """Return samples and poses sorted by stamp."""
     entries: list[Sample | Pose] = [*_samples(truth, begin, end), *_poses(truth, begin, end)]
     return sorted(entries, key=lambda entry: (entry.stamp_ns, isinstance(entry, Pose)))
 
@@ -380,7 +379,6 @@ def test_twins_that_catch_up_later_give_the_same_bits(truth: Truth) -> None:
 
 
 def _late(truth: Truth, t: float) -> list[Sample]:
-    """Return a sample between two samples of the load."""
     first, second = _samples(truth, t - 1e-6, t + 0.0101)[:2]
     return [replace(first, stamp_ns=(first.stamp_ns + second.stamp_ns) // 2)]
 

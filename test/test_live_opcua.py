@@ -66,7 +66,6 @@ class Plant:
         assert self._process.stdout.readline() == "done\n"
 
     def mend(self) -> None:
-        """Let clients connect."""
         self._door = socket.create_server(("127.0.0.1", self.port))
         threading.Thread(target=self._let_in, args=(self._door,), daemon=True).start()
 
@@ -77,7 +76,6 @@ class Plant:
         self.mend()
 
     def cut(self) -> None:
-        """Close all connections and refuse new connections."""
         for found in (self._door, *self._sockets):
             with suppress(OSError):
                 found.shutdown(socket.SHUT_RDWR)

@@ -41,7 +41,6 @@ STALE = ("--set", "excitation_timeout=3600")
 
 
 def _hash(password: str) -> str:
-    """Return the hash of a password in the format of the broker's library."""
     try:
         from pwdlib import PasswordHash
     except ModuleNotFoundError:  # amqtt before 0.12
@@ -290,7 +289,6 @@ def _until(reached: Callable[[], bool], seen: object = None) -> None:
 
 @contextmanager
 def _open_broker(folder: Path, port: int) -> Iterator[None]:
-    """Yield a broker without TLS and without login."""
     config = {
         "listeners": {"default": {"type": "tcp", "bind": f"127.0.0.1:{port}"}},
         "plugins": {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}},

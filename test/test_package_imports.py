@@ -112,7 +112,6 @@ def _statements(path: Path) -> list[ast.Import | ast.ImportFrom]:
 
 
 def _imports(path: Path) -> Iterator[str]:
-    """Yield the full name of every import."""
     for node in _statements(path):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

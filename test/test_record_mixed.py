@@ -39,8 +39,6 @@ NAMES = {topic.name: f"/{topic.name}" for topic in TOPICS}
 
 
 class Front:
-    """A front end that stores the messages."""
-
     name, topics, follows_samples, sends_motion = "/plow_twin", NAMES, True, True
 
     def __init__(self) -> None:
@@ -240,7 +238,6 @@ def test_a_speed_before_the_first_sample_acts_from_there_on_however_often_it_is_
 
 
 def _drive(live: Mixed, random: Random, calls: int) -> None:
-    """Call a live twin with a random mix of inputs."""
     index, skipped, fails = 0, [], random.random() < 0.4
     span_ms = round(1000 * live.settings.rollback_span)
     kinds = {

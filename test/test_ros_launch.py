@@ -34,7 +34,6 @@ except PackageNotFoundError:
 
 @pytest.mark.launch_test
 def generate_test_description() -> LaunchDescription:
-    """Return a description that starts the twin as users start it."""
     twin = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(LAUNCH_FILE)), launch_arguments={"namespace": "launched"}.items()
     )

@@ -45,8 +45,6 @@ from plow_twin.stream.journal import Pose
 
 
 class _Flood:
-    """A queue that never becomes empty."""
-
     def __init__(self) -> None:
         self.fd = os.eventfd(1)
         self.taken = 0

@@ -28,7 +28,6 @@ def _publication(
 
 
 def _changes(alarms: Alarms, published: Published) -> bool:
-    """Return whether a publication changes a level."""
     return list(alarms.feed(published)) == [0]
 
 

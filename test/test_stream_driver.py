@@ -60,8 +60,6 @@ def _some(published: Published) -> Published | None:
 
 
 class Bench:
-    """A driver on a real twin, and its journal."""
-
     def __init__(self, policy: Policy | None = None, excitation: str = "sampled", *, every_sample: bool = True) -> None:
         self.journal: list[Entry] = []
         twin = Twin(SCENE, excitation="sampled" if excitation == "sampled" else "scene")
@@ -69,7 +67,6 @@ class Bench:
         self.driver = Driver(session, Intake(), policy or Policy(), every_sample=every_sample)
 
     def sample(self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int) -> Published | None:
-        """Return the publication of one sample, or None."""
         return _some(Published.joined(list(self.driver.samples([(stamp_ns, wrench)], now_ns))))
 
     def silence(self, now_ns: int) -> Published | None:

@@ -36,7 +36,6 @@ def _arrival(index: int) -> Arrival:
 
 
 def _newest(frame: Published, name: str) -> Any:
-    """Return a field of the newest row."""
     return frame.rows[name][-1]
 
 

@@ -29,8 +29,6 @@ WRENCH = compile_loads(PAPER.loads).at(np.arange(2000) * 1e-3).tolist()
 
 
 class Bench:
-    """A driver on a real twin, with its journal and publications."""
-
     def __init__(self, scene: Scene) -> None:
         self.journal: list[Entry] = []
         self.out: list[Published] = []

@@ -52,8 +52,6 @@ def _entries() -> list[Entry]:
 
 
 class Run:
-    """A session, with everything that it has emitted and published."""
-
     def __init__(self) -> None:
         self.emitted: list[Entry] = []
         self.publications: list[Published] = []

@@ -21,7 +21,6 @@ DATA = Path(__file__).resolve().parent.parent / "benchmark" / "data" / "measured
 
 @pytest.fixture(scope="module")
 def impacts() -> tuple[np.ndarray, np.ndarray]:
-    """Return the states before and after the measured impacts of the ellipse."""
     with np.load(DATA / "ellipse_impacts.npz") as data:
         return data["before"], data["after"]
 

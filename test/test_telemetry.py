@@ -25,8 +25,6 @@ from plow_twin.telemetry.opcua.model import NAMESPACE
 
 
 class Heard:
-    """A client that collects the events of conditions."""
-
     def __init__(self) -> None:
         self.events: list[Any] = []
 

@@ -34,7 +34,6 @@ def test_stress_draws_new_examples_prints_its_seed_and_shrinks() -> None:
 
 @pytest.fixture
 def metadata(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """Return the arguments of setup() in setup.py."""
     stated: dict[str, Any] = {}
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr("setuptools.setup", lambda **keywords: stated.update(keywords))

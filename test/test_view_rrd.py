@@ -60,7 +60,6 @@ def read(path: Path) -> dict[str, pa.Table]:
 
 
 def curve_names(path: Path) -> dict[str, str]:
-    """Return the name of each curve in the legend of a rerun file."""
     names: dict[str, str] = {}
     for chunk in RrdReader(str(path)).stream():
         batch = chunk.to_record_batch()
@@ -70,7 +69,6 @@ def curve_names(path: Path) -> dict[str, str]:
 
 
 def journal_around_the_hole(folder: Path) -> list[Sample]:
-    """Return the samples before and after the missing entries."""
     samples = [
         (record.sequence, record.entry)
         for record in RunReader(folder)

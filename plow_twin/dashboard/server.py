@@ -121,7 +121,6 @@ class Pages:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _send_updates(self, socket: WebSocket) -> None:
-        """Send new values to the page, and count the updates that the page misses."""
         board, version, skipped = self._board, 0, 0
         while not self._link.broken:
             news = board.news

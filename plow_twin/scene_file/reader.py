@@ -179,7 +179,6 @@ def _samples(raw: Mapping[str, Any], path: str, base: Path | None) -> tuple[Any,
 
 
 def _problems_across(parts: Mapping[str, Any]) -> tuple[Problem, ...]:
-    """Return the conflicts between the parts that have no problems of their own."""
     try:
         Scene(**{**_SOUND, **parts})
     except SceneError as error:

@@ -144,7 +144,6 @@ class FittedPicture:
 
 
 def _broken(t: Array, values: Array) -> tuple[Array, Array]:
-    """Return a curve with NaN inserted at each gap."""
     there = np.isfinite(values)
     t, values = t[there], values[there]
     steps = np.diff(t)

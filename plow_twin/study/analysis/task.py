@@ -193,7 +193,6 @@ def _is_result(file: Path, out: Path) -> bool:
 
 
 def _scene_state(scene: Path | None) -> list[str] | None:
-    """Return the name of a scene and a hash of its contents."""
     if scene is None:
         return None
     try:

@@ -220,5 +220,4 @@ def objective_of(objective: Objective, values: Mapping[str, Value]) -> float:
 
 
 def _sums(residuals: Array) -> Array:
-    """Return the sum of squares of each row of residuals."""
     return np.asarray((residuals**2).sum(axis=1))

@@ -89,7 +89,6 @@ class PaperRuns:
 
 
 def _check_scene(scene: Scene) -> None:
-    """Raise a `SceneError` if the scene cannot be compared with the paper."""
     problems = []
     if tuple(sorted(scene.frame.labels)) != CORNERS:
         problems.append(
