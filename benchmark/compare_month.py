@@ -64,7 +64,7 @@ def _heights() -> np.ndarray:
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option("--days", default=30, show_default=True)
 @click.option("--hours", default=24.0, show_default=True, help="Length of a day's run.")
-@click.option("--rate", default=1.0, show_default=True, help="Samples of the load a second.")
+@click.option("--rate", default=1.0, show_default=True, help="Samples of the load per second.")
 @click.option("--verb", type=click.Choice(["compare", "analyse"]), default="compare", show_default=True)
 @click.option("--workers", default=1, show_default=True)
 def main(folder: Path, days: int, hours: float, rate: float, verb: str, workers: int) -> None:

@@ -122,7 +122,7 @@ def load_rows(path: Path) -> list[dict[str, Any]]:
 @click.option("--group", "groups", multiple=True, type=click.Choice(list(GROUPS)))
 @click.option("--truths", default=50, show_default=True)
 @click.option("--seed", default=5000, show_default=True, help="First seed.")
-@click.option("--periods", type=float, help="Load periods of data; the group's by default.")
+@click.option("--periods", type=float, help="Number of load periods. The default is that of the group.")
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "estimate.jsonl", show_default=True)
 def main(groups: tuple[str, ...], truths: int, seed: int, periods: float | None, out: Path) -> None:
     warm_up(draw(type(GROUPS["plain"])("start", periods=1.0), 0).nominal)

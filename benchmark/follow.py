@@ -159,7 +159,7 @@ def as_markdown(rows: Sequence[dict[str, Any]]) -> str:
 @click.option("--seed", default=72000, show_default=True, help="First seed.")
 @click.option("--members", default=MEMBERS, show_default=True)
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS, show_default=True)
-@click.option("--table", "alone", is_flag=True, help="Run nothing.")
+@click.option("--table", "alone", is_flag=True, help="Only print the table of the stored results.")
 def main(groups: tuple[str, ...], truths: int, seed: int, members: int, out: Path, alone: bool) -> None:
     rows = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
     done = {(row["group"], row["seed"]) for row in rows}

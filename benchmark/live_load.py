@@ -440,11 +440,15 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--minutes", type=float, default=0.0)
-    parser.add_argument("--rate", type=float, default=1000.0, help="samples a second of --minutes")
-    parser.add_argument("--beside", action="store_true", help="all at once, for --seconds")
+    parser.add_argument("--rate", type=float, default=1000.0, help="sample rate for --minutes [Hz]")
+    parser.add_argument("--beside", action="store_true", help="run echo and nodes at the same time, for --seconds")
     parser.add_argument("--role", nargs="+", default=[])
-    parser.add_argument("--estimate", action="store_true", help="without and with the estimate, for --seconds each")
-    parser.add_argument("--opcua", action="store_true", help="beside an OPC UA server, for --minutes")
+    parser.add_argument(
+        "--estimate", action="store_true", help="run the node without and with the estimate, for --seconds each"
+    )
+    parser.add_argument(
+        "--opcua", action="store_true", help="run `plow-twin live` with an OPC UA server, for --minutes"
+    )
     options = parser.parse_args()
     if options.opcua:
         import opcua_load

@@ -608,7 +608,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--plot", action="store_true", help="draw the stored results")
     parser.add_argument(
-        "--only", choices=("square", "ellipse", "fit", "table"), help="compute one part, keep the other"
+        "--only", choices=("square", "ellipse", "fit", "table"), help="compute only this part of the results"
     )
     chosen = parser.parse_args()
     drops = Drops.load(DATA / "square_drops.npz")

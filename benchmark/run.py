@@ -48,15 +48,15 @@ Fill = Callable[[Sequence[Row]], None]
 
 
 @click.command()
+@click.option("--quick", is_flag=True, help="For tests: run few cases of our solver once, without picture and pages.")
+@click.option("--only", multiple=True, type=click.Choice(SECTIONS), help="Measure only this part. May be repeated.")
 @click.option(
-    "--quick", is_flag=True, help="Own rows of KV only, few of them, once; for tests. Writes no picture and no page."
+    "--repeats", default=5, show_default=True, type=click.IntRange(1), help="Number of rounds over all cases."
 )
-@click.option("--only", multiple=True, type=click.Choice(SECTIONS), help="Measure this part only; repeatable.")
-@click.option("--repeats", default=5, show_default=True, type=click.IntRange(1), help="Rounds over all cases.")
 @click.option(
     "--out",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="CSV file; benchmark/results/<machine>.csv by default.",
+    help="CSV file. The default is benchmark/results/<machine>.csv.",
 )
 @click.option("--summary", "page", type=click.Path(path_type=Path, dir_okay=False), help="Markdown file of the tables.")
 def main(quick: bool, only: tuple[str, ...], repeats: int, out: Path | None, page: Path | None) -> None:

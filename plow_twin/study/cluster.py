@@ -50,4 +50,6 @@ def completed(client: Client, futures: Iterable[Future[Any]]) -> Iterator[Future
             workers_seen = now if client.scheduler_info()["workers"] else workers_seen
             if now - workers_seen > WORKER_TIMEOUT_S:
                 got = f"got no worker for {WORKER_TIMEOUT_S:g} s, expected at least one"
-                raise StudyError(f"dask: {got}; finished chunks are kept: run it again for the rest") from None
+                raise StudyError(
+                    f"dask: {got}; finished chunks are stored, and the same command computes the rest"
+                ) from None

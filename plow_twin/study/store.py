@@ -71,7 +71,7 @@ class Store:
         if differing or facts.get("format") != FORMAT:
             difference = "; ".join(_difference(key, stored.get(key), asked[key]) for key in differing) or "its format"
             raise StudyError(
-                f"{self.folder}: holds another sweep, which differs in {difference}. Use another --out or --fresh"
+                f"{self.folder}: contains another sweep, which differs in {difference}. Use another --out or --fresh"
             )
 
     @property

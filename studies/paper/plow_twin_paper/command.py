@@ -33,7 +33,7 @@ _STYLES = {"yes": "blue", "no": "dark_orange", "not computed": "dim"}
     help="New or empty folder for the report.",
 )
 @click.option("--t-end", metavar="T", type=POSITIVE, default=60.0, show_default=True, help="Length of the runs [s].")
-@click.option("--workers", type=click.IntRange(min=1), help="Threads; all cores by default.")
+@click.option("--workers", type=click.IntRange(min=1), help="Number of threads. The default is the number of cores.")
 @click.option(
     "--scene",
     default="paper",
