@@ -29,7 +29,6 @@ _DAY_S, _SPAN_S = 86_400, 600
 
 
 def write_days(folder: Path, days: int, hours: float, rate_hz: float) -> None:
-    """Write the runs of all days that are missing in the folder."""
     scene = load_scene("paper")
     count = round(_SPAN_S * rate_hz)
     stamps = np.round(1e9 / rate_hz * np.arange(count)).astype(np.int64)

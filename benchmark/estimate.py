@@ -31,7 +31,6 @@ RESULTS = Path(__file__).resolve().parent / "results"
 
 
 def run_one(name: str, seed: int, periods: float | None = None) -> dict[str, Any]:
-    """Run the estimate on one truth. Return its errors as a row."""
     group = GROUPS[name]
     try:
         truth = draw(group if periods is None else type(group)(**{**vars(group), "periods": periods}), seed)

@@ -311,7 +311,6 @@ def _telemetry(kind: Kind, fine: Array, believed: Array) -> tuple[Array, Array]:
 
 
 def run_one(name: str, seed: int) -> dict[str, Any]:
-    """Run the estimate on one machine. Return its errors as a row."""
     truth = draw(KINDS[name], seed)
     begin = time.process_time()
     result = estimate(truth.nominal, truth.load, truth.poses)

@@ -63,7 +63,6 @@ _UNKNOWN_NOISE = 3e-4
 
 @kernel(entry=True)
 def move(params, parts, states, saved, work, totals, times, wrench, rows, pace):  # type: ignore[no-untyped-def]
-    """Determine the contact modes of all members, and advance the members."""
     marks = np.zeros(0, np.int64)
     for m in range(states.size):
         settle_modes(params[m], states[m], parts.terms.stick)

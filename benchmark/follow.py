@@ -46,7 +46,6 @@ _FINE = 1e-4
 
 
 def run_one(name: str, seed: int, members: int) -> dict[str, Any]:
-    """Follow one truth. Return the errors as a row."""
     try:
         truth = draw(GROUPS[name], seed)
     except SolverError as error:  # the head has passed through a wall, which is impossible in a real machine

@@ -33,8 +33,6 @@ _STEP, _END, _FIRST, _ESTIMATED = 1e-3, 6.0, 1.0, 0.5
 
 
 class _Front:
-    """A front end of the runtime that discards all messages."""
-
     name, follows_samples, sends_motion = "/plow_twin", False, True
     topics = {topic.name: f"/{topic.name}" for topic in TOPICS}  # noqa: RUF012
 

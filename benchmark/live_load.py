@@ -97,7 +97,6 @@ def echo(raw: bool = False, namespace: str = "live_load") -> None:
 
 
 def send(rate_hz: float, seconds: float) -> None:
-    """Publish samples. Each stamp is the time of sending."""
     import rclpy
     from geometry_msgs.msg import WrenchStamped
 
@@ -295,7 +294,6 @@ def compare(seconds: float, repeats: int) -> None:
 
 
 def _targets(rows: dict[Case, dict[str, float]]) -> Iterator[tuple[str, float, float]]:
-    """Yield the description, the result and the limit of each target."""
     bare = rows[ECHO]
     for case, how in ((ON_SAMPLE, ""), (RECORDED, ", recording")):
         row = rows[case]

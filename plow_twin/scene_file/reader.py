@@ -110,7 +110,6 @@ def _scene(raw: Any, problems: list[Problem], base: Path | None, source: str) ->
 def _read_parts(
     raw: Mapping[str, Any], bad: set[str], marks: dict[str, Provenance], base: Path | None, problems: list[Problem]
 ) -> dict[str, Any]:
-    """Build the parts of a scene, except the parts with problems."""
     parts: dict[str, Any] = {}
     for key, part in SECTIONS.items():
         if key in raw and key not in bad:

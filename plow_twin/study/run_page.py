@@ -72,8 +72,6 @@ def _uplot(name: str) -> str:
 
 @dataclass
 class _Log:
-    """The events of a run as texts for the page."""
-
     samples: int = 0
     first_ns: int | None = None
     last_ns: int | None = None
@@ -83,7 +81,6 @@ class _Log:
 
     @classmethod
     def of(cls, reader: RunReader) -> _Log:
-        """Collect the events of a whole recording."""
         log, alarms = cls(), reader.header.topic(ALARMS)
         for batch in reader.batches():
             stamps = batch.entries.samples()[0]

@@ -109,7 +109,6 @@ class _Rows:
         return _Rows(self.segment, np.floor(self.place / width), self.least, self.largest)
 
     def merged(self) -> _Rows:
-        """Return one row for each segment and place."""
         order = np.lexsort((self.place, self.segment))
         segment, place = self.segment[order], self.place[order]
         first = np.flatnonzero(np.r_[True, (np.diff(segment) != 0) | (np.diff(place) != 0)])

@@ -218,7 +218,6 @@ def _thresholds(axis: Any, thresholds: Thresholds, factor: float) -> None:
 
 
 def _clearance(axis: Any, curves: RunCurves) -> None:
-    """Draw the clearances with their intervals, and mark the changes that are not due to wear."""
     axis.set_ylabel("clearance with its\n90 % interval [mm]")
     if not curves.clearance:
         _note_absence(axis, "not in the recording")

@@ -78,7 +78,6 @@ def near_optimal(space: Space, found: Calibration, excess: float) -> list[Cluste
 
 
 def _linked(points: Array, rows: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Return the rows of each cluster, found by complete linkage."""
     from scipy.cluster.hierarchy import fcluster, linkage
 
     if len(rows) == 1:

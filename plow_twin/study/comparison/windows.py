@@ -152,7 +152,6 @@ class _RunSums:
         self._newest: tuple[Indexes, Array] | None = None
 
     def add(self, name: str, part: Batched) -> None:
-        """Add messages of a topic."""
         window = part.stamp_ns // self._window_ns
         if (np.diff(window) < 0).any():
             part, window = _risen(part, window)
