@@ -3,9 +3,9 @@
     python benchmark/filter_peers.py --truths 5 --seed 5000 --group plain
 
 The state of both filters contains the pose and its rate, the clearances, softness, damping, load gains, and the bias
-and delay of the sensor. The process model of both filters is the solver of this project. Their initial state is the
-nominal scene with the prior of the estimate, and their measurement noise is the true noise of the sensor. Rows are
-appended to `results/filter_peers.jsonl`, and truths that are in the file are skipped.
+and delay of the sensor. The process model of both filters is the solver of this project. The initial state is the
+nominal scene with the prior of the estimate. The measurement noise is the true noise of the sensor. Rows are appended
+to `results/filter_peers.jsonl`, and truths that are in the file are skipped.
 """
 
 from __future__ import annotations

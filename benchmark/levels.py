@@ -50,7 +50,7 @@ def ladders(rows: Sequence[Row], scene: str, output_s: float, member: Member) ->
 def reach(ladder: Sequence[Row], level: float) -> Reached | None:
     """Return the shortest time for an error of at most `level`.
 
-    The time is that of one setting, or is interpolated between two neighbouring settings, linearly in the logarithms of
+    One setting gives the time, or it is interpolated between two neighbouring settings, linearly in the logarithms of
     time and error. Of these two settings, the looser misses the level and the tighter reaches it.
     """
     done = [row for row in ladder if row.status == "ok" and row.error is not None and row.wall_ms is not None]

@@ -56,8 +56,8 @@ CASES = (ECHO, RAW_ECHO, ON_SAMPLE, RECORDED, FIXED, FIXED_RECORDED, Case("fixed
 def echo(raw: bool = False, namespace: str = "live_load") -> None:
     """Answer each sample with three messages of the size of the node's messages.
 
-    With `raw`, the messages are serialised in advance, and only the stamp of the sample is written into them. This is
-    the least work of an rclpy node.
+    With `raw`, the messages are serialised in advance, and only the stamp of the sample is written into them. No rclpy
+    node can do less work.
     """
     import rclpy
     from geometry_msgs.msg import WrenchStamped

@@ -27,7 +27,7 @@ from live_load import ROOT, cpu_s
 
 NODES = ("Load.Fx", "Load.Fy", "Load.M")
 NAMESPACE = 2
-#: Publishing interval [ms] and queue length that the bare client requests, which are those of the twin.
+#: Publishing interval [ms] and queue length. Bare client and twin request the same values.
 PUBLISHING_MS, QUEUE = 10.0, 10_000
 #: Time [s] without a value after which the bare client ends.
 SILENCE_S = 3.0

@@ -90,9 +90,9 @@ def verdict(row: dict[str, Any]) -> list[Any]:
 def summary(name: str, factor: float, rows: list[dict[str, Any]]) -> str:
     """Return a summary of the effect of one variation on the clearances and verdicts.
 
-    The summary contains the largest change of a clearance in units of its standard deviation, and the RMSE and the
-    width relative to those of the chosen value. It also contains the number of estimated clearances whose interval
-    contains the truth, and the number of changed verdicts.
+    The summary contains the largest change of a clearance in units of its standard deviation, and the ratios of RMSE
+    and width to RMSE and width with the chosen value. It also contains the number of estimated clearances whose
+    interval contains the truth, and the number of changed verdicts.
     """
     base = {row["group"]: row for row in rows if row["name"] == ""}
     own = [row for row in rows if row["name"] == name and row["factor"] == factor]

@@ -160,7 +160,7 @@ def test_command_estimates_a_drop(follows: bool, drops, tmp_path) -> None:
 
 @pytest.fixture(scope="module")
 def elastic() -> dict[float, tuple[np.ndarray, np.ndarray]]:
-    """Return by stiffness the times and poses of a block in a guide with clearances of 30 mm and 22 mm, every 4 ms."""
+    """Return times and poses of a block in a guide with clearances of 30 mm and 22 mm, for each stiffness."""
     found = {}
     for stiffness in (1e4, 1e8):
         motion = simulate(guide(stiffness), t_end=12.0, output_dt=0.004, tol=1e-6)

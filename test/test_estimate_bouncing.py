@@ -142,7 +142,7 @@ def test_a_classifier_of_drawn_motions_finds_another_law() -> None:
 
 
 def test_log_odds_find_another_law_among_motions_whose_drawn_numbers_matter_more() -> None:
-    """The parameters move the features along a curve. This effect is ten times as large as that of law and noise."""
+    """The parameters move the features along a curve, ten times as far as law and noise do."""
     rng = np.random.default_rng(5)
     slope, curve, apart = rng.standard_normal((3, 40))
 

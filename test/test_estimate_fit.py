@@ -125,7 +125,7 @@ def test_starts_that_meet_end_the_search(
     problem, found = search.candidate(forward, unknowns, truth.poses, truth.load.period()) or (None, None)
     assert problem is not None and found is not None
     assert least <= fitted.call_count <= most
-    # one call gives the derivatives with respect to all six initial values, and one call those of each other unknown
+    # one call gives the derivatives with respect to all six initial values; each other unknown needs one call
     run = Mock(side_effect=forward.run)
     monkeypatch.setattr(forward, "run", run)
     problem.linearise(found.point)

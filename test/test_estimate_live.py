@@ -286,7 +286,7 @@ def test_other_pads_and_other_model_numbers_discard_earlier_estimates(
     # when the model is changed, an estimate of the previous machine is still being computed
     estimation.worker.found.append(_found(State.ESTIMATED, State.ESTIMATED))
     session.apply(SetModel(START_NS, json.dumps({"clearance.horizontal_m": 0.026})))
-    # the clearance is that of the model again: no estimate remains if the other clearance is not observable
+    # the model determines the clearance again: no estimate remains if the other clearance is not observable
     assert estimation.entry is None and set(estimation.states.values()) == {State.PRIOR}
     assert estimation.forecast is not None and estimation.poll(session) == {}
     told()

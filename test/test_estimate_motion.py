@@ -232,7 +232,7 @@ def test_a_clearance_without_evidence_is_not_estimated() -> None:
 
 
 def test_stated_deviations_of_the_measurements_are_believed() -> None:
-    """The stated deviations are lower bounds. They determine the intervals and the prior of the load's gains."""
+    """The stated deviations, which are lower bounds, determine the intervals and the prior of the load's gains."""
     scene = preset("paper")
     t = np.arange(0.0, 10.0, 0.01)
     wrench = compile_loads(scene.loads).at(t)

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.timeout(600)
 
 @pytest.fixture(scope="module")
 def found() -> dict[str, Any]:
-    """Compute the figures in a process that compiles the kernels and in a process that loads them. Both must agree."""
+    """Compute the figures in two processes, which must agree: one compiles the kernels, and the other loads them."""
     runs: list[dict[str, Any]] = []
     for _ in range(2):
         done = subprocess.run([sys.executable, PROGRAM], capture_output=True, text=True, check=False)

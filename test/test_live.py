@@ -130,7 +130,7 @@ def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(
 def test_a_time_that_stands_alone_is_no_clock_and_no_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     date = "2026-01-01T00:00:{:06.3f}".format
     rows = [f"{date(index * 1e-3)},1,2,3\n" for index in range(300)]
-    rows[150:150] = ["2080-01-01,1,2,3\n"]  # this stamp is not near the previous stamps
+    rows[150:150] = ["2080-01-01,1,2,3\n"]  # this stamp is more than fifty years after the previous stamp
     rows[200:200] = ["9999-12-31,1,2,3\n", "9999-12-31,1,2,3\n"]
     path = tmp_path / "load.csv"
     path.write_text("time,fx,fy,m\n" + "".join(rows))

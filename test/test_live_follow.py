@@ -242,7 +242,7 @@ def test_intervals_of_peaks_and_impulses_are_those_of_the_span_that_is_published
     for name in ("force", "peak", "impulse"):
         value, low, high = (live.column(f"{name}{end}") for end in ("", "_low", "_high"))
         assert (low <= value).all() and (value <= high).all() and (high > low).any()
-    # the peaks in a long publication are at least as large as those in the short publications of the same time
+    # each peak in a long publication is at least as large as the peaks in the short publications of its time
     other = Live(truth.nominal)
     for entry in _in_turn(truth, 0.0, 1.0):
         other.session.apply(entry)

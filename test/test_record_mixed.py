@@ -218,7 +218,7 @@ def test_late_samples_at_the_edge_of_the_memory_give_the_same_however_they_came(
 
 
 def test_a_late_speed_at_the_edge_of_the_memory_acts_where_it_did(tmp_path: Path) -> None:
-    """A replay has no intermediate states. They must not determine whether a speed is too old."""
+    """Whether a speed is too old must not depend on intermediate states, which a replay does not have."""
     live = Mixed(tmp_path, rollback_span=0.1)
     live.send(*map(_swinging, range(300)))
     for ms in (50, 190, 198, 199, 201):

@@ -162,7 +162,7 @@ def test_wear_that_could_not_be_saved_goes_on_unless_the_file_is_another_one(
 
         def fail(descriptor: int) -> None:
             calls.append(descriptor)
-            # the first sync is that of the file, the second is that of the folder with the new file
+            # the first call syncs the file, and the second call syncs the folder with the new file
             if len(calls) == 1 + waited:
                 raise OSError(28, "No space left on device")
 

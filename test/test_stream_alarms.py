@@ -58,7 +58,7 @@ def test_an_alarm_comes_after_its_duration_goes_below_its_hysteresis_and_stays_l
     _changes(alarms, _publication(30, 150.0))
     assert alarms.acknowledge() == ["force"] and _levels(alarms) == (Level.WARN, Level.WARN)
     raised = alarms.alarms["force"].raised
-    # value and threshold are those of the higher level, although the level has decreased
+    # value and threshold still belong to the higher level, although the level has decreased
     assert raised is not None and (raised.value, raised.threshold) == (300.0, 100.0)
 
 

@@ -293,7 +293,7 @@ def test_no_input_is_removed_and_results_of_two_recordings_never_stand_side_by_s
     with pytest.raises(RecordingError):
         Task(broken, PAPER, None, (), out).run()
     assert not [path.name for path in out.iterdir() if path.is_file()]
-    # with another scene, or the same scene in another role, it is another task
+    # another scene, or the same scene in another role, makes another task
     Task(runs / "r0", PAPER, None, (narrow,), out).run()
     assert Task(runs / "r0", PAPER, None, (narrow,), out).stored() is not None
     assert Task(runs / "r0", PAPER, narrow, (), out).stored() is None

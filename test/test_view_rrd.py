@@ -443,7 +443,7 @@ def test_no_line_is_drawn_over_a_part_that_is_not_there(
     entries = [*first, Reset(BASE_NS + 99 * STEP_NS, "asked for"), *second]
     run = record_run(tmp_path / "run", entries, part_bytes=200_000, flush_period_s=0.01, chunk_size=50_000)
     whole = read(to_rrd(run.folder, tmp_path / "whole.rrd").path)
-    # the only empty value is that of the reset
+    # the only empty value belongs to the reset
     assert [scalar for scalar in whole["/load/fx"]["Scalars:scalars"].to_pylist() if not scalar] == [[]]
     RunReader(run.folder).parts[1].unlink()
     before, after = (sample.stamp_ns for sample in journal_around_the_hole(run.folder))

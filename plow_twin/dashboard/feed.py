@@ -131,8 +131,8 @@ class Feed:
     facts
         Facts about the machine (`facts.facts_of`).
     answer
-        Function that carries out an operator request: `acknowledge`, or `mark` with a text. It returns success and an
-        answer.
+        Function that carries out an operator request: `acknowledge`, or `mark` with a text. The function
+        returns success and an answer.
     load
         Function that returns the load Fx, Fy [N], M [N m] at the newest publication, shape (3,).
     on_error

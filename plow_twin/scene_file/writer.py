@@ -24,7 +24,7 @@ def dump_scene(scene: Scene) -> str:
     Returns
     -------
     str
-        The text. It includes tables and provenance marks.
+        The text, including tables and provenance marks.
     """
     raw: dict[str, Any] = {key: _plain(getattr(scene, key), key, scene.marks) for key in SECTIONS}
     raw["loads"] = [_plain_load(load, f"loads[{index}]", scene.marks) for index, load in enumerate(scene.loads)]

@@ -15,7 +15,7 @@ _SCALE = 1e3
 
 
 class Residuals:
-    """Comparison of measured poses with poses of the model, which are interpolated linearly between its stamps."""
+    """Comparison of measured poses with linearly interpolated poses of the model."""
 
     def __init__(self) -> None:
         self._waiting: list[tuple[int, int, tuple[float, ...]]] = []

@@ -23,7 +23,7 @@ from plow_twin.scene_file.presets import scene_path
 from plow_twin.study.analysis.analyse import MAPPED_LOAD, OnProgress, analyse
 from plow_twin.study.analysis.report import write_report
 
-#: File with the inputs of an analysis. It is written last, so that it exists only if the analysis is complete.
+#: File with the inputs of an analysis. This file is written last: it exists only if the analysis is complete.
 _ASKED: Final = "asked.json"
 _FILES: Final = (_ASKED, "analysis.json", "report.html", "measured.parquet")
 #: Names of the tables. The names of tables of further scenes end in a number.

@@ -8,8 +8,8 @@ Each target gives one residual r of a candidate. A target that is met exactly ha
     above              r = max(0, largest - s) / (tolerance |largest|)                  met if r = 0
     trend              r = (sum of wrong steps + missing change) / (tolerance mean)     met if r = 0
 
-Here s is the target's statistic, or the smallest statistic if the target names several. It is taken from the run with
-the parameters `set` of the target. In `above`, `largest` is the largest of the statistics with which s is compared. A
+Here s is the target's statistic, or the smallest statistic if the target names several. The run of a
+target has the parameters `set`. In `above`, `largest` is the largest of the statistics with which s is compared. A
 trend is judged over a sequence of runs along one parameter: wrong steps go against the trend, and the required change
 is `margin` times the mean. In `rises_then_falls`, rise and fall must each reach the required change. The turning point
 is the point with the smallest violation. The objective is the sum of weight times r^2.

@@ -41,9 +41,9 @@ class Change:
     Hochberg. A *cell* is one quantity of one pair, or one clearance. Among the cells with an adjusted probability below
     0.05, about one in twenty has not changed.
 
-    `machine`, `machine_low`, `machine_high` and `machine_chance` describe the change at equal load in the same way. The
-    four fields are None if the loads of the two groups do not overlap, or if the load varies too little within the
-    groups.
+    `machine`, `machine_low`, `machine_high` and `machine_chance` are the share, its interval and its probability for
+    the change at equal load. They are None if the loads of the two groups do not overlap, or if the load varies too
+    little within the groups.
     """
 
     share: float

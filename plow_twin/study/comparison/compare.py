@@ -22,7 +22,7 @@ from plow_twin.study.comparison.windows import FULL, QUANTITIES, Windows, window
 _DATES_NS: Final = 10**18
 SHIFTS: Final = (time(6), time(14), time(22))
 
-#: Function of a run's name and a window's stamp [ns]. It returns the group of the window.
+#: Function that returns the group of a window, given the name of its run and its stamp [ns].
 Label = Callable[[str, int], str]
 
 

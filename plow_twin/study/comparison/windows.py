@@ -192,8 +192,8 @@ class _RunSums:
     def silent(self) -> set[int]:
         """Return the windows that overlap a time without samples.
 
-        The first message after such a time contains the peaks and sums of the whole time. Its window is therefore
-        included.
+        The first message after such a time contains the peaks and sums of the whole time. The window of this message is
+        therefore included.
         """
         known, silent = np.array(sorted(self.messages.rows)), set[int]()
         for begin, end in self._silent_ns:
