@@ -297,7 +297,6 @@ def lowest_bit(typingctx: Any, bits: Any) -> Any:
 
 
 def _called(builder: Any, name: str, arguments: Any) -> Any:
-    """Emit a call of an LLVM function that takes and returns vectors."""
     kind = ir.FunctionType(_VECTOR, [_VECTOR] * len(arguments))
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v8f64"), arguments)
 
@@ -370,8 +369,6 @@ def power_of_two(typingctx: Any, exponent: Any) -> Any:
 
 
 def _elementwise(operation: Callable[..., Any], emit: str) -> None:
-    """Define a binary operator for two vectors, and for a vector and a number."""
-
     @infer_global(operation)
     class _Typing(AbstractTemplate):
         # numba tries templates of the processor first; its list of general templates of an operator has twenty entries

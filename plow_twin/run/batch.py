@@ -419,7 +419,6 @@ class TwinBatch:
                 worker.lanes.reload()
 
     def _samples_before(self) -> NDArray[np.float64]:
-        """Return the last samples of all twins, shape (m, 3)."""
         return np.broadcast_to(self._wrench, (len(self), 3))
 
     def _ends(self, samples: NDArray[np.float64], members: slice) -> NDArray[np.float64]:

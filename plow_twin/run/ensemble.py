@@ -231,7 +231,6 @@ class _Run:
         state: State | NDArray[np.void],
         status: int | NDArray[np.int64],
     ) -> None:
-        """Store the results of finished members. `index` selects one or several members."""
         ensemble = self._ensemble
         ensemble.peak[index], ensemble.impulse[index] = totals["peak"], totals["impulse"]
         ensemble.time_in_contact[index], ensemble.makes[index] = totals["time_in_contact"], totals["makes"]

@@ -133,7 +133,6 @@ def sensitivity_parameters(scene: Scene) -> dict[str, float]:
 
 
 def _changed(scene: Scene, path: str, value: float) -> Scene:
-    """Return a copy of the scene with a new value of the parameter at `path` (see `sensitivity_parameters`)."""
     part, _, name = path.rpartition(".")
     if part in ("contact", "clearance"):
         return replace(scene, **{part: replace(getattr(scene, part), **{name: value})})

@@ -469,7 +469,6 @@ class Twin:
         raise (LimitError if late else RunInterrupted)(message, part, self.time) from None
 
     def _go_back(self) -> None:
-        """Restore the state before the interrupted advance."""
         if self._pace.record.underway == 0:
             return
         self._states[0] = self._pace.saved[0]

@@ -407,7 +407,6 @@ def inertias(scene: Scene) -> Array:
 
 
 def _segments(scene: Scene, pieces: Pieces) -> Segments:
-    """Return the linear pieces of a load, divided by mass and inertia."""
     segments = np.zeros(len(pieces.knots), SEGMENT)
     segments["knot"] = pieces.knots
     segments["start"], segments["slope"] = per_mass(scene, pieces.start), per_mass(scene, pieces.slope)
@@ -543,7 +542,6 @@ def _implicit(scene: Scene, terms: Terms, values: dict[str, Any]) -> Implicit | 
 
 
 def _rubbing(scene: Scene) -> dict[str, Any]:
-    """Return the constants of in-plane sliding and running-in (`solve.rubbing`), if the scene has them."""
     wear, there, found = scene.wear, _wear_terms(scene.wear), dict[str, Any]()
     if wear is not None and there.get("sliding"):
         found["slip_rows"] = geometry.slip_rows(scene)

@@ -191,7 +191,6 @@ def _begin_slice(pace) -> None:
 
 @kernel(inline="source")
 def _is_over(pace) -> bool:
-    """Return whether the slice of work is used up and no advance is in progress."""
     return bool(pace.left <= 0 and pace.underway == 0)
 
 

@@ -298,7 +298,6 @@ def _expand_columns(p, state, w, along, columns, order, acts, viscous, hystereti
 
 @kernel()
 def _move_columns(columns, order, sigma) -> None:
-    """Set eight columns to their values at the end of the step."""
     at = exact_splat(sigma)
     for i in range(6):
         series = columns.series[i]

@@ -101,7 +101,6 @@ _LOADED, _LEFT = 1, 2
 
 @kernel(inline="source")
 def _unowned_samples(s):
-    """Return the arrays without reference counts."""
     load = Load(unowned(s.load.before), unowned(s.load.samples), unowned(s.load.masses))
     return Samples(
         unowned(s.params), unowned(s.states), unowned(s.blocks), unowned(s.noted), unowned(s.totals),

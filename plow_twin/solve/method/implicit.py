@@ -611,7 +611,6 @@ def note_step(implicit, state, w, step_size, has_event) -> None:
 
 @kernel()
 def _start(p, support, state, implicit) -> None:
-    """Write the state at the start of the step to `implicit.z[0]`."""
     if support is not None:
         to_world_both(p, state.y, state.frame, implicit.z[0])
     else:
