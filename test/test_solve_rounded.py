@@ -36,6 +36,7 @@ SIDE, RADIUS, MASS = 0.06, 0.01, 1.0
 INERTIA = MASS * SIDE**2 / 6.0
 STIFFNESS, DAMPING, MU, SLIP_SPEED = 3e6, 0.8, 0.2, 0.05
 STICK = Friction(MU, stick_stiffness_n_m=1e6, stick_damping_n_s_m=20.0)
+NOTHING = Harmonic("nothing to speak of", (1e-12, 0.0), 9.0)
 
 
 def block(**changes: object) -> Scene:
@@ -67,31 +68,30 @@ def in_guide(carries: str, **changes: object) -> Scene:
 def on_table(t: float, z: np.ndarray) -> list[float]:
     """Return the time derivative of z = (x, y, theta, vx, vy, omega).
 
-    Four discs touch the table at their lowest points.
+    Four discs touch the table at their lowest points. The table is smooth;
+    `test_disc_of_rounded_corners_rolls_without_sliding` has friction.
     """
     _, y, theta, vx, vy, omega = z
     c, s, half = math.cos(theta), math.sin(theta), 0.5 * SIDE - RADIUS
-    fx = fy = moment = 0.0
+    fy = moment = 0.0
     for cx, cy in ((-half, half), (half, half), (half, -half), (-half, -half)):
         ax, ay = c * cx - s * cy, s * cx + c * cy - RADIUS
         depth, rate = -1.0 - (y + ay), -(vy + omega * ax)
         if depth > 0.0:
             normal = max(STIFFNESS * depth * (1.0 + DAMPING * rate), 0.0)
-            drag = -MU * normal * math.tanh((vx - omega * ay) / SLIP_SPEED)
-            fx, fy, moment = fx + drag, fy + normal, moment + ax * normal - ay * drag
-    return [vx, vy, omega, fx / MASS, fy / MASS - 9.81, moment / INERTIA]
+            fy, moment = fy + normal, moment + ax * normal
+    return [vx, vy, omega, 0.0, fy / MASS - 9.81, moment / INERTIA]
 
 
 def test_rounded_block_agrees_with_an_independent_integration_of_four_discs() -> None:
-    found = simulate(block(), t_end=0.4, output_dt=0.004, tol=1e-9, energy_balance=True)
+    # neither the friction nor the load moves anything; with both, the kernels of the tests below are used
+    scene = block(friction=replace(STICK, coefficient=1e-12), loads=(NOTHING,))
+    found = simulate(scene, t_end=0.4, output_dt=0.004, tol=1e-9, energy_balance=True)
     reference = solve_ivp(
         on_table, (0.0, 0.4), [0.0, -0.85, 0.3, 0.4, 0.0, 6.0], "DOP853", found.t, rtol=1e-9, atol=1e-11, max_step=1e-4
     )
     np.testing.assert_allclose(found.q, reference.y[:3].T, atol=1e-6)
-    # the block has turned over a corner, and with sharp corners its motion differs
-    assert abs(found.q[-1, 2]) > 1.0
-    sharp = simulate(block(frame=Frame(SIDE, SIDE)), t_end=0.4, output_dt=0.004, energy_balance=True)
-    assert np.abs(sharp.q - found.q).max() > 1e-3
+    assert abs(found.q[-1, 2]) > 1.0, "the block turns over a corner"
 
 
 def test_disc_of_rounded_corners_rolls_without_sliding() -> None:
@@ -103,7 +103,7 @@ def test_disc_of_rounded_corners_rolls_without_sliding() -> None:
         frame=Frame(SIDE, SIDE, corner_radius_m=radius),
         friction=Friction(0.5, stick_stiffness_n_m=1e7, stick_damping_n_s_m=200.0),
         # with the second load and the balance, the kernels of `in_guide` are used
-        loads=(Constant("push", (push, 0.0)), Harmonic("nothing to speak of", (1e-12, 0.0), 9.0)),
+        loads=(Constant("push", (push, 0.0)), NOTHING),
         initial=Initial(q=(0.0, -1.0 + 0.5 * SIDE, 0.0)),
     )
     found = simulate(disc, t_end=0.6, output_dt=0.01, energy_balance=True)

@@ -90,8 +90,8 @@ def test_sliding_in_the_plane_and_running_in_under_a_constant_load(contact: Cont
         contact=contact,
         initial=Initial((0.0, -0.01 - 0.5 * weight / stiffness, 0.0), (along, 0.0, 0.0)),
     )
-    twin = Twin(scene, tol=1e-10)
-    worn = twin.advance(t).wear_depth
+    twin = Twin(scene, tol=1e-10, excitation="sampled")
+    worn = twin.advance(t, np.zeros(3)).wear_depth
     exposure = RUBBED.coefficient_m2_n / RUBBED.pad_area_m2 * 0.5 * weight * math.hypot(2.0, along) * t
     assert worn[[0, 2]] == pytest.approx([worn_by(exposure)] * 2, rel=1e-5)
     assert (twin._state.implicit_steps > 0) == (contact.law == "kelvin_voigt")
@@ -127,18 +127,19 @@ def test_sliding_in_the_plane_wears_by_the_way_of_the_corner() -> None:
 
 def test_a_twin_goes_on_wearing_from_a_snapshot_and_stands_still_without_wear() -> None:
     scene = dataclasses.replace(preset("paper"), wear=dataclasses.replace(RUBBED, coefficient_m2_n=1e-13))
-    whole, parts = Twin(scene), Twin(scene)
-    expected = whole.advance(2.0).wear_depth
-    parts.advance(0.7)
-    other = Twin(scene)
+    t = np.arange(1, 31) * 0.1
+    wrench = compile_loads(scene.loads).at(t)
+    whole, parts, other = (Twin(scene, excitation="sampled") for _ in range(3))
+    expected = whole.advance_samples(t[:20], wrench[:20]).wear_depth[-1]
+    parts.advance_samples(t[:7], wrench[:7])
     other.restore(parts.snapshot())
-    assert np.array_equal(other.advance(2.0).wear_depth, expected)
+    assert np.array_equal(other.advance_samples(t[7:20], wrench[7:20]).wear_depth[-1], expected)
     # worn pads have run in, so the same motion wears them more slowly than new pads
     other.reset(0.0, wear_depth=np.full(8, 1e-3))
-    assert (other.advance(2.0).wear_depth - 1e-3).max() < 0.4 * expected.max()
+    assert (other.advance_samples(t[:20], wrench[:20]).wear_depth[-1] - 1e-3).max() < 0.4 * expected.max()
     other.set_travel_speed(0.0)
-    expected = other.advance(2.0).wear_depth
-    assert np.array_equal(other.advance(3.0).wear_depth, expected)
+    depths = other.advance_samples(t[19:], wrench[19:]).wear_depth
+    assert np.array_equal(depths[0], depths[-1])
 
 
 def test_a_ratio_without_a_depth_is_named() -> None:

@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 from plow_twin.errors import ArgumentError
 from plow_twin.live.wear_keeper import WearKeeper
 from plow_twin.model.loads import compile_loads
-from plow_twin.model.scene import Contact, Scene, Table, Wear
+from plow_twin.model.scene import Contact, Scene, Wear
 from plow_twin.run.batch import TwinBatch
-from plow_twin.run.simulate import simulate
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
@@ -215,7 +214,6 @@ def test_the_wear_rate_times_the_time_is_the_growth(reference: Run) -> None:
 def test_running_in_and_sliding_in_the_plane_wear_live_as_offline_and_go_on_after_a_restart(tmp_path: Path) -> None:
     wear = Wear(1e-12, 0.015, 2.0, sliding="total", running_in_ratio=4.0, running_in_depth_m=2e-5)
     scene = replace(SCENE, wear=wear)
-    samples = Table("samples", 2e-3 * np.arange(STEPS), WRENCH)
 
     def lived(kept: WearKeeper) -> np.ndarray:
         session = Session(Twin(scene, excitation="sampled"), wear_depth=kept.load())
@@ -226,8 +224,9 @@ def test_running_in_and_sliding_in_the_plane_wear_live_as_offline_and_go_on_afte
         return session.wear_depth
 
     def offline(before: np.ndarray) -> np.ndarray:
-        worn = replace(scene, loads=(samples,), wear=replace(wear, initial_depth_m=tuple(before.tolist())))
-        return simulate(worn, 2e-3 * (STEPS - 1), 0.1, tol=Twin(scene).tol).wear_depth
+        worn = replace(scene, wear=replace(wear, initial_depth_m=tuple(before.tolist())))
+        twin = Twin(worn, excitation="sampled", tol=1e-9)
+        return twin.advance_samples(2e-3 * np.arange(STEPS), WRENCH).wear_depth[-1]
 
     new = lived(WearKeeper(tmp_path, "head 7", scene))
     # the wear is equal within the tolerance of the motion
