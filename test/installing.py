@@ -6,7 +6,10 @@ import os
 import shutil
 import subprocess
 import sys
+from importlib.metadata import distribution
 from pathlib import Path
+
+from packaging.requirements import Requirement
 
 from plow_twin.kernel.polynomial import to_bernstein
 from plow_twin.model.contact import power_term
@@ -64,18 +67,32 @@ def run(*command: str | Path, cwd: Path, env: dict[str, str] | None = None, code
     return done.stderr if code else done.stdout
 
 
-def make_environment(folder: Path, *requirements: str) -> Path:
-    """Create a virtual environment with the given requirements at the locked versions. Return its Python."""
-    run(sys.executable, "-m", "venv", folder, cwd=folder.parent)
-    python = folder / "bin" / "python"
-    install(python, *requirements)
-    return python
+def make_environment(folder: Path) -> Path:
+    """Create an empty virtual environment. Return its Python."""
+    run(sys.executable, "-m", "venv", "--without-pip", folder, cwd=folder.parent)
+    return folder / "bin" / "python"
+
+
+def lend(python: Path, *names: str) -> None:
+    """Link distributions of this environment, and all that they require, into another one; copies would take long."""
+    (site,) = python.parent.parent.glob("lib/python*/site-packages")
+    waiting, known = [*names], set[str]()
+    while waiting:
+        if (name := waiting.pop()) in known:
+            continue
+        known.add(name)
+        found = distribution(name)
+        needed = (Requirement(text) for text in found.requires or ())
+        waiting += [one.name for one in needed if one.marker is None or one.marker.evaluate({"extra": ""})]
+        for part in {file.parts[0] for file in found.files or ()} - {"..", "__pycache__"}:
+            if not (site / part).exists():
+                (site / part).symlink_to(found.locate_file(part))
 
 
 def install(python: Path, *requirements: str) -> None:
-    """Install requirements at the locked versions into an environment."""
-    pip = ("-m", "pip", "install", "--quiet", "--no-compile", "-c", ROOT / "requirements" / "constraints.txt")
-    run(python, *pip, *requirements, cwd=python.parent)
+    """Install into an environment without looking for anything outside of it."""
+    pip = (sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-compile", "--no-index")
+    run(*pip, *requirements, cwd=python.parent)
 
 
 def lend_kernels(python: Path) -> None:

@@ -12,22 +12,29 @@ from plow_twin.estimate.estimate import estimate
 from plow_twin.estimate.measurements import Poses
 from plow_twin.estimate.result import State
 
-COMPONENTS = ("x", "y", "theta")
 
-
-@pytest.mark.parametrize(("missing", "kept", "most"), [((1,), 7, 2e-4), ((2,), 0, 4e-4), ((0, 1), 0, 1e-3)])
+@pytest.mark.parametrize(
+    ("kept", "deviation", "reasons", "most"),
+    [
+        pytest.param((None,) * 3, (0.0, 1.0, 0.0), ("y: stated deviation 1, expected at most 0.05",), 2e-4, id="y"),
+        pytest.param((None, None, 7), (0.0,) * 3, ("theta: measured 7 times, expected at least 20",), 4e-4, id="theta"),
+        pytest.param(
+            (0, 0, None), (0.0,) * 3, tuple(f"{name}: measured 0 times, expected at least 20" for name in "xy"), 1e-3,
+            id="x and y",
+        ),
+    ],
+)  # fmt: skip
 def test_the_believed_load_gives_clearances_where_components_are_missing(
-    missing: tuple[int, ...], kept: int, most: float
+    kept: tuple[int | None, ...], deviation: tuple[float, float, float], reasons: tuple[str, ...], most: float
 ) -> None:
-    """A component with few values is treated as not measured."""
+    """A component with few values, or with a large stated deviation, is treated as not measured."""
     truth, _ = known()[0]
     q = truth.poses.q.copy()
-    q[kept:, missing] = np.nan
-    result = estimate(truth.nominal, truth.load, Poses(truth.poses.t, q))
-    assert result.horizontal_state is result.vertical_state is State.ESTIMATED
-    assert result.reasons == tuple(
-        f"{COMPONENTS[index]}: measured {kept} times, expected at least 20" for index in missing
-    )
+    for column, count in zip(q.T, kept, strict=True):
+        column[len(q) if count is None else count :] = np.nan
+    result = estimate(truth.nominal, truth.load, Poses(truth.poses.t, q, deviation))
+    assert result.horizontal_state is result.vertical_state is State.ESTIMATED and result.model == "ok"
+    assert result.reasons == reasons
     assert result.motion is not None and np.isfinite(result.motion.model).mean() > 0.9
     for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):
         assert value.deviation < most and abs(value.mean - true) < 3.0 * value.deviation

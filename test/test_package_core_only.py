@@ -9,7 +9,7 @@ from pathlib import Path
 import mcap_bytes
 import numpy as np
 import pytest
-from installing import build_wheel, install, lend_kernels, make_environment, run
+from installing import build_wheel, install, lend, lend_kernels, make_environment, run
 
 from plow_twin.scene_file.presets import PRESETS
 
@@ -54,9 +54,9 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory, wheel: Path) -> Path:
-    """Return an environment, which first contains the three libraries of the core, and later all base dependencies."""
-    folder = tmp_path_factory.mktemp("environment")
-    python = make_environment(folder / "venv", "numpy", "scipy", "numba")
+    """Return an environment, first with the core's three libraries, later with all base dependencies."""
+    python = make_environment(tmp_path_factory.mktemp("environment") / "venv")
+    lend(python, "numpy", "scipy", "numba")
     install(python, "--no-deps", str(wheel))
     lend_kernels(python)
     return python
@@ -74,6 +74,7 @@ def test_model_and_twin_need_numpy_scipy_and_numba_alone(environment: Path, tmp_
 
 
 def test_pip_install_brings_the_command_and_the_presets(environment: Path, wheel: Path, tmp_path: Path) -> None:
+    lend(environment, "click", "jsonschema", "PyYAML", "rich")
     install(environment, str(wheel))
     programs, prefix = environment.parent, environment.parent.parent
     found = {path.name for path in programs.iterdir()}
