@@ -7,13 +7,13 @@ import json
 import os
 import shutil
 import subprocess
-import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from waiting import until
 from websockets.sync.client import ClientConnection, connect
 
 #: Path of Chromium, or None if it is not installed.
@@ -84,10 +84,8 @@ def page(folder: Path, url: str) -> Iterator[Page]:
     command = [CHROMIUM, *_OPTIONS, f"--user-data-dir={folder}", "about:blank"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        place, deadline = folder / "DevToolsActivePort", time.monotonic() + 60.0
-        while not (place.exists() and "\n" in place.read_text()):
-            assert process.poll() is None and time.monotonic() < deadline, "the browser does not answer"
-            time.sleep(0.05)
+        place = folder / "DevToolsActivePort"
+        until(lambda: process.poll() is not None or (place.exists() and "\n" in place.read_text()), "an answer")
         port = place.read_text().split()[0]
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=10) as answer:
             target = next(one for one in json.load(answer) if one["type"] == "page")
@@ -153,10 +151,8 @@ def firefox_page(folder: Path, url: str) -> Iterator[FirefoxPage]:
         env={**os.environ, "HOME": str(folder)},
     )  # fmt: skip
     try:
-        place, deadline = folder / "WebDriverBiDiServer.json", time.monotonic() + 60.0
-        while not (place.exists() and place.read_text().endswith("}")):
-            assert process.poll() is None and time.monotonic() < deadline, "the browser does not answer"
-            time.sleep(0.05)
+        place = folder / "WebDriverBiDiServer.json"
+        until(lambda: process.poll() is not None or (place.exists() and place.read_text().endswith("}")), "an answer")
         server = json.loads(place.read_text())
         with connect(f"ws://{server['ws_host']}:{server['ws_port']}/session", max_size=None) as socket:
             opened = FirefoxPage(socket)

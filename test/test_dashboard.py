@@ -25,6 +25,7 @@ import numpy as np
 import pytest
 from commands import plow_twin_here, started
 from record_support import PAPER_AMPLITUDE, paper_sample, record_run
+from waiting import until
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
@@ -500,10 +501,8 @@ def test_a_browser_shows_the_twin_takes_names_as_text_and_fetches_nothing_from_e
         page = opened.enter_context(browser.page(tmp_path / "browser", f"{url}#token={TOKEN.replace(' ', '%20')}"))
 
         def seen(reached: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-            give_up = time.monotonic() + 60.0
-            while not reached(found := json.loads(page.evaluate(_SEEN))):
-                assert time.monotonic() < give_up, (found, page.errors)
-                time.sleep(0.2)
+            found: dict[str, Any] = {}
+            until(lambda: found.update(json.loads(page.evaluate(_SEEN))) or reached(found), (found, page.errors), 0.2)
             return found
 
         seen(lambda found: not found["banner"])
@@ -530,13 +529,12 @@ def test_firefox_shows_the_twin_too(tmp_path: Path) -> None:
         url = said.partition("#")[0].split()[-1]
         with browser.firefox_page(tmp_path / "firefox", url) as page:
             _feed(process)
-            give_up = time.monotonic() + 60.0
-            while not (
-                "6000" in (found := json.loads(page.evaluate(_SEEN)))["inputs"] and "was warn" in found["alarms"]
-            ):
-                assert time.monotonic() < give_up, (found, page.errors)
-                time.sleep(0.2)
-                found = json.loads(page.evaluate(_SEEN))
+            found: dict[str, Any] = {}
+            until(
+                lambda: found.update(json.loads(page.evaluate(_SEEN)))
+                or ("6000" in found["inputs"] and "was warn" in found["alarms"]),
+                (found, page.errors), 0.2,
+            )  # fmt: skip
             assert (found["pads"], found["charts"], page.errors) == (8, 3, [])
             assert "25.000 mm" in found["clearance"] and not found["banner"]
         _stopped(process)

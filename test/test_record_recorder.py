@@ -24,6 +24,7 @@ import pytest
 import yaml
 from commands import started
 from record_support import BASE_NS, STEP_NS, paper_sample
+from waiting import until
 
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
@@ -237,9 +238,7 @@ def test_little_free_space_ends_a_recording_that_can_be_read(tmp_path: Path) -> 
     errors: list[str] = []
     recorder = Recorder(tmp_path / "run", HEADER, min_free_bytes=2**62, on_error=errors.append)
     recorder.journal(Sample(BASE_NS, (1.0, 2.0, 3.0)))
-    deadline = time.monotonic() + 20
-    while not errors and time.monotonic() < deadline:
-        time.sleep(0.01)
+    until(lambda: errors, "the end of the recording")
     assert not recorder.journal(Sample(BASE_NS + 1, (1.0, 2.0, 3.0)))
     loss = recorder.close()
     assert errors == [loss.error] and f"expected at least {2**62} B" in errors[0]
@@ -253,34 +252,35 @@ def test_little_free_space_ends_a_recording_that_can_be_read(tmp_path: Path) -> 
 
 
 def record_around_a_pause(folder: Path, stop: Callable[[], object], go_on: Callable[[], object]) -> Recorder:
-    """Record a twin. The disk fails in the middle of the run and recovers."""
+    """Record a twin. The disk fails in the middle and recovers; counts of the recorder, not the time, end each stage."""
     scene = load_scene(scene_path("paper"))
     recorder = Recorder(folder, RunHeader(dump_scene(scene)), flush_period_s=0.02, min_free_bytes=1)
     session = Session(Twin(scene, excitation="sampled"), on_entry=recorder.journal)
     session.start()
+    samples = map(paper_sample, itertools.count())
 
-    def go(begin: int, until: Callable[[], bool]) -> int:
-        deadline, index = time.monotonic() + 30, begin
-        while not until() and time.monotonic() < deadline:
-            session.apply(paper_sample(index))
+    def go(reached: Callable[[], bool]) -> None:
+        def step() -> bool:
+            session.apply(next(samples))
             publication = session.outputs.pop()
             assert len(publication.rows)
             recorder.publication(publication)
             if recorder.snapshot_wanted:
                 recorder.journal(session.snapshot())
-            index += 1
-            time.sleep(0.0005)
-        assert until()
-        return index
+            return reached()
 
-    index = go(0, lambda: recorder.counters.written > 500)
+        until(step, recorder.counters, pause_s=0.0005)
+
+    def lost() -> int:
+        return min(recorder.counters.lost.get(name, 0) for name in (JOURNAL, "/contact_peaks"))
+
+    go(lambda: recorder.counters.written > 500)
     stop()
-    index = go(index, lambda: recorder.counters.error is not None)
-    index = go(index + 1, lambda: recorder.counters.lost.get("/contact_peaks", 0) > 50)
+    go(lambda: recorder.counters.error is not None and lost() > 50)
     go_on()
-    index = go(index, lambda: recorder.counters.error is None and not recorder.snapshot_wanted)
+    go(lambda: recorder.counters.error is None and not recorder.snapshot_wanted)
     written = recorder.counters.written
-    go(index, lambda: recorder.counters.written > written + 2000)
+    go(lambda: recorder.counters.written > written + 2000)
     session.close()
     return recorder
 
@@ -338,11 +338,13 @@ def test_a_mark_at_the_news_of_a_lost_one_is_written(tmp_path: Path, monkeypatch
     session = Session(twin, on_entry=recorder.journal)
     session.start()
     recorder.mark()
-    give_up = time.monotonic() + 60.0
-    while recorder.counters.marks == 0 and time.monotonic() < give_up:
+
+    def marked() -> int:
         if recorder.snapshot_wanted:
             recorder.journal(session.renew())
-        time.sleep(0.01)
+        return recorder.counters.marks
+
+    until(marked, "a mark")
     recorder.close()
     assert (recorder.counters.marks, recorder.counters.marks_lost, folder.exists()) == (1, 1, True)
 
@@ -424,9 +426,7 @@ def test_a_removed_file_is_noticed(whole: bool, tmp_path: Path) -> None:
     errors: list[str] = []
     with Recorder(tmp_path / "run", HEADER, flush_period_s=0.05, on_error=errors.append) as recorder:
         shutil.rmtree(recorder.path.parent) if whole else recorder.path.unlink()
-        deadline = time.monotonic() + 20
-        while not errors and time.monotonic() < deadline:
-            time.sleep(0.01)
+        until(lambda: errors, "the end of the recording")
         assert not recorder.journal(Sample(BASE_NS, (0.0, 0.0, 0.0)))
     assert len(errors) == 1 and "removed or replaced" in errors[0]
 

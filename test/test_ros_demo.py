@@ -7,7 +7,6 @@ import os
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +17,7 @@ import pytest
 from record_support import BASE_NS, paper_sample, record_run
 from rich.console import Console
 from ros_processes import ROOT
+from waiting import until
 
 from plow_twin.demo.comparison import compare_forces
 from plow_twin.demo.demo import Watch, _run, program
@@ -46,11 +46,9 @@ def test_the_processes_of_the_demo_end_with_it_however_it_ends(tmp_path: Path) -
         "os.kill(os.getpid(), 9)"
     )
     done = subprocess.run([sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, timeout=110)
-    child, give_up = Path("/proc", done.stdout.strip(), "cmdline"), time.monotonic() + 60.0
+    child = Path("/proc", done.stdout.strip(), "cmdline")
     # the child has ended if its command line is empty (a zombie) or absent
-    while child.exists() and child.read_bytes():
-        assert time.monotonic() < give_up
-        time.sleep(0.05)
+    until(lambda: not child.exists() or not child.read_bytes(), "the end of the child")
 
 
 # CI has a separate step for the speed `fast`

@@ -25,6 +25,7 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import JointState
+from waiting import until
 
 from plow_twin.live.parameters import ParameterError
 from plow_twin.live.tool_forces import ToolForces
@@ -203,10 +204,7 @@ def test_a_ring_that_the_disk_does_not_take_is_trouble_and_counted(
 
         def mark(written: int, lost: int) -> None:
             assert node._front is not None and node._front.answer("mark")[0]
-            give_up = time.monotonic() + 60.0
-            while (counted := recorder.counters) and (counted.marks, counted.marks_lost) != (written, lost):
-                assert time.monotonic() < give_up
-                time.sleep(0.01)
+            until(lambda: (recorder.counters.marks, recorder.counters.marks_lost) == (written, lost), recorder.counters)
 
         mark(0, 1)
         level, message, values = node._health.recorder(runtime)
@@ -406,9 +404,7 @@ def test_an_error_in_the_thread_of_the_inputs_ends_the_program_with_a_message() 
 
         node.runtime.inputs.uses_travel = fail  # type: ignore[method-assign,assignment]
         publisher = node.create_publisher(TwistStamped, "travel", 10)
-        give_up = time.monotonic() + 60.0
-        while node._front.error is None and time.monotonic() < give_up:
-            publisher.publish(TwistStamped())
-            time.sleep(0.05)
+        front = node._front
+        until(lambda: front.error or publisher.publish(TwistStamped()), "an error", pause_s=0.05)
         with pytest.raises(RuntimeError, match="not foreseen"):
             node._publish_diagnostics()

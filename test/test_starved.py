@@ -6,12 +6,12 @@ import os
 import resource
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from test_live import ROOT, _csv, _live
+from waiting import until
 
 from plow_twin.cli.app import EXTRA_OF_MODULE
 from plow_twin.record.replay import replay
@@ -107,11 +107,8 @@ def test_a_recording_is_replayed_while_it_is_written_as_far_as_it_goes(folder: P
     stale = ("--set", "excitation_timeout=3600")
     with _live("load.csv", "--follow", "--record", "run", *stale, cwd=folder) as live:
         live.until_count("samples_used", 1500)
-        give_up = time.monotonic() + 60.0
-        while not ((folder / "run").is_dir() and (report := replay(folder / "run")).samples == 1500):
-            assert time.monotonic() < give_up
-            live.until(lambda heard: True, "a report")
-        assert report.exit_code == 3
+        until(lambda: (folder / "run").is_dir() and replay(folder / "run").samples == 1500, "all samples")
+        assert replay(folder / "run").exit_code == 3
         assert live.stop() == 0
     report = replay(folder / "run")
     assert (report.exit_code, report.samples) == (0, 1500)

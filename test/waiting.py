@@ -1,0 +1,17 @@
+"""Waiting until other threads and processes have reached a state."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+#: Longest wait [s]: long enough for a compilation on a machine that does other work. No result depends on it.
+LONGEST_S = 200.0
+
+
+def until(reached: Callable[[], object], what: object = "", pause_s: float = 0.01) -> None:
+    """Look again and again until `reached` returns a true value; it may take the next step each time."""
+    give_up = time.monotonic() + LONGEST_S
+    while not reached():
+        assert time.monotonic() < give_up, what
+        time.sleep(pause_s)
