@@ -6,22 +6,30 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
+from functools import partial
 from io import StringIO
 from pathlib import Path
 from typing import Any
+
+import forge
 
 from plow_twin.cli.app import run
 
 
 def plow_twin(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "plow_twin", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=110, stdin=subprocess.DEVNULL)
+    """Run a command as a program."""
+    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with forge.start("plow_twin", [*map(str, arguments)], cwd=cwd, text=True, **pipes) as process:
+        out, err = process.communicate(timeout=250)
+    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
 
 @contextmanager
 def started(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[str]]:
     """Start a program, and kill it at the end of the context. A `Popen` context would wait without limit."""
-    with subprocess.Popen(command, text=True, **options) as process:
+    own = [*command[:3]] == [sys.executable, "-m", "plow_twin"]
+    start = partial(forge.start, "plow_twin", [*command[3:]]) if own else partial(subprocess.Popen, command)
+    with start(text=True, **options) as process:
         try:
             yield process
             process.wait(60)

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import atexit
-import fcntl
-import hashlib
 import os
 import shutil
 import signal
 import tempfile
+from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import Phase, settings
+from shared_work import FOLDER, compile_once
 
 ROOT = Path(__file__).resolve().parent.parent
 SKIPS = ROOT / "test" / "skips.txt"
 FIRST = ROOT / "test" / "first.txt"
-#: Name of the environment variable with the folder of the locks of `_compile_once`.
-LOCKS = "PLOW_TWIN_COMPILING"
 
 
 def _prepare_environment() -> None:
@@ -41,38 +39,34 @@ def _prepare_environment() -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def _compile_once() -> None:
-    """Prevent the processes of a suite from compiling the same kernels in parallel.
-
-    Each signature of a kernel has a lock file, which the compiling process locks. To avoid a deadlock, locks are taken
-    in the order of calls, and by one thread of a process only.
-    """
-    if "PYTEST_XDIST_WORKER" not in os.environ:
-        os.environ[LOCKS] = tempfile.mkdtemp(prefix="plow_twin-compiling-")
-        atexit.register(shutil.rmtree, os.environ[LOCKS], ignore_errors=True)
-        return
-    from numba.core.compiler_lock import global_compiler_lock
-    from numba.core.dispatcher import Dispatcher
-
-    compile_alone = Dispatcher.compile
-
-    def compile_once(dispatcher: Any, signature: Any) -> Any:
-        name = f"{dispatcher.py_func.__module__}.{dispatcher.py_func.__qualname__} {signature}"
-        place = Path(os.environ[LOCKS]) / hashlib.blake2b(name.encode(), digest_size=8).hexdigest()
-        with global_compiler_lock, place.open("wb") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            return compile_alone(dispatcher, signature)
-
-    Dispatcher.compile = compile_once
+def _share_work() -> None:
+    """Make the folder that the suite's processes share, in the first of them; others wait for kernels of others."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        compile_once()
+    else:
+        os.environ[FOLDER] = tempfile.mkdtemp(prefix="plow_twin-shared-work-")
+        atexit.register(shutil.rmtree, os.environ[FOLDER], ignore_errors=True)
 
 
 _prepare_environment()
-_compile_once()
+_share_work()
 settings.register_profile("plow_twin", deadline=None, derandomize=True, database=None)
 # profile of `make stress`: it prints the seed, draws new examples in each run, and shrinks failing examples
 FRESH = (Phase.explicit, Phase.generate, Phase.shrink)
 settings.register_profile("stress", deadline=None, derandomize=False, database=None, print_blob=True, phases=FRESH)
 settings.load_profile("plow_twin")
+
+
+@pytest.fixture
+def without_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let studies of many recordings run in this process; `test_study_many` has the worker processes."""
+    from plow_twin.study.analysis import many
+
+    def here(tasks: Sequence[Any], waiting: list[int], workers: int, done: Callable[[int, Any], None]) -> None:
+        for number in waiting:
+            done(number, many.run_task(tasks[number]))
+
+    monkeypatch.setattr(many, "_here", here)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache
 
 from scenes import ROOT
+from shared_work import computed_once
 
 from plow_twin.estimate.estimate import estimate
 from plow_twin.estimate.result import Estimate
@@ -22,5 +23,9 @@ __all__ = ["GROUPS", "KINDS", "Truth", "draw", "known", "mismatched"]
 @cache
 def known() -> tuple[tuple[Truth, Estimate], ...]:
     """Return two simulated machines with the paper's scene over five load periods, with their estimates."""
+    return computed_once("known machines", _known)
+
+
+def _known() -> tuple[tuple[Truth, Estimate], ...]:
     truths = [draw(replace(GROUPS["plain"], periods=5.0), seed) for seed in (2, 3)]
     return tuple((truth, estimate(truth.nominal, truth.load, truth.poses)) for truth in truths)

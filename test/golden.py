@@ -1,8 +1,8 @@
 """Motions whose results are pinned by hashes, bit for bit.
 
-    python test/golden.py
+    python test/golden.py [NAME ...]
 
-computes all motions and prints their figures as JSON.
+computes these motions, or all motions, and prints their figures as JSON.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from importlib.metadata import version
@@ -17,6 +18,7 @@ from typing import Any
 
 import numpy as np
 from scenes import preset
+from shared_work import compile_once
 from test_solve_flight import swaying
 from test_solve_implicit import damped
 from test_solve_rest import fallen
@@ -102,4 +104,5 @@ CASES: dict[str, Callable[[], Figures]] = {
 
 
 if __name__ == "__main__":
-    print(json.dumps({name: case() for name, case in CASES.items()}))
+    compile_once()
+    print(json.dumps({name: CASES[name]() for name in sys.argv[1:] or CASES}))

@@ -43,7 +43,7 @@ class Process:
     def __init__(self, module: str, arguments: Sequence[str], log: Path) -> None:
         self._log = log
         with log.open("wb") as stream:
-            self._process = forge.start(module, arguments, stream)
+            self._process = forge.start(module, arguments, stdout=stream, stderr=subprocess.STDOUT)
 
     @property
     def running(self) -> bool:

@@ -8,8 +8,6 @@ import shutil
 import socket
 import struct
 import subprocess
-import sys
-import time
 import urllib.request
 from collections.abc import Iterator
 from io import BytesIO
@@ -17,11 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import browser
+import forge
 import numpy as np
 import pytest
 from commands import plow_twin, plow_twin_here
 from PIL import Image
 from record_support import Run, paper_sample, record_run, rewrite
+from waiting import until
 
 from plow_twin.cli.app import run as cli
 from plow_twin.stream.intake import NS_PER_S
@@ -54,6 +54,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return record_run(tmp_path_factory.mktemp("recording") / "run", map(paper_sample, range(SAMPLES)))
 
 
+@pytest.mark.usefixtures("without_workers")
 def test_an_analysis_of_runs_without_measurements_shows_the_model_and_no_empty_table(
     run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -201,19 +202,15 @@ def test_view_names_a_port_that_is_taken(run: Run, tmp_path: Path) -> None:
 def served(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Yield the address that `view --web` prints, as long as it serves."""
     out = tmp_path_factory.mktemp("served") / "run.rrd"
-    command = [sys.executable, "-m", "plow_twin", "view", str(run.folder), "--out", str(out), "--web", "--quiet"]
-    process = subprocess.Popen(
-        [*command, "--web-port", "0"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    )
+    words = ["view", str(run.folder), "--out", str(out), "--web", "--quiet", "--web-port", "0"]
+    process = forge.start("plow_twin", words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     try:
         assert process.stdout is not None
         address = re.search(r"http://127\.0\.0\.1:\S+", process.stdout.readline())
         assert address is not None
-        deadline = time.monotonic() + 90
         for port in ports_of(address[0]):
-            while not answers(port):
-                assert process.poll() is None and time.monotonic() < deadline, "no server"
-                time.sleep(0.1)
+            until(lambda: answers(port) or process.poll() is not None, "a server")  # noqa: B023
+        assert process.poll() is None, "no server"
         yield address[0]
     finally:
         process.terminate()
@@ -231,11 +228,8 @@ def test_view_serves_a_page_on_the_loopback_address_alone(served: str) -> None:
 @pytest.mark.skipif(browser.CHROMIUM is None, reason="no Chromium is installed")
 def test_a_browser_shows_the_run_at_the_address_that_view_names(served: str, tmp_path: Path) -> None:
     with browser.page(tmp_path, served) as page:
-        deadline = time.monotonic() + 90
         # the cross-sections have a dark background; other pages of the viewer have not
-        while _dark(page.picture()) < 0.15:
-            assert time.monotonic() < deadline, f"no picture: {page.errors}, {page.requests}"
-            time.sleep(0.5)
+        until(lambda: _dark(page.picture()) >= 0.15, f"a picture: {page.errors}, {page.requests}", pause_s=0.5)
         assert not page.errors
         # the page requests the dark theme, so almost no pixel is white, whatever the theme of the browser
         dots = np.asarray(Image.open(BytesIO(page.picture())).convert("L"))

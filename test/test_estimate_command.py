@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bag_support import BIAS, LAG_S, motion, write_bag
+from commands import plow_twin
 from estimate_support import GROUPS, draw
 from record_support import STEP_NS, paper_sample, record_run
 from rosbags.rosbag2 import StoragePlugin
@@ -26,9 +25,8 @@ def test_the_command_keeps_the_contract(tmp_path: Path) -> None:
     # a row with a text instead of a number is counted and not used
     with (tmp_path / "pose.csv").open("a") as file:
         file.write("99,what,0,0\n")
-    command = [sys.executable, "-m", "plow_twin", "estimate", str(tmp_path), "--json", "--out", str(tmp_path / "out")]
-    command += ["--plot", str(tmp_path / "fit.png")]
-    done = subprocess.run([*command, "--forces", "20"], capture_output=True, text=True, timeout=280)
+    words = ["estimate", tmp_path, "--json", "--out", tmp_path / "out", "--plot", tmp_path / "fit.png"]
+    done = plow_twin(*words, "--forces", "20")
     assert done.returncode == 3, done.stderr
     facts = json.loads(done.stdout)
     assert facts == json.loads((tmp_path / "out" / "estimate.json").read_text())
@@ -48,8 +46,7 @@ def test_the_command_keeps_the_contract(tmp_path: Path) -> None:
 
 def test_a_bag_is_read_by_its_mapping(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", motion(), StoragePlugin.SQLITE3)
-    command = [sys.executable, "-m", "plow_twin", "estimate", str(bag), "--map", str(tmp_path / "map.yaml"), "--json"]
-    done = subprocess.run([*command, "--scene", "paper"], capture_output=True, text=True, timeout=110)
+    done = plow_twin("estimate", bag, "--map", tmp_path / "map.yaml", "--json", "--scene", "paper")
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
     assert facts["delay"]["mean"] == pytest.approx(LAG_S, abs=2e-3)

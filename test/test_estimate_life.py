@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import plow_twin
 from record_support import BASE_NS, STEP_NS, paper_sample, record_run
 from scenes import preset
 
@@ -91,8 +90,7 @@ def test_quantiles_scale_with_the_coefficient_and_the_horizon_cuts(tmp_path: Pat
     limits = ["--limit-horizontal", "28", "--limit-vertical", "34", "--horizon", "20000", "--stop", "1000", "--json"]
     limits += ["--scenario", "hard:coefficient=2"]
     picture = tmp_path / "plots" / "forecast.png"
-    command = [sys.executable, "-m", "plow_twin", "forecast", str(file), *limits, "--plot", str(picture)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=110)
+    done = plow_twin("forecast", file, *limits, "--plot", picture)
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
     assert facts["p50"]["passes"] == pytest.approx(facts["p50"]["km"] * 1000.0 / 250.0)

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from multiprocessing import Pipe
 from pathlib import Path
@@ -15,12 +14,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import plow_twin
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from ros_processes import ROOT, Bench, bench, value
 from scenes import gaps_at, preset
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
+from waiting import until
 
 from plow_twin import Twin, Wear
 from plow_twin.cli.app import run as run_cli
@@ -189,8 +190,7 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
         assert value(status, name) == "estimated"
     assert (value(status, "model"), value(status, "sensor")) == ("ok", "ok")
 
-    command = [sys.executable, "-m", "plow_twin", "estimate", str(run), "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=110)
+    done = plow_twin("estimate", run, "--json")
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
     assert facts["live"]["repeated"] is True and facts["live"]["estimates"] >= 1
@@ -320,13 +320,14 @@ def test_a_frozen_worker_is_reported_and_costs_no_further_memory(monkeypatch: py
     monkeypatch.setattr("plow_twin.estimate.worker._MOST_WAITING", 20_000)
     worker = Worker(preset("paper"), Windows(10.0, 4.0, 1.0))
     os.kill(worker._process.pid, signal.SIGSTOP)
-    give_up = time.monotonic() + 20.0
-    while not worker.error and time.monotonic() < give_up:
+
+    def look() -> str:
         for _ in range(1000):
             worker.add_load(START_NS, (0.0, 0.0, 0.0))
         assert worker.poll() is None
-        # a source pauses in the same way while it waits for a slow worker
-        time.sleep(0.1)
+        return worker.error
+
+    until(look, "a report", pause_s=0.1)  # a source pauses in the same way while it waits for a slow worker
     assert worker.error == "the estimator did not read for 20000 samples"
     assert not worker.ready
     worker.add_load(START_NS, (0.0, 0.0, 0.0))
@@ -342,11 +343,13 @@ def test_the_death_of_a_worker_is_reported_and_stops_nothing() -> None:
     # the worker has not ended yet, and `poll` does not wait for it
     assert worker.poll() is None and not worker.error
     worker._process.kill()
-    give_up = time.monotonic() + 20.0
-    while not worker.error and time.monotonic() < give_up:
+
+    def look() -> str:
         worker.add_load(START_NS, (0.0, 0.0, 0.0))
         assert worker.poll() is None
-        time.sleep(0.01)
+        return worker.error
+
+    until(look, "a report")
     assert worker.error == "the estimator ended with code -9"
     worker.close()
 

@@ -24,9 +24,11 @@ from pathlib import Path
 from typing import Any, cast
 from urllib.request import urlopen
 
+import forge
 import numpy as np
 import pytest
 from record_support import PAPER_AMPLITUDE, rewrite
+from waiting import until
 
 from plow_twin.cli.app import run as run_cli
 from plow_twin.cli.outlet import MOST_WAITING, Outlet
@@ -424,13 +426,10 @@ def test_a_live_twin_whose_standard_output_nobody_reads_goes_on_and_ends_when_it
         # the pipe is soon full, because it holds less than the lines of one second
         fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, 4096)
         live.until_count("samples_used", 100)
-        give_up = time.monotonic() + START_S
         for count in range(1000, 4000, 1000):  # from here on, nothing reads the pipe
             with path.open("a") as file:
                 file.writelines(",".join(map(repr, _row(index))) + "\n" for index in range(count - 900, count + 100))
-            while _metric(port, "plow_twin_input_samples_used") < count + 100:
-                assert time.monotonic() < give_up
-                time.sleep(0.1)
+            until(lambda: _metric(port, "plow_twin_input_samples_used") >= count + 100, count, 0.1)  # noqa: B023
         live.process.send_signal(signal.SIGTERM)
         assert live.process.wait(60.0) == 3
         errors = live.process.stderr
@@ -446,11 +445,8 @@ def _metric(port: int, name: str) -> float:
 
 class Live:
     def __init__(self, *arguments: str, **options: Any) -> None:
-        environment = os.environ | {"PYTHONPATH": str(ROOT), **options.pop("environment", {})}
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "plow_twin", "live", *arguments, "--lines"],
-            env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options,
-        )  # fmt: skip
+        words = ["live", *arguments, "--lines"]
+        self.process = forge.start("plow_twin", words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
         self.heard: dict[str, dict[str, Any]] = {}
         self.alarms: list[dict[str, Any]] = []
 
@@ -490,8 +486,7 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
     path, run = tmp_path / "load.csv", tmp_path / "run"
     _csv(path, 100)
     arguments = (str(path), "--follow", "--record", str(run), "--set", "excitation_timeout=3600")
-    # under `nohup`, the twin would ignore SIGHUP, so the default handler is restored
-    with _live(*arguments, preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL)) as live:
+    with _live(*arguments) as live:
         live.until_count("samples_used", 100)
         text = "".join(",".join(map(repr, _row(index))) + "\n" for index in range(100, 200))
         with path.open("a") as stream:

@@ -446,7 +446,7 @@ def test_an_encrypted_session_of_a_user_leaves_no_secret_in_the_recording(
         *("--tls-ca", str(access.ca), "--tls-cert", str(access.certificate), "--tls-key", str(access.key)),
     )
 
-    with _live(*arguments, environment={"PLOW_TWIN_OPCUA_PASSWORD": access.password}) as live:
+    with _live(*arguments, env={"PLOW_TWIN_OPCUA_PASSWORD": access.password}) as live:
         live.until(lambda heard: "source" in heard, "connected")
         plant.do("rows", _rows(time.time_ns() // MS * MS, 0, 10))
         live.until_count("samples_used", 10)

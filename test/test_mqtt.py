@@ -22,6 +22,7 @@ from urllib.parse import urlsplit
 import pytest
 from commands import plow_twin_here
 from test_live import ROOT, _csv, _free_port, _live, _row
+from waiting import until
 
 from plow_twin.cli.app import run as run_cli
 from plow_twin.live.bridge import mqtt
@@ -106,7 +107,7 @@ class Subscriber:
         assert self._subscribed.wait(30.0)
 
     def until(self, reached: Callable[[], bool]) -> None:
-        _until(reached, self.messages)
+        until(reached, self.messages)
 
     def newest(self, topic: str) -> Any:
         found = [payload for name, payload, _ in self.messages if name == topic]
@@ -264,7 +265,7 @@ def test_a_broker_that_sends_more_than_can_wait_fills_no_memory(monkeypatch: pyt
     with _hostile(b"\x20\x02\x00\x00", b"\x90\x03\x00\x01\x01" + flood) as access:
         bridge = Mqtt(access)
         bridge.start(["a"])
-        _until(lambda: (bridge.lost, len(bridge._queue)) == (12, 14))
+        until(lambda: (bridge.lost, len(bridge._queue)) == (12, 14))
         waiting = [len(payload) for _, payload, _, _ in bridge._queue]
         assert waiting == [0] * 5 + [60_000] * 8 + [1]
         assert [found.content for found in bridge.poll(0.0)] == [None] * 14
@@ -278,13 +279,6 @@ def test_another_machine_without_tls_and_passwords_in_the_address_are_refused(ur
     with pytest.raises(BridgeError) as caught:
         Mqtt(Access(url))
     assert "secret" not in str(caught.value)
-
-
-def _until(reached: Callable[[], bool], seen: object = None) -> None:
-    give_up = time.monotonic() + 90.0
-    while not reached():
-        assert time.monotonic() < give_up, seen
-        time.sleep(0.02)
 
 
 @contextmanager
@@ -311,7 +305,8 @@ def test_a_broker_gets_all_groups_with_tls_and_says_when_the_twin_has_died(broke
     arguments = (str(path), "--follow", "--mqtt-out", url, "--out-access", str(tmp_path / "out.yaml"), *STALE)
     alarm = ("--set", "alarm_force=[20e3,1e9]", "--set", "alarm_duration=0.0")
     early = Subscriber(port, broker)
-    with _live(*arguments, *alarm, "--out-rate", "5") as live:
+    # with a variable of its own the twin is started, not forked, so that its command line is its own
+    with _live(*arguments, *alarm, "--out-rate", "5", env={"OF_THIS_TEST": "1"}) as live:
         live.until_count("samples_used", 1500)
         live.until(lambda heard: heard.get("mqtt_out", {}).get("values", {}).get("sent", 0) > 8, "sent")
         assert broker.password not in Path(f"/proc/{live.process.pid}/cmdline").read_text()
@@ -386,16 +381,16 @@ def test_messages_that_wait_for_a_broker_are_bounded_counted_and_come_in_order(t
     way.open()
     for number in range(8):
         way.send(Message("n", str(number).encode(), False))
-    _until(lambda: way.state.trouble.startswith("no broker at 127.0.0.1"), way.state)
+    until(lambda: way.state.trouble.startswith("no broker at 127.0.0.1"), way.state)
     assert (way.state.sent, way.state.lost, way.state.connected) == (0, 3, False)
     with _open_broker(tmp_path, port):
         subscriber = Subscriber(port)
-        _until(lambda: way.state.sent == 6, way.state)
+        until(lambda: way.state.sent == 6, way.state)
         subscriber.until(lambda: len(subscriber.messages) == 6)
         assert [payload for _, payload, _ in subscriber.messages] == [b"true", b"3", b"4", b"5", b"6", b"7"]
         assert (way.state.lost, way.state.trouble) == (3, "")
         subscriber.close()
-    _until(lambda: not way.state.connected)
+    until(lambda: not way.state.connected)
     asyncio.run(way.close(there, 0.0))
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import random
-import subprocess
-import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import pairwise
@@ -16,6 +14,7 @@ import numpy as np
 import pytest
 import rainflow
 from bag_support import BIAS, COUNT, LAG_S, PAPER, STORE, measured, motion, pose_message, wrench_message, write_bag
+from commands import plow_twin
 from pyarrow import parquet
 from record_support import BASE_NS, STEP_NS, paper_sample, record_run
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -107,9 +106,8 @@ def test_values_of_another_clock_and_impossible_ones_are_counted(tmp_path: Path)
 
 def test_other_scenes_are_predicted_beside_it_in_one_pass(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", motion(), StoragePlugin.MCAP)
-    command = [sys.executable, "-m", "plow_twin", "analyse", str(bag), "--scene", "paper", "--with", str(BEST_FIT)]
-    command += ["--map", str(tmp_path / "map.yaml"), "--out", str(tmp_path / "out"), "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=110, check=False)
+    words = ["analyse", bag, "--scene", "paper", "--with", BEST_FIT, "--map", tmp_path / "map.yaml"]
+    done = plow_twin(*words, "--out", tmp_path / "out", "--json")
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
     assert set(facts["signals"]["x"]) >= {"n", "bias", "rms", "correlation", "lag_s"}

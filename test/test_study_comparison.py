@@ -33,6 +33,7 @@ from plow_twin.study.comparison.compare import Comparison, by_time, compare
 from plow_twin.study.comparison.report import _figure
 from plow_twin.study.comparison.windows import QUANTITIES, windows_of
 
+pytestmark = pytest.mark.usefixtures("without_workers")
 SECONDS = 8
 
 

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +18,7 @@ import pytest
 from commands import started
 from pyarrow import parquet
 from record_support import paper_sample, record_run
+from waiting import until
 
 from plow_twin.cli.app import run as cli
 from plow_twin.errors import RecordingError
@@ -67,9 +67,7 @@ def test_a_killed_worker_loses_nothing_and_a_second_call_uses_finished_chunks(ru
     out = tmp_path / "out"
     command = [sys.executable, "-m", "plow_twin", "analyse", str(runs), "--scene", "paper", "--out", str(out)]
     with started([*command, "--workers", "2", "--json"], stdout=subprocess.PIPE) as process:
-        deadline = time.monotonic() + 120
-        while not list(out.glob("*/asked.json")) and time.monotonic() < deadline:
-            time.sleep(0.01)
+        until(lambda: list(out.glob("*/asked.json")), "the first analysis")
         os.kill(int(workers_of(process)[0]), signal.SIGKILL)
         report = json.loads(process.communicate(timeout=200)[0])
     assert process.returncode == 0
@@ -95,9 +93,7 @@ def test_an_interrupt_ends_the_call_and_its_workers_at_once(number: signal.Signa
     command = [sys.executable, "-m", "plow_twin", "analyse", str(tmp_path / "runs"), "--scene", "paper"]
     command += ["--out", str(tmp_path / "out"), "--workers", "2"]
     with started(command, stderr=subprocess.PIPE, start_new_session=True) as process:
-        while len(list(tmp_path.glob("out/*/run/run_0.mcap"))) < 2:
-            assert process.poll() is None
-            time.sleep(0.05)
+        until(lambda: process.poll() is not None or len(list(tmp_path.glob("out/*/run/run_0.mcap"))) == 2, "two runs")
         workers = workers_of(process)
         if number == signal.SIGINT:
             os.killpg(process.pid, number)  # a terminal sends Ctrl-C to the whole process group
@@ -107,10 +103,7 @@ def test_an_interrupt_ends_the_call_and_its_workers_at_once(number: signal.Signa
     if number == signal.SIGINT:
         assert process.returncode == 1 and "interrupted" in said and "Traceback" not in said
     assert len(workers) == 2
-    deadline = time.monotonic() + 20
-    while (left := [pid for pid in workers if is_running(pid)]) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not left
+    until(lambda: not any(map(is_running, workers)), "the end of the workers")
 
 
 def test_the_others_go_on_together_when_a_worker_died_before_the_first_result(
@@ -197,6 +190,7 @@ def test_the_failure_of_one_of_many_recordings_is_its_row(tmp_path: Path) -> Non
     assert found["run"] == str(run.folder) and "FileExistsError" in found["error"]
 
 
+@pytest.mark.usefixtures("without_workers")
 def test_no_recording_of_a_folder_is_left_out_unsaid(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("good", "gone"):
         record_run(tmp_path / name, map(paper_sample, range(10)))

@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import forge
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -105,7 +106,7 @@ def test_a_killed_sweep_goes_on_where_it_was(tmp_path: Path, capsys: pytest.Capt
     arguments = ["study", "sweep", "paper", *GRID, "--statistic", "max.ccw.a", "--statistic", "events"]
     arguments += ["--t-end", "40", "--chunk", "2", "--out"]
     killed, whole = tmp_path / "killed", tmp_path / "whole"
-    process = subprocess.Popen([sys.executable, "-m", "plow_twin", *arguments, str(killed)], stderr=subprocess.DEVNULL)
+    process = forge.start("plow_twin", [*arguments, str(killed)], stderr=subprocess.DEVNULL)
     try:
         while process.poll() is None and len(list(killed.glob("chunks/*.npz"))) < 2:
             time.sleep(0.005)

@@ -7,22 +7,14 @@ import re
 import signal
 import socket
 import subprocess
-import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
+import forge
 from ros_processes import WAIT_S, bench
 from sensor_msgs.msg import JointState
+from waiting import until
 
 from plow_twin.record.reader import RunReader
-
-
-def until(reached: Callable[[], object], what: str) -> None:
-    deadline = time.monotonic() + WAIT_S
-    while not reached():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.1)
 
 
 def stopped(pid: int) -> bool:
@@ -30,9 +22,9 @@ def stopped(pid: int) -> bool:
 
 
 def follower(run: Path, log: Path, *options: str) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "plow_twin", "view", str(run), "--follow", "--wait", "60", *options]
+    words = ["view", str(run), "--follow", "--wait", "60", *options]
     with log.open("wb") as stream:
-        return subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT)
+        return forge.start("plow_twin", words, stdout=stream, stderr=subprocess.STDOUT)
 
 
 def test_a_stopped_viewer_does_not_disturb_the_node_and_catches_up_later(tmp_path: Path) -> None:
