@@ -56,8 +56,13 @@ def test_both_solvers_agree(stiffness: float, exponent: float) -> None:
     contact = Contact("ramped_damping", stiffness, exponent, damping=6e4, ramp_m=1e-3)
     scene = replace(preset("paper"), contact=contact)
     events = simulate(scene, 2.0, output_dt=0.1)
-    steps = simulate(scene, 2.0, output_dt=0.1, method="rk4", dt=1e-5)
+    coarse, steps = (
+        simulate(scene, 2.0, output_dt=0.1, method="rk4", dt=dt, energy_balance=True) for dt in (4e-5, 1e-5)
+    )
     assert pose_error(scene, steps.q, events.q) < 1e-6
+    # the energy of fixed steps balances to their order
+    assert coarse.energy_balance is not None and steps.energy_balance is not None
+    assert steps.energy_balance.relative_imbalance < 0.15 * coarse.energy_balance.relative_imbalance < 1e-6
     assert 2 in events.events["mode_to"]
 
 

@@ -188,13 +188,24 @@ def test_fixed_steps_come_to_the_same_motion_and_the_energy_balances(name: str) 
     assert pose_error(scene, loose.q, events.q) < 1e-4
 
 
-@pytest.mark.stress  # implicit steps with stick need additional compiled kernels
-@pytest.mark.parametrize("damping", [1e10, 1e7])
-def test_strong_dampers_keep_to_the_tolerance(damping: float) -> None:
+#: A contact with the damping and the exponent of `held_scene`, whose kernels have implicit steps.
+HYSTERETIC = Contact("exact_restitution", 1.6e10, 1.5, restitution=0.5)
+
+
+# implicit steps with the block's own law compile kernels of their own
+@pytest.mark.parametrize(
+    ("contact", "damping"),
+    [
+        pytest.param(HYSTERETIC, 1e8, id="hysteretic"),
+        *(pytest.param(block(0.0, 0.0).contact, damping, marks=pytest.mark.stress) for damping in (1e10, 1e7)),
+    ],
+)
+def test_strong_dampers_keep_to_the_tolerance(contact: Contact, damping: float) -> None:
     """A grip with a damper that is far stronger than its spring needs implicit steps."""
     friction = Friction(MU, stick_stiffness_n_m=GRIP, stick_damping_n_s_m=damping)
     push, omega = 1.3 * MU * MASS * G, 9.0
-    scene = replace(block(0.0, 0.0), friction=friction, loads=(Harmonic("pull", (push, 0.0), omega_rad_s=omega),))
+    load = Harmonic("pull", (push, 0.0), omega_rad_s=omega)
+    scene = replace(block(0.0, 0.0), contact=contact, friction=friction, loads=(load,))
     tight = simulate(scene, 1.0, output_dt=0.05, tol=1e-12)
     loose = simulate(scene, 1.0, output_dt=0.05, tol=1e-5)
     assert pose_error(scene, loose.q, tight.q) < 1e-4 and loose.solver["steps"] < 3000
