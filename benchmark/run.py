@@ -109,7 +109,7 @@ def _run(chosen: set[str], repeats: int, quick: bool, notify: Notify) -> list[Ro
     if "start" in chosen:
         rows += live_rows.start_rows(notify)
     if "ensemble" in chosen:
-        columns, lines, steps = (3, 2, ()) if quick else (ensemble_rows.COLUMNS, ensemble_rows.ROWS, (1e-3, 1e-4))
+        columns, lines, steps = (3, 2, ()) if quick else (ensemble_rows.COLUMNS, ensemble_rows.ROWS, (1e-3,))
         rows += ensemble_rows.ensemble_rows(columns, lines, steps, min(repeats, 3), notify)
         if not quick:
             rows += ensemble_rows.lanes_rows(columns, lines, min(repeats, 3), notify)
