@@ -18,7 +18,7 @@ from plow_twin.model.geometry import STATE_SIZE
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.dense_output import evaluate, pair_outputs, time_along, wear_depth_at
 from plow_twin.solve.dynamics import about_mass, push
-from plow_twin.solve.kinematics import along, named_angle, to_world_axes
+from plow_twin.solve.kinematics import along, to_world_axes
 from plow_twin.solve.loads import load_at
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y, new_record
 from plow_twin.solve.support import to_ground
@@ -76,8 +76,6 @@ def _powers(p, parts, state, wear_depth, y, frame, t, balance, out) -> None:
     """Write powers and forces at time t and body coordinates y. `frame` is the state of a frame on springs, or None."""
     terms, load = parts.terms, out[LOAD_X : LOAD_M + 1]
     load_at(p, parts.harmonics, parts.segments, t, load)
-    angle = named_angle(p, y, y[THETA])
-    y[COS], y[SIN] = math.cos(angle), math.sin(angle)
     ground = _on_ground(terms.support, y, frame, balance)
     _powers_under(
         p, terms.offset, terms.free, terms.slip, terms.stick, state, wear_depth, y, ground, load, balance.pairs, out
