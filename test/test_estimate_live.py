@@ -105,6 +105,31 @@ def test_measurements_without_a_load_do_not_pile_up(monkeypatch: pytest.MonkeyPa
     assert len(windows._poses) <= 100
 
 
+def test_poses_form_windows_while_the_load_is_silent() -> None:
+    stamps = [START_NS + index * 10_000_000 for index in range(1500)]
+    windows, formed = Windows(4.0, 1.0, 0.5), []
+    for index, stamp in enumerate(stamps):
+        formed.append(windows.add_pose(stamp, (0.001 * index, 0.0, 0.0)))
+        if 400 <= index < 800:
+            formed.append(windows.add_load(stamp, (1.0, 2.0, 3.0)))
+    found = [one for one in formed if one is not None]
+    assert sorted(one.end_ns for one in found) == [one.end_ns for one in found]
+    silent = [one for one in found if not one.samples]
+    assert silent[0].end_ns < stamps[400] < stamps[800] < silent[-1].end_ns
+    assert all(not one.load.wrench.any() and len(one.pose.t) >= 200 for one in silent)
+    assert not any(stamps[400] < one.end_ns < stamps[799] for one in silent)
+
+
+def test_a_pose_with_a_stamp_far_ahead_does_not_stop_the_windows() -> None:
+    stamps = [START_NS + index * 10_000_000 for index in range(1000)]
+    windows, formed = Windows(4.0, 1.0, 0.5), []
+    for index, stamp in enumerate(stamps):
+        formed.append(windows.add_pose(stamp + 3_600_000_000_000 * (index == 500), (0.0, 0.0, 0.0)))
+        formed.append(windows.add_load(stamp, (1.0, 2.0, 3.0)))
+    found = [one for one in formed if one is not None]
+    assert len(found) == 8 and all(one.samples for one in found)
+
+
 def test_a_window_begins_behind_a_silence_of_the_load() -> None:
     stamps = np.delete(START_NS + np.arange(0, 1200) * 10_000_000, slice(500, 600))
     rows = [(int(stamp), (0.0, 0.0, 0.0)) for stamp in stamps]

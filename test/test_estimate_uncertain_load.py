@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimate_support import KINDS, known, mismatched
+from estimate_support import GROUPS, KINDS, draw, known, mismatched
 
 from plow_twin.estimate import tuning
 from plow_twin.estimate.equation_error import EquationError
@@ -79,3 +79,12 @@ def test_a_quick_load_is_no_reason_to_look_at_the_poses_in_its_own_time() -> Non
     truth = mismatched(replace(KINDS["chatter"], periods=6.0), 80001)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert result.horizontal_state is State.ROUGH and _holds(result, truth.clearance)
+
+
+def test_poses_without_any_load_give_a_rough_clearance_whose_interval_holds() -> None:
+    """Soft walls yield by more than half of the clearance; hard walls leave the range of motion."""
+    for truth in (known()[0][0], draw(replace(GROUPS["hard"], periods=4.0), 30100)):
+        result = estimate(truth.nominal, Load.unmeasured(float(truth.load.t[-1])), truth.poses)
+        assert (result.model, result.sensor) == ("suspect", "ok") and "load" in result.reasons[0]
+        assert result.horizontal_state is result.vertical_state is State.ROUGH and _holds(result, truth.clearance)
+        assert max(result.horizontal.deviation, result.vertical.deviation) < 4e-3

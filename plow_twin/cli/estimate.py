@@ -84,7 +84,7 @@ def estimate(
     """Estimate clearances, contact parameters, load gains, bias and delay from INPUT, with 90 % intervals.
 
     INPUT is a folder with the nominal scene, scene.yaml, and tables in CSV or Parquet. The table load.csv (t, fx, fy,
-    m) contains the measured load. The table pose.csv (t, x, y, theta) contains the measured pose; its cells may be
+    m) contains the measured load, and may be missing. The table pose.csv (t, x, y, theta) contains the measured pose; its cells may be
     empty. The optional table gaps.csv (t and columns named after pairs) contains measured gaps, and may replace
     pose.csv. The optional table contact_forces.csv (columns as in gaps.csv) contains measured forces.
 
@@ -175,16 +175,26 @@ class _Given:
 
 def _measured(source: Path, scene: Path | None, mapping: Path | None, folder: bool) -> _Given:
     from plow_twin.estimate.gaps import Gaps
-    from plow_twin.estimate.measurements import Load, Poses
+    from plow_twin.estimate.measurements import Poses
     from plow_twin.record.measured import read_measured, read_recording
 
     measured = read_measured(source, scene) if folder else read_recording(source, scene, mapping)
     _check_units(source, measured)
-    load, lost_load = Load.of(measured.load[:, 0], measured.load[:, 1:], measured.load_deviation)
+    load, lost_load = _load_of(measured)
     poses, lost_poses = Poses.of(measured.poses[:, 0], measured.poses[:, 1:], measured.pose_deviation)
     gaps, lost_gaps = Gaps.of(measured.gaps[:, 0], measured.gaps[:, 1:], measured.gaps_deviation)
     lost = measured.unreadable + lost_load + lost_poses + lost_gaps
     return _Given(measured, load, poses, gaps if len(gaps.t) else None, lost)
+
+
+def _load_of(measured: Measured) -> tuple[Load, int]:
+    """Return the load and the number of unusable rows; a load that was not measured is zero over the poses or gaps."""
+    from plow_twin.estimate.measurements import Load
+
+    if len(measured.load):
+        return Load.of(measured.load[:, 0], measured.load[:, 1:], measured.load_deviation)
+    t = (measured.poses if len(measured.poses) else measured.gaps)[:, 0]
+    return Load.unmeasured(float(t.max()), float(t.min())), 0
 
 
 def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool) -> _Task:
@@ -208,6 +218,8 @@ def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool)
 def _followed(given: _Given, members: int, dt: float | None) -> tuple[list[str], Any]:
     from plow_twin.estimate import followed as offline
 
+    if not len(given.measured.load):
+        raise click.UsageError("--follow: got no load, expected its samples")
     stretch = offline.follow(given.measured.scene, given.load, given.poses, members, dt, gaps=given.gaps)
     return offline.table(stretch.rows)
 

@@ -286,6 +286,30 @@ def compare(
     )
 
 
+def by_range(unknowns: Unknowns, poses: Poses) -> Bounced:
+    """Return the result for a hard contact from the range of motion alone, because the load was not measured.
+
+    The walls yield by at most `tuning.FITTED` each; the penetrations of both are uniformly distributed up to this.
+    """
+    eye = MotionFeatures(unknowns, poses, float(poses.t[-1] - poses.t[0]))
+    yielding = tuning.FITTED / math.sqrt(6.0)
+    middle, softness, damping, _ = tuning.HARD_DRAWN
+    return Bounced(
+        range_of_motion(unknowns.scene, poses)[0] - tuning.OVERRATED,
+        np.full(2, yielding),
+        np.zeros(3),
+        np.array([yielding, yielding, yielding / geometry.half_diagonal(unknowns.scene)]),
+        (math.log(middle), softness),
+        (float(unknowns.nominal()[DAMPING]), damping),
+        eye.noise,
+        0.0,
+        0.0,
+        0.0,
+        -math.inf,
+        *hidden_by_geometry(unknowns, poses, float(poses.t[-1] - poses.t[0]), eye.features(eye.q)[:2]),
+    )
+
+
 def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: Array) -> tuple[Array, Array]:
     """Return the attributes `unseen` and `rounded` of `Bounced`.
 

@@ -110,7 +110,7 @@ class EquationError:
         self._slope = -6.0 * step / span * s * bump**2
         self._curve = step / span**2 * (24.0 * s * s * bump - 6.0 * bump**2)
         self._apart = max(1, half // 2)
-        self._force = unknowns.force
+        self._force, self._scene = unknowns.force, scene
         self._rows, self._arms = geometry.penetration_rows(scene)[:4], geometry.arm_rows(scene)
         self._inertia = np.asarray(inertias(scene))
         self._half_size = np.where(NORMAL_X != 0.0, scene.frame.width_m, scene.frame.height_m) / 2.0
@@ -156,6 +156,25 @@ class EquationError:
         beyond = self._geometry(poses)[0] - walls.reach[_WALL] > deeper
         step = self._grid[1] - self._grid[0]
         return np.array([step * beyond[:, wall].any(axis=1).sum() for wall in WALLS])
+
+    def required_load(self, q: Array, reach: Array, ln_depth: float, damping: float) -> Load:
+        """Return the load that moves the head along poses (n, 3) between walls with these properties.
+
+        It is averaged over `tuning.LOAD_AVERAGED`, because impacts falsify it.
+        """
+        poses = np.stack([np.interp(self._grid, self._t, column) for column in q.T], axis=1)
+        stiffness = self._force / math.exp(ln_depth)
+        columns = self._columns(*self._geometry(poses), reach, stiffness)[..., :2]
+        contact = columns @ np.array([stiffness, stiffness * damping]) / _UNIT
+        left = (self._weighed(poses, self._curve) - contact) / self._value.sum()
+        step = float(self._grid[1] - self._grid[0])
+        count = max(1, round(tuning.LOAD_AVERAGED / (self._apart * step)))
+        mean = np.stack([np.convolve(column, np.full(count, 1.0 / count), "valid") for column in left.T], axis=1)
+        first = len(self._value) // 2 + 0.5 * (count - 1) * self._apart
+        t = self._grid[0] + step * (first + self._apart * np.arange(len(mean)))
+        mass, gravity = self._scene.head.mass_kg, self._scene.gravity
+        weight = mass * gravity.acceleration_m_s2 * np.array([0.0, -1.0, -gravity.arm_m])
+        return Load(t, mean * self._inertia - weight)
 
     def _geometry(self, q: Array) -> tuple[Array, Array]:
         """Return the reaches of the pairs in m, shape (n, 8), and the accelerations by unit forces of the pairs, (n, 3,

@@ -12,7 +12,7 @@ from scipy.special import ndtri
 
 from plow_twin.estimate import tuning
 from plow_twin.estimate.block import estimate_block
-from plow_twin.estimate.bouncing import Bounced, bias_of_hard, bounces, compare
+from plow_twin.estimate.bouncing import Bounced, bias_of_hard, bounces, by_range, compare
 from plow_twin.estimate.discrepancy import Graded, graded, variants
 from plow_twin.estimate.fit import Fit, Problem, freed
 from plow_twin.estimate.forward import Forward
@@ -205,7 +205,7 @@ def _from_motion(
     if lacking:
         return _not_observable(unknowns, poses, lost, lacking), ()
     if _is_dead(load, poses):
-        return _without_fit(unknowns, poses, lost, "load: the same value throughout, while the head moves"), ()
+        return _without_load(unknowns, load, poses, lost), ()
     if _is_idle(scene, load, poses):
         return _not_observable(unknowns, poses, lost, ("the head rests under a load that hardly changes",)), ()
     if _rests(poses):
@@ -236,6 +236,21 @@ def _from_motion(
             following = tuple(numbers.tolist())
         return _moved_back(result, bias), following
     return _searched(forward, unknowns, poses, period, drift, lost, forces)
+
+
+def _without_load(unknowns: Unknowns, load: Load, poses: Poses, lost: int) -> Estimate:
+    """Estimate from the poses alone, because the load was not measured.
+
+    The range of motion is the clearance plus the penetrations of both walls. If the walls yield, the equations of
+    motion show how much, and which load moves the head between the walls.
+    """
+    nothing = _without_fit(unknowns, poses, lost, "load: the same value throughout, while the head moves")
+    bias = bias_of_hard(unknowns, poses)
+    poses = poses.moved(-bias)
+    if bounces(unknowns, poses):
+        found = summarise_bounced(unknowns, poses, by_range(unknowns, poses), lost, 0)
+        return replace(_moved_back(found, bias), model="suspect", reasons=(*nothing.reasons, *found.reasons))
+    return under_uncertain_load(nothing, unknowns, None, poses, float(poses.t[-1] - poses.t[0]) / 10.0)
 
 
 def _from_some_components(
@@ -320,7 +335,7 @@ def _fails(found: Fit, verdict: Verdict) -> bool:
 def under_uncertain_load(
     result: Estimate,
     unknowns: Unknowns,
-    felt: Load,
+    felt: Load | None,
     poses: Poses,
     period: float,
     fitted: tuple[Problem, Fit] | None = None,
@@ -332,7 +347,7 @@ def under_uncertain_load(
     `fitted` is a fit that failed a check and may have converged to a false optimum. A clearance of the fit that agrees
     with the comparison is combined with it.
     """
-    if _known(result) or felt.interval() > tuning.COARSEST:
+    if _known(result) or (felt is not None and felt.interval() > tuning.COARSEST):
         return result
     found, work = compare_under_uncertain_load(felt, unknowns, poses, period)
     figures = result.figures | {"work": result.figures.get("work", 0.0) + float(work)}

@@ -180,6 +180,11 @@ class Load:
             raise EstimateError(f"load: got {len(index)} samples that can be used, expected at least 2")
         return Load(times[index], rows[index], deviation), len(times) - len(index)
 
+    @staticmethod
+    def unmeasured(end: float, start: float = 0.0) -> Load:
+        """Return a load of zero between two times in s, in place of a load that was not measured."""
+        return Load(np.array([start, end]), np.zeros((2, 3)))
+
     def between(self, start: float, end: float) -> Load:
         """Return the samples that determine the load in [start, end]."""
         first = max(int(np.searchsorted(self.t, start, side="right")) - 1, 0)

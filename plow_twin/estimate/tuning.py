@@ -566,6 +566,23 @@ MODULATED: Annotated[
     float,
     Tuned("s", "span of the test functions by which the equations are multiplied", "kinds `load_10`, `averages_1hz`"),
 ] = 0.12
+LOAD_AVERAGED: Annotated[
+    float,
+    Tuned(
+        "s",
+        "time over which the load is averaged that a motion requires, if the load was not measured",
+        "`plain`, seeds 30200 to 30202: clearances are off by up to 3.7 mm, with 0.2 s by up to 8 mm",
+    ),
+] = 0.4
+YIELDED: Annotated[
+    tuple[float, float, float],
+    Tuned(
+        "1, 1, 1",
+        "if the load was not measured: penetrations of both walls relative to that under the reference force, median "
+        "and deviation of the logarithm; share of the penetrations that is added to the deviation of a clearance",
+        "as for `LOAD_AVERAGED`",
+    ),
+] = (1.5, 0.4, 0.1)
 UNCERTAIN_DRAWS: Annotated[
     tuple[int, ...], Tuned("motions", "number of draws in each of three rounds: if theta was measured; if it was not")
 ] = (60, 120)

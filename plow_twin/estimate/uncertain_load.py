@@ -1,9 +1,13 @@
-"""Clearances if the measured load does not explain the motion, or if theta was not measured.
+"""Clearances if the measured load does not explain the motion, or if load or theta was not measured.
 
 Motions with random clearances, contacts and load errors are simulated and observed as by the sensor. A regression over
 the simulated motions near the measured motion corrects the result of the module `equation_error`, and gives the
 deviation of the corrected result. The method is approximate Bayesian computation with local-linear adjustment, as in
 the module `bouncing`. If theta was not measured, the range of motion replaces the result of `equation_error`.
+
+If the load was not measured, each simulated motion has the load that the measured motion would need between the drawn
+walls, averaged over a time that is longer than impacts. Only the right walls then give the measured impacts. The
+sensor's biases of x and y are taken as zero.
 """
 
 from __future__ import annotations
@@ -62,6 +66,7 @@ class _Spread:
     """Distribution of the draws: mean `centre` (2,) and deviation `about` of the clearances in m, and logarithms.
 
     Each logarithm (of penetration in m, damping and relative load error) has a mean and a standard deviation.
+    If `yields` is true, the clearances are the mean minus random penetrations of both walls.
     """
 
     centre: Array
@@ -69,17 +74,18 @@ class _Spread:
     ln_depth: tuple[float, float]
     ln_damping: tuple[float, float]
     ln_error: tuple[float, float]
+    yields: bool = False
 
 
 def compare_under_uncertain_load(
-    felt: Load, unknowns: Unknowns, poses: Poses, period: float, seed: int = 0
+    felt: Load | None, unknowns: Unknowns, poses: Poses, period: float, seed: int = 0
 ) -> tuple[Compared | None, int]:
     """Return the comparison of the measured motion with motions under random errors of the load, and the work.
 
     Parameters
     ----------
-    felt : Load
-        The measured load, without samples that hardly move the head.
+    felt : Load or None
+        The measured load, without samples that hardly move the head; None if it was not measured.
     unknowns : Unknowns
         The prior.
     poses : Poses
@@ -99,17 +105,24 @@ def compare_under_uncertain_load(
     rng = np.random.default_rng(seed)
     seen = MotionFeatures(unknowns, poses, period)
     angle = bool(np.isfinite(poses.q[:, 2]).any())
-    features, spread, touched = (_with_angle if angle else _without_angle)(seen, felt, unknowns, poses)
+    if felt is None:
+        motion = EquationError(unknowns, Load.unmeasured(period), poses.t)
+        features, spread, touched = _without_load(seen, unknowns, poses)
+    else:
+        features, spread, touched = (_with_angle if angle else _without_angle)(seen, felt, unknowns, poses)
     measured = features(seen.q)
     rows: list[Array] = []
     targets: list[Array] = []
     work = 0
     found = None
     for _ in range(_ROUNDS):
-        for _ in range(tuning.UNCERTAIN_DRAWS[0 if angle else 1]):
+        for _ in range(tuning.UNCERTAIN_DRAWS[0 if angle and felt is not None else 1]):
             clearance, numbers, ln_error = _draw(spread, rng)
             other = _with_exponent(unknowns, rng)
-            forward = Forward(other.scene, _with_error(felt, math.exp(ln_error), rng))
+            load = felt
+            if load is None:
+                load = motion.required_load(seen.q, np.repeat(0.5 * clearance, 2), numbers[0], math.exp(numbers[1]))
+            forward = Forward(other.scene, _with_error(load, math.exp(ln_error), rng))
             q = seen.look(forward, other, clearance, numbers, 0.0, rng)
             work += forward.work
             if q is not None:
@@ -129,8 +142,10 @@ def compare_under_uncertain_load(
     assert found is not None
     if (spread.centre < LEAST_CLEARANCE).any():  # an extrapolation of the regression beyond all draws
         return None, work
-    share, least = tuning.CORRECTED
-    unexplained = np.hypot(share * value[:2], least) if angle else np.zeros(2)
+    share, least = tuning.CORRECTED if angle else (0.0, 0.0)
+    if felt is None:
+        share, least = tuning.YIELDED[2], 0.0
+    unexplained = np.hypot(share * value[:2], least)
     # a clearance that still changes has not converged, so its last change is added to its deviation
     moved = spread.centre - before
     return Compared(
@@ -145,6 +160,26 @@ def compare_under_uncertain_load(
 
 
 _Look = tuple[Callable[[Array], Array], _Spread, NDArray[np.bool_]]
+
+
+def _without_load(seen: MotionFeatures, unknowns: Unknowns, poses: Poses) -> _Look:
+    """Return the same as `_with_angle` if the load was not measured: motions are compared by reaches and changes."""
+
+    def features(q: Array) -> Array:
+        values = seen.features(q)
+        return np.concatenate([values[:2], values[5:], seen.changes(q)])
+
+    travel = features(seen.q)[:2]
+    spread = _Spread(
+        travel,
+        0.0,
+        _middle(DEPTHS),
+        (_damping(unknowns), tuning.UNCERTAIN_SPREAD[2]),
+        _middle(tuning.LOAD_ERRORS),
+        True,
+    )
+    moved = np.nanstd(poses.q[:, :2], axis=0) > tuning.RESTS * noise_level(seen.q)[:2]
+    return features, spread, moved
 
 
 def _with_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Poses) -> _Look:
@@ -196,8 +231,12 @@ def _draw(spread: _Spread, rng: np.random.Generator) -> tuple[Array, Array, floa
     The numbers are the logarithms of penetration and damping, and three load gains.
     """
     white = rng.standard_normal(8)
-    clearance = np.maximum(spread.centre + spread.about * white[:2], LEAST_CLEARANCE)
     ln_depth = np.clip(spread.ln_depth[0] + spread.ln_depth[1] * white[2], *np.log(DEPTHS))
+    clearance = spread.centre + spread.about * white[:2]
+    if spread.yields:
+        middle, about, _ = tuning.YIELDED
+        clearance -= middle * np.exp(ln_depth + about * white[:2])
+    clearance = np.maximum(clearance, LEAST_CLEARANCE)
     ln_damping = spread.ln_damping[0] + spread.ln_damping[1] * white[3]
     gains = 1.0 + tuning.UNCERTAIN_GAIN * white[4:7]
     ln_error = np.clip(spread.ln_error[0] + spread.ln_error[1] * white[7], *np.log(tuning.LOAD_ERRORS))

@@ -2,7 +2,8 @@
 
 Each window ends at a multiple of the interval between windows. A window is formed as soon as a load sample is newer
 than its end by the waiting time for late data. The order of arrival within the waiting time has no effect, so a replay
-of the journal gives the same windows as the live node.
+of the journal gives the same windows as the live node. If no load has arrived for half of a window, poses take the
+place of its samples, and the window has no load.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ from plow_twin.model.pairs import PAIR_COUNT
 Array = NDArray[np.float64]
 #: A stamp in ns and the measured values.
 Row = tuple[int, tuple[float, ...]]
+#: A stamp in ns, the measured pose, and its deviations if known.
+_Pose = tuple[int, tuple[float, ...], tuple[float, ...]]
 
 #: Upper bound on the number of stored poses, and on stored rows of gaps. More rows arrive only if the load has stopped
 #: or a clock is ahead by hours.
@@ -91,13 +94,15 @@ class Windows:
     def restart(self) -> None:
         """Drop all data, for example because the stamps have jumped or the machine has changed."""
         self._loads: list[Row] = []
-        self._poses: deque[tuple[int, tuple[float, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
+        self._poses: deque[_Pose] = deque(maxlen=MOST_KEPT)
         self._gaps: deque[tuple[int, tuple[int, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
         #: length [s] of the newest window that was checked, and the larger of its numbers of poses and of rows of gaps
         self._left = (0.0, 0)
         self._newest_ns: int | None = None
         self._end_ns: int | None = None
         self._first_ns: int | None = None
+        #: stamp of the first pose after the newest sample of the load, in order of arrival [ns]
+        self._silent_ns: int | None = None
         #: end of the newest window that was formed [ns]
         self._formed_ns: int | None = None
 
@@ -105,11 +110,22 @@ class Windows:
         """Set the standard deviation of the load (Fx, Fy [N], M [N m]) from now on."""
         self._load_deviation = deviation
 
-    def add_pose(self, stamp_ns: int, q: tuple[float, ...], deviation: tuple[float, ...] = ()) -> None:
+    def add_pose(self, stamp_ns: int, q: tuple[float, ...], deviation: tuple[float, ...] = ()) -> Window | None:
         """Add a measured pose (x, y [m], theta [rad]), with NaN for missing components, and its standard deviations, if
         known.
+
+        Returns a window of poses alone if one has become due, because the load is silent.
         """
         self._poses.append((stamp_ns, q, deviation))
+        self._silent_ns = stamp_ns if self._silent_ns is None else self._silent_ns
+        end_ns = (stamp_ns - self._wait_ns) // self._interval_ns * self._interval_ns
+        if end_ns - self._silent_ns < tuning.WINDOW_SHARES[0] * self._length_ns:
+            return None
+        if self._end_ns is not None and end_ns <= self._end_ns:
+            return None
+        window = self._without_load(max(self._silent_ns, end_ns - self._length_ns), end_ns)
+        self._end_ns = self._end_ns if window is None else end_ns
+        return window
 
     def add_gaps(self, stamp_ns: int, pairs: tuple[int, ...], gaps: tuple[float, ...]) -> None:
         """Add measured gaps in m of the pairs with the indices `pairs`."""
@@ -118,6 +134,7 @@ class Windows:
     def add_load(self, stamp_ns: int, wrench: tuple[float, ...]) -> Window | None:
         """Add a sample of the load (Fx, Fy [N], M [N m]); return a window if one has become due."""
         self._loads.append((stamp_ns, wrench))
+        self._silent_ns = None
         if self._newest_ns is not None and stamp_ns <= self._newest_ns:
             return None
         self._newest_ns = stamp_ns
@@ -187,13 +204,23 @@ class Windows:
             return None
         rows = [row for row in self._loads if start_ns <= row[0] < end_ns]
         load, lost_load = Load.of(*_table(rows, start_ns), self._load_deviation)
-        times, q = _table([(stamp, values) for stamp, values, _ in poses], start_ns)
-        own = own_deviations(brought for _, _, brought in poses)
-        q, deviation = believed(self._pose_deviation, q, own)
-        pose, lost_poses = Poses.of(times, q, deviation)
+        pose, lost_poses = self._table_of_poses(poses, start_ns)
         tabled, lost_gaps = self._table_of_gaps(measured, start_ns)
         lost = lost_load + lost_poses + lost_gaps
         return Window(start_ns, end_ns, load, pose, len(rows), len(poses) + len(measured), lost, tabled)
+
+    def _without_load(self, start_ns: int, end_ns: int) -> Window | None:
+        """Return a window of poses; None if there are few."""
+        poses = [row for row in self._poses if start_ns <= row[0] < end_ns]
+        if len(poses) < FEWEST_POSES:
+            return None
+        pose, lost = self._table_of_poses(poses, start_ns)
+        return Window(start_ns, end_ns, Load.unmeasured((end_ns - start_ns) * 1e-9), pose, 0, len(poses), lost)
+
+    def _table_of_poses(self, rows: list[_Pose], start_ns: int) -> tuple[Poses, int]:
+        times, q = _table([(stamp, values) for stamp, values, _ in rows], start_ns)
+        q, deviation = believed(self._pose_deviation, q, own_deviations(brought for _, _, brought in rows))
+        return Poses.of(times, q, deviation)
 
     def _table_of_gaps(
         self, rows: list[tuple[int, tuple[int, ...], tuple[float, ...]]], start_ns: int

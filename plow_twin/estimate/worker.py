@@ -239,8 +239,8 @@ def add(windows: Windows, item: tuple[Any, ...]) -> Window | None:
     if kind == "load":
         return windows.add_load(*values)
     if kind == "pose":
-        windows.add_pose(*values)
-    elif kind == "gaps":
+        return windows.add_pose(*values)
+    if kind == "gaps":
         windows.add_gaps(*values)
     else:
         windows.set_load_deviation(*values)

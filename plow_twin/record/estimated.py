@@ -46,20 +46,23 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
     length_s, interval_s, wait_s = (float(settings[name]) for name in names)
     windows = Windows(length_s, interval_s, wait_s, *stated(settings), float(settings.get("gaps_deviation", 0.0)))
     formed: dict[int, Window] = {}
+
+    def note(window: Window | None) -> None:
+        if window is not None:
+            formed[window.end_ns] = window
+
     for batch in reader.batches(outputs=False):
         entries = batch.entries
         stamps, wrenches = entries.stamp_ns.tolist(), entries.wrench.tolist()
         for index, is_sample in enumerate(entries.sample.tolist()):
             if is_sample:
-                window = windows.add_load(stamps[index], tuple(wrenches[index]))
-                if window is not None:
-                    formed[window.end_ns] = window
+                note(windows.add_load(stamps[index], tuple(wrenches[index])))
                 continue
             match entries.others[index]:
                 case Pose(stamp_ns, pose, deviation):
-                    windows.add_pose(stamp_ns, pose, deviation)
+                    note(windows.add_pose(stamp_ns, pose, deviation))
                 case PartOfPose(stamp_ns) as part:
-                    windows.add_pose(stamp_ns, whole_pose(part))
+                    note(windows.add_pose(stamp_ns, whole_pose(part)))
                 case Gaps(stamp_ns, pairs, gaps):
                     windows.add_gaps(stamp_ns, pairs, gaps)
                 case Spread(_, deviation):
@@ -69,7 +72,8 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
                     formed.clear()
                 case Estimated(end_ns=end_ns) as entry:
                     yield LiveEstimate(entry, _whole(formed.get(end_ns) or windows.last(), entry))
-                    formed = {end: window for end, window in formed.items() if end > end_ns}
+                    for end in [end for end in formed if end <= end_ns]:
+                        del formed[end]
 
 
 def left_by(reader: RunReader) -> tuple[Scene, Estimated | None]:

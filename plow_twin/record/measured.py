@@ -3,7 +3,7 @@
 A folder of tables contains these files:
 
 - scene.yaml
-- load.csv with the columns t, fx, fy and m
+- optionally load.csv with the columns t, fx, fy and m
 - pose.csv with the columns t, x, y and theta; it may be missing if gaps.csv exists
 - optionally gaps.csv with the column t and columns that are named after pairs
 - optionally contact_forces.csv with the same columns as gaps.csv
@@ -135,8 +135,9 @@ def read_measured(folder: Path, scene: Path | None = None) -> Measured:
     SceneError
         The scene is invalid.
     """
-    lost = Counter[str]()
-    load = _read(_table(folder, LOAD_FILE), lost, _LOAD_COLUMNS)
+    lost, load = Counter[str](), np.zeros((0, 4))
+    if (file := _table(folder, LOAD_FILE)).is_file():
+        load = _read(file, lost, _LOAD_COLUMNS)
     gaps = forces = np.zeros((0, 1 + PAIR_COUNT))
     if (file := _table(folder, GAPS_FILE)).is_file():
         gaps = _read(file, lost, ("t",), PAIR_NAMES)
@@ -146,16 +147,17 @@ def read_measured(folder: Path, scene: Path | None = None) -> Measured:
     if (file := _table(folder, POSE_FILE)).is_file() or not len(gaps):
         poses = _read(file, lost, _POSE_COLUMNS)
     model = load_scene(scene_path(str(scene)) if scene else folder / SCENE_FILE)
-    if len(load) and load[0, 0] >= EPOCH_S:
-        # time is counted from the first sample of the load
+    first = next((table[0, 0] for table in (load, poses, gaps) if len(table)), 0.0)
+    if first >= EPOCH_S:
+        # times count from the first sample of the load, or from the first pose or gap without a load
         for table in (poses, gaps, forces, load):
-            table[:, 0] -= load[0, 0]
+            table[:, 0] -= first
     return Measured(model, load, poses, lost.total(), gaps=gaps, lost=dict(lost), forces=forces)
 
 
 def is_measured(folder: Path) -> bool:
-    """Return whether a folder contains a table of the load."""
-    return _table(folder, LOAD_FILE).is_file()
+    """Return whether a folder has a table of the load or of the poses."""
+    return any(_table(folder, name).is_file() for name in (LOAD_FILE, POSE_FILE))
 
 
 def _table(folder: Path, name: str) -> Path:
@@ -170,12 +172,12 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
 
     The measurements of a run are read from its journal. If the journal contains no pose, the poses are read from other
     topics in the folder of the run and its subfolders `beside`, `beside_2`, .... Any other recording is read through
-    the mapping.
+    the mapping. Without a load, time is counted from the first pose or gap.
 
     Raises
     ------
     RecordingError
-        The recording cannot be read, or it contains no load or no pose.
+        A recording cannot be read, has no pose, or has a load that does not fit its role.
     SceneError
         The scene is invalid.
     """
@@ -205,10 +207,12 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
             lost.update(unread)
         lost.update(own.lost, damaged_chunks=own.damaged_chunks, **own.lost_parts)
     poses = rows["head_pose"]
-    for name, found in (("load", len(loads)), ("measured pose", len(poses) + len(gaps))):
+    measured = len(poses) + len(gaps)
+    # a load that does not fit its role is an error of the mapping
+    for name, found in (("load", len(loads) or (measured and not why)), ("measured pose", measured)):
         if not found:
             raise RecordingError(f"{path}: got no {name}, expected some{why}")
-    origin, count = loads[0, 0], len(loads)
+    origin, count = next(table[0, 0] for table in (loads, poses, gaps) if len(table)), len(loads)
     loads = _longest(loads, begins)
     lost["samples_of_other_stretches"] = count - len(loads)
     forces = rows.get("forces", np.zeros((0, 1 + PAIR_COUNT)))
