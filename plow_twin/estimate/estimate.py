@@ -657,9 +657,11 @@ def _next_guess(problem: Problem, fit: Fit) -> Guess:
 def thinned(load: Load, period: float) -> tuple[Load, bool]:
     """Return a load without samples that hardly move the head, and whether the load is broad-band.
 
-    A load is broad-band if nearly all its samples move the head. Such a load is averaged instead.
+    A load is broad-band if nearly all its samples move the head. Such a load is averaged instead. A load whose samples
+    are too rare to show its broad-band part counts as broad-band too.
     """
-    load = load.believable()
+    samples, load = load, load.believable()
+    rare = load.wrench is not samples.wrench
     most = tuning.KNOTS[0] * max(1.0, float(load.t[-1] - load.t[0]) / period)
     shares = (5e-4, 1e-3, 2e-3, 4e-3, 8e-3)
     significance = load.significance(shares[0])
@@ -671,7 +673,7 @@ def thinned(load: Load, period: float) -> tuple[Load, bool]:
     broad = len(thin.t) > most
     # the head follows the mean values of a broad-band load
     felt = load.averaged(tuning.KNOTS[1] * int(most)) if len(thin.t) > tuning.KNOTS[1] * most else thin
-    return replace(felt, unknown=load.unknown), broad
+    return replace(felt, unknown=load.unknown), broad or rare
 
 
 def warm_up(scene: Scene) -> None:
