@@ -84,9 +84,9 @@ def estimate(
     """Estimate clearances, contact parameters, load gains, bias and delay from INPUT, with 90 % intervals.
 
     INPUT is a folder with the nominal scene, scene.yaml, and tables in CSV or Parquet. The table load.csv (t, fx, fy,
-    m) contains the measured load, and may be missing. The table pose.csv (t, x, y, theta) contains the measured pose; its cells may be
-    empty. The optional table gaps.csv (t and columns named after pairs) contains measured gaps, and may replace
-    pose.csv. The optional table contact_forces.csv (columns as in gaps.csv) contains measured forces.
+    m) contains the measured load, and may be missing. The table pose.csv (t, x, y, theta) contains the measured pose;
+    its cells may be empty. The optional table gaps.csv (t and columns named after pairs) contains measured gaps, and
+    may replace pose.csv. The optional table contact_forces.csv (columns as in gaps.csv) contains measured forces.
 
     INPUT may also be a run of plow_twin or another recording (MCAP, sqlite3 of rosbag2, CSV, Parquet). If the node of a
     run made estimates, the last estimate is computed again from the journal, and the result is compared bit for bit.
