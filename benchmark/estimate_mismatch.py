@@ -90,6 +90,7 @@ class Kind:
     filter_hz: float = 0.0
     steps_m: float = 0.0
     theta_missing: bool = False
+    load_missing: bool = False
     theta_scale: float = 0.0
     clock: float = 0.0
     #: Number of bursts without poses. No threshold was tuned on this difference or on the following differences.
@@ -135,6 +136,7 @@ KINDS = {
     "filter_5": Kind("filter of the sensor 5 Hz", filter_hz=5.0),
     "steps": Kind("steps of 1 mm", steps_m=1e-3),
     "no_theta": Kind("theta missing", theta_missing=True),
+    "no_load": Kind("load missing", load_missing=True),
     "theta_scale": Kind("theta's scale 1 %", theta_scale=0.01),
     "clock": Kind("clock drift 1e-4", clock=1e-4),
     "several": replace(_MILD, title="several mild ones", harmonic=0.005, constant=0.005),
@@ -148,6 +150,7 @@ KINDS = {
     "late_load": Kind("load 20 ms late", late_s=0.02),
     "drift": Kind("bias drifts by 1 mm", drift_m=1e-3),
     "hard": Kind("hard: nothing", stiffness=_HARD),
+    "hard_no_load": Kind("hard: load missing", stiffness=_HARD, load_missing=True),
     "hard_corners": Kind("hard: corners rounded 5 mm", stiffness=_HARD, radius_m=5e-3),
     "hard_askew": Kind("hard: pads askew 1 mm", stiffness=_HARD, askew_m=1e-3),
     "hard_theta": Kind("hard: theta's scale 1 %", stiffness=_HARD, theta_scale=0.01),
@@ -197,7 +200,7 @@ def _draw(kind: Kind, rng: np.random.Generator) -> Mismatch:
     wrench = _true_load(kind, rng, fine, believed)
     t = np.arange(0.0, end, 1.0 / kind.rate_hz)
     poses, _ = Poses.of(*_measured(kind, rng, t, fine, poses_of(scene, machine, fine, wrench, fine)))
-    load, _ = Load.of(*_telemetry(kind, fine, believed))
+    load, _ = Load.of(*_telemetry(kind, fine, (not kind.load_missing) * believed))
     return Mismatch(scene, nominal, load, poses)
 
 
