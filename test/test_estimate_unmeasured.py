@@ -47,3 +47,13 @@ def test_a_machine_whose_load_does_not_explain_the_motion_gives_no_narrow_interv
     result = estimate(truth.nominal, truth.load, Poses(truth.poses.t, q))
     for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):
         assert abs(value.mean - true) < 3.0 * value.deviation
+
+
+@pytest.mark.stress
+def test_a_start_whose_neighbours_cannot_be_simulated_is_improved_all_the_same() -> None:
+    """The drawn start of this machine has unknowns whose derivatives come from the prior alone."""
+    truth = mismatched(KINDS["no_theta"], 99004)
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert result.horizontal_state is result.vertical_state is State.ESTIMATED
+    for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):
+        assert value.deviation < 1e-3 and abs(value.mean - true) < 3.0 * value.deviation

@@ -130,6 +130,8 @@ class _Whole:
             there = self._normalised(moved, rows, scale)
             if there is not None:
                 columns[:, place] = (there - here) / _STEPS[index]
+            else:  # the moved motion cannot be simulated, so only the prior acts on this unknown
+                columns[place - len(self.free), place] = 1.0 / self.deviation[index]
         weight = np.append(huber_weight(np.abs(here[: -len(self.free)])), np.ones(len(self.free)))
         return columns.T @ (weight[:, None] * columns), columns.T @ (weight * here)
 
