@@ -18,16 +18,17 @@ from plow_twin.estimate.result import Estimate, State
 from plow_twin.estimate.window import Window
 from plow_twin.model.scene import Scene, Table
 
-#: Settling time in load periods before the evaluated span, derived from the decay of the members' initial states.
+#: Time before the evaluated span in load periods. It is derived from the time in which the effect of the members'
+#: initial states decays.
 _SETTLE_PERIODS: Final = 1.0
-#: Longest interval between two knots of a load, as a share of the load's period. The share is derived from the paper's
-#: machine, for which the interval is about twice `tuning.LOAD_KNOT`.
+#: Longest interval between two knots of a load, as a share of the load's period. It is derived from the paper's
+#: machine, for which this share of the period is about twice `tuning.LOAD_KNOT`.
 _KNOT_SHARE: Final = 1.0 / 400.0
 
 
 @dataclass(frozen=True)
 class Asked:
-    """The answers that are requested in addition to the estimate.
+    """Settings of the two answers that a caller may request in addition to the estimate: contact forces and a forecast.
 
     members : number of twins from which the intervals of the forces are computed; 0 if no forces are requested
     span_s : duration at the end of the window for which forces are computed [s]
@@ -41,10 +42,10 @@ class Asked:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The estimate from a window, the guess for the next window, and the other requested answers.
+    """The estimate from a window, the first guess for the fit of the next window, and the requested additional answers.
 
-    also : `forces` and `forecast`, if requested, as JSON values. An answer that cannot be computed is null, and
-    `<name>_error` contains the reason.
+    also : the requested answers as JSON values, by the names `forces` and `forecast`. An answer that cannot be computed
+    is null, and an entry `forces_error` or `forecast_error` contains the reason.
     """
 
     estimate: Estimate
@@ -58,7 +59,7 @@ class Answer:
 
 
 def answer(scene: Scene, window: Window, guess: Guess, asked: Asked) -> Answer:
-    """Return the estimate from a window and the other requested answers; the fit starts at `guess`."""
+    """Return the estimate from a window and the answers requested in `asked`. The fit starts at `guess`."""
     result, following = estimate_window(scene, window.load, window.pose, window.lost, guess, window.gaps)
     also: dict[str, Any] = {}
     if asked.members:

@@ -1,8 +1,9 @@
 """Solution in linear time of the normal equations for the unknowns of the swings and the shared unknowns.
 
-A swing is a part of the window with a starting state of its own, which consists of six unknowns. Each swing is coupled
-only to its neighbours and to the shared unknowns. The matrix is therefore block tridiagonal with a border. The block of
-the swings is factorised as a band matrix (Cholesky), and the border by its Schur complement.
+A swing is a part of the measured motion that begins in flight. Its starting state consists of six unknowns. In the
+equations, each swing is coupled only to its neighbours and to the unknowns that all swings share. The matrix is
+therefore block tridiagonal with a border. The block of the swings is factorised as a band matrix by Cholesky's method.
+The Schur complement of this block is factorised for the border.
 
 Reference: Golub and Van Loan, Matrix Computations, ch. 4.3 and 3.2.6.
 """
@@ -17,13 +18,14 @@ from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_bande
 
 Array = NDArray[np.float64]
 
-#: Number of unknowns of a swing: by definition, pose and rate at its start, with three numbers each.
+#: Number of unknowns of a swing. By definition, they are the three coordinates of the pose and the three rates at the
+#: start of the swing.
 OWN = 6
 
 
 @dataclass(frozen=True, eq=False)
 class Arrow:
-    """Symmetric matrix for k shared unknowns and the six unknowns of each of s swings.
+    """Symmetric matrix for k shared unknowns and s swings, each of which has six unknowns.
 
     border : (k, k) block of the shared unknowns
     coupling : (6 s, k) block that couples the unknowns of the swings with the shared unknowns
@@ -87,9 +89,7 @@ class Factor:
     schur: Array
 
     def solve(self, right: Array) -> Array:
-        """Return the solution for one right-hand side, shape (k + 6 s,), or for m right-hand sides, shape (k + 6 s,
-        m).
-        """
+        """Return the solution for right-hand sides of shape (k + 6 s,) or (k + 6 s, m)."""
         shared = len(self.schur)
         border, rest = right[:shared], right[shared:]
         first = cho_solve((self.schur, True), border - self.eliminated.T @ rest)

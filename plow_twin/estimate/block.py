@@ -1,11 +1,11 @@
 """Clearances around a block (a scene with `carries: corners`), estimated from the positions of its impacts.
 
-Between impacts, only load and gravity move the block, apart from drag and errors of the load. The two flights before
-and after an impact are extrapolated to the time at which they are nearest to each other. At that time the deepest
-corner touches the wall, or has penetrated the wall if the contact is compliant. The positions of all impacts are linear
-in the clearances, in bias and lever arm of the sensor, and in the compliance of the contact. These quantities are
-estimated together. The errors of the positions have a Student-t distribution of unknown scale, so that the widths of
-the intervals follow from the scatter of the impacts.
+Between impacts, only the load and gravity move the block. Drag and errors of the load are small disturbances. The
+flight before an impact and the flight after the impact are extrapolated to the time at which the two flights are
+nearest to each other. At this time, the deepest corner touches a rigid wall or has penetrated a compliant wall. The
+position of an impact is a linear function of the clearances, the bias of the sensor, the lever arm of the sensor and
+the compliance of the contact. The quantities are estimated together from all impacts. The errors of the positions have
+a Student-t distribution of unknown scale, so that the widths of the intervals follow from the scatter of the impacts.
 
 Reference: Lange, Little and Taylor, J. Am. Stat. Assoc. 84 (1989) 881 (Student-t errors by reweighting).
 """
@@ -32,22 +32,24 @@ from plow_twin.solve.compiled_scene import inertias
 
 Array = NDArray[np.float64]
 
-#: Definition of the walls: axis that a wall bounds, and outward normal of the wall.
+#: Definition of the walls. Each wall has the index of the axis that it bounds, and an outward normal.
 WALLS: Final = {
     "right": (GX, np.array([1.0, 0.0])),
     "left": (GX, np.array([-1.0, 0.0])),
     "top": (GY, np.array([0.0, 1.0])),
     "bottom": (GY, np.array([0.0, -1.0])),
 }
-#: Bounds on the number of rows of a flight in a fit. The lower bound is derived from the three coefficients of a
-#: parabola.
+#: Lower and upper bound on the number of rows that a fit of a flight uses. The lower bound is derived from the number
+#: of coefficients of a parabola, which is three.
 _FLIGHT_ROWS: Final = (4, 9)
 #: Degrees of freedom of the Student-t likelihood, derived from the recommendation of Lange et al.
 _FREEDOM: Final = 4.0
-#: Upper bounds on the number of scales on the grid of the likelihood, and on the reweighting iterations for each scale.
+#: Upper bound on the number of scales for which the likelihood is computed, and upper bound on the number of
+#: reweighting iterations for each scale.
 _SCALES, _ROUNDS = 40, 30
-#: Definition of the unknowns of the linear problem: clearances, bias of x, y and theta, lever arm, and relative change
-#: of the penetration from its value with the scene's stiffness.
+#: Definition of the slices of the linear problem's unknowns. The unknowns are two clearances, three biases (x, y,
+#: theta), two coordinates of the lever arm, and the relative change of the penetration. The change is relative to the
+#: penetration with the scene's stiffness.
 _CLEARANCES, _BIAS, _LEVER, _DEPTH, _SIZE = slice(0, 2), slice(2, 5), slice(5, 7), 7, 8
 
 
@@ -63,10 +65,9 @@ class Impact:
         A name of `WALLS`.
     distance : float
         Distance of the wall from the middle of the guide in m, computed for a rigid wall.
-    deeper : float
-        Part of `distance` in m that is penetration, computed for a wall with the scene's stiffness.
-    restitution : float
-        Coefficient of restitution: normal speed of the corner after the impact, divided by the speed before the impact.
+    deeper : float Penetration in m that is part of `distance`, computed for a wall with the scene's stiffness.
+    restitution : float Coefficient of restitution, which is the normal speed of the corner after the impact divided by
+        the speed before the impact.
     gained : float
         Kinetic energy after the impact, divided by the energy before the impact.
     turned : ndarray, shape (2,)
@@ -88,10 +89,10 @@ class Impact:
 def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> Estimate:
     """Return the estimate of the clearances around a block from the positions of its impacts.
 
-    If only one wall of an axis has impacts, the sensor's bias along the axis cannot be estimated. The bias is then
-    assumed to be zero, and the result contains None for the bias. A clearance is not observable if its standard
-    deviation exceeds half of the prior deviation. An observable clearance is rough if its standard deviation exceeds 1
-    mm.
+    If only one of two opposite walls has impacts, the sensor's bias along the normal of the walls cannot be estimated.
+    In this case, the bias is assumed to be zero, and the result contains None for the bias. A clearance is not
+    observable if its standard deviation exceeds half of its prior standard deviation. An observable clearance is rough
+    if its standard deviation exceeds 1 mm.
 
     Parameters
     ----------
@@ -193,10 +194,11 @@ def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tu
     prior = np.zeros(_SIZE)
     prior[_CLEARANCES] = known.horizontal.deviation, known.vertical.deviation
     prior[_BIAS] = np.array([quantity.deviation for quantity in QUANTITIES])[BIAS]
-    # the prior was chosen for the paper's machine, so it is scaled to the size of this machine
+    # the prior was chosen for the paper's machine, so it is multiplied by the ratio of the sizes of the two machines
     prior[_LEVER] = UNSTATED["lever_x"] * geometry.half_diagonal(scene) / PAPER_LENGTH
-    # The prior of the stiffness is log-normal, and the penetration is a power of the stiffness. The deviation of the
-    # penetration is chosen so that the 95 % quantile is unchanged.
+    # The prior of the stiffness is log-normal, and the penetration is a power of the stiffness. The prior of the
+    # penetration is log-normal for this reason, but a normal distribution is needed here. Its deviation is chosen so
+    # that the 95 % quantile is unchanged.
     spread = deviation_of(scene, "contact.stiffness") / (scene.contact.exponent + 1.0)
     prior[_DEPTH] = math.expm1(NORMAL_P95 * spread) / NORMAL_P95
     for axis in (GX, GY):
@@ -224,11 +226,12 @@ def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tu
 
 
 def _student(design: Array, off: Array, prior: Array, scales: Array) -> tuple[Array, Array]:
-    """Return means and standard deviations of the vector x in off = design x + errors.
+    """Return the means and the standard deviations of the unknowns x in the equation `off` = `design` x + errors.
 
-    The prior of x is normal with standard deviations `prior`; the errors have a Student-t distribution. The prior of
-    their scale is log-uniform over `scales`. For each scale, iterative reweighting gives the mode and its covariance,
-    and Laplace's approximation gives the evidence. The results for all scales are averaged with the evidence as weight.
+    The prior of x is normal with the standard deviations `prior`. The errors have a Student-t distribution, and the
+    prior of the errors' scale is log-uniform over `scales`. For each scale, iterative reweighting gives the mode and
+    the covariance of x, and Laplace's approximation gives the evidence. The results for all scales are averaged with
+    the evidence as weight.
     """
     modes, variances, log = [], [], []
     precision = np.diag(prior**-2.0)
@@ -251,7 +254,7 @@ def _student(design: Array, off: Array, prior: Array, scales: Array) -> tuple[Ar
 
 
 def impacts(scene: Scene, load: Load, poses: Poses, level: Array) -> tuple[list[Impact], int]:
-    """Return the impacts between flights that are long enough for a fit, and the number of all contacts.
+    """Return the impacts that lie between two flights long enough for a fit, and the number of all contacts.
 
     Parameters
     ----------
@@ -307,7 +310,9 @@ def _load_and_weight(scene: Scene, load: Load, t: Array) -> Array:
 
 
 def _kinks(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> list[tuple[int, int]]:
-    """Return the first and the last row of each contact, in which the acceleration differs from that of a flight."""
+    """Return the first and the last row of each contact, which is a part of the motion with an acceleration unlike that
+    of a flight.
+    """
     one, two = np.diff(t)[:-1, None], np.diff(t)[1:, None]
     way = np.diff(q, axis=0)
     acceleration = 2.0 * (way[1:] / two - way[:-1] / one) / (one + two)
@@ -317,7 +322,9 @@ def _kinks(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> lis
 
 
 def _flight(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> Array:
-    """Return the coefficients of the parabolas of a flight, shape (3, 3), by component and by power of t."""
+    """Return the coefficients of the parabolas of a flight, shape (3, 3). Rows are components of the pose, columns are
+    powers of t.
+    """
     basis = np.vander(t, 3, increasing=True)
     out = np.zeros((3, 3))
     for j in range(3):
@@ -328,7 +335,9 @@ def _flight(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> Ar
 
 
 def _meeting(scene: Scene, inertia: Array, flights: list[Array], room: float) -> Impact | None:
-    """Return the impact between two flights; None if the flights are not nearest within `room` s or no wall was hit."""
+    """Return the impact between two flights; None if no wall was hit, or if the flights are not nearest within `room`
+    s.
+    """
     apart = flights[1] - flights[0]
     change = apart[:, 1]
     t = -float((inertia * apart[:, 0] * change).sum() / (inertia * change * change).sum())
@@ -365,11 +374,12 @@ def _corners(scene: Scene) -> Array:
 
 
 def _deeper(scene: Scene, mass: float, before: float, after: float) -> float:
-    """Return the distance in m beyond the wall at which the extrapolated flights of a compliant contact meet.
+    """Return the distance in m behind a compliant wall at which the extrapolated flights before and after the contact
+    meet.
 
-    The corner approaches with the normal speed v, stays in contact for the time T and leaves with the speed e v. The
-    straight lines of the two flights then meet at the distance v e T / (1 + e) beyond the wall. The duration is T = pi
-    u / v, where u is the largest penetration. This duration is exact for a linear spring.
+    The corner approaches with the normal speed v, stays in contact for the time T and leaves with the speed e v. If the
+    flights are straight lines, they meet at the distance v e T / (1 + e) behind the wall. The duration is T = pi u / v,
+    where u is the largest penetration. The formula for T is exact for a linear spring.
     """
     exponent = scene.contact.exponent
     largest = ((exponent + 1.0) * mass * before**2 / (2.0 * scene.contact.stiffness)) ** (1.0 / (exponent + 1.0))

@@ -1,13 +1,15 @@
-"""Clearances with a hard contact, from features of the whole motion instead of the pose at each moment.
+"""Estimate of the clearances from features of the whole motion, for a contact so hard that single poses cannot be
+predicted.
 
-With a hard contact the head bounces many times before it rests, so its pose at a given moment cannot be predicted. Two
-kinds of features can be predicted: the reach of the corners, and the scatter of the pose at each phase of the load. The
-method is approximate Bayesian computation with local-linear adjustment:
+With a hard contact, the head bounces many times before it rests, so its pose at a given moment cannot be predicted. Two
+kinds of features can be predicted. The first kind is the reach of the corners, which is the distance that a corner
+moves toward a wall. The second kind is the scatter of the pose at each phase of the load. The method is approximate
+Bayesian computation with local-linear adjustment:
 
 1. Stiffness, damping and load gains are drawn at random, and the motion is simulated for each draw.
 2. Each simulated motion is observed with the noise and the gaps of the sensor.
-3. Among the simulated motions near the measured motion, the difference between clearance and reach is regressed on the
-features. The regression gives the clearance, and its residuals give the interval.
+3. For the simulated motions near the measured motion, the difference between clearance and reach is regressed on the
+features. The regression gives the clearance, and the residuals of the regression give the interval.
 
 References: Beaumont, Zhang and Balding, Genetics 162 (2002) 2025; Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012)
 419; Wood, Nature 466 (2010) 1102; Blum and Francois, Stat. Comput. 20 (2010) 63.
@@ -45,39 +47,41 @@ from plow_twin.model import geometry
 
 Array = NDArray[np.float64]
 
-#: Grid of trial values for the bias of theta in rad, derived from its prior: the grid extends over eight prior
-#: deviations to both sides. The best value is refined with a parabola through `_NEAR_TURNS`, which extend over three
-#: quarters of the grid spacing to both sides.
+#: Grid of trial values for the bias of theta in rad. It is derived from the prior of the bias and extends over eight
+#: prior deviations to both sides. The best value is refined with a parabola through the points `_NEAR_TURNS`, which
+#: extend over three quarters of the grid spacing to both sides.
 _TURNS: Final = np.linspace(-0.16, 0.16, 81)
 _FINEST_TURN: Final = 3e-3
 _NEAR_TURNS: Final = np.linspace(-_FINEST_TURN, _FINEST_TURN, 5)
-#: Upper bounds on the number of rows in the search for a bias, and in the refinement of the bias.
+#: Upper bound on the number of rows that the search for a bias uses, and upper bound on the number of rows that the
+#: refinement of the bias uses.
 _MOST_ROWS, _MOST_NEAR_ROWS = 2000, 1200
-#: Smallest number of rows in a part of a load period. It is derived from the scatter of a mean, which for nine values
-#: is a third of the scatter of the values.
+#: Smallest number of rows in a part of a load period. It is derived from the scatter of a mean. The scatter of the mean
+#: of nine values is a third of the scatter of the values.
 _FEWEST_OF_PHASE = 9
-#: Grids of trial values for the delay in s, derived from its prior. The grid for the measured path extends over two
-#: prior deviations to both sides; the grid for simulated motions extends over a tenth of this range. `_NO_LAG` is the
-#: index of the delay zero in the second grid.
+#: Grids of trial values for the delay of the sensor in s, derived from the prior of the delay. The grid `_LAGS_S` for
+#: the measured motion extends over two prior deviations to both sides. The grid `_OF_DRAWN_S` for simulated motions
+#: extends over a tenth of the range of `_LAGS_S`. `_NO_LAG` is the index of the delay zero in `_OF_DRAWN_S`.
 _LAGS_S: Final = np.linspace(-0.1, 0.1, 81)
 _OF_DRAWN_S: Final = np.linspace(-0.01, 0.01, 9)
 _NO_LAG = len(_OF_DRAWN_S) // 2
-#: Distances in rows over which second differences are computed, derived as powers of two. `_CHANGES` is used for pose
-#: and reach in the whole motion, `_CHANGES_BY_PHASE` for the pose at each phase of the load.
+#: Distances in rows over which second differences are computed, derived as powers of two. The distances `_CHANGES` are
+#: used for pose and reach in the whole motion. The distances `_CHANGES_BY_PHASE` are used for the pose at each phase of
+#: the load.
 _CHANGES: Final = (1, 2, 4, 8, 16, 32)
 _CHANGES_BY_PHASE: Final = (1, 4)
 #: Paths of the frame's sides in a scene.
 _SIDES: Final = ("frame.width_m", "frame.height_m")
-#: Guard against logarithms of zero and divisions by zero: squared scatter in m2 or rad2.
+#: Smallest squared scatter in m2 or rad2. It is a guard against logarithms of zero and divisions by zero.
 _NO_SCATTER = 1e-14
 #: Upper bound on the factor by which the work for simulated motions may grow in windows longer than ten load periods.
 _LONGER = 2.0
-#: Bounds on the drawn penetration in m for a hard contact, and for a firm contact.
+#: Lower and upper bound on the drawn penetration in m, first for a hard contact and second for a firm contact.
 _HARD_BOUNDS, _FIRM_BOUNDS = (8e-7, 6e-4), (2e-6, 2e-2)
 #: Upper bound on the number of iterations in which the noise of a simulated motion is adjusted.
 _NOISE_ROUNDS = 3
-#: Smallest number of draws, and smallest number of complete poses. They are derived from the twenty features of a
-#: regression, and from the 99 % quantile of the poses.
+#: Smallest number of draws, derived from the twenty features of a regression, and smallest number of complete poses,
+#: derived from the use of the 99 % quantile of the poses.
 _FEWEST, _FEWEST_WHOLE = 30, 100
 
 
@@ -89,32 +93,29 @@ class Bounced:
     ----------
     clearance, clearance_deviation : ndarray, shape (2,)
         Clearances and their standard deviations in m.
-    bias, bias_deviation : ndarray, shape (3,)
-        Bias of x, y in m and theta in rad, and standard deviations.
+    bias, bias_deviation : ndarray, shape (3,) Bias of x and y in m and of theta in rad, and the standard deviations of
+        the three biases.
     ln_penetration : tuple of float
         Mean and standard deviation of the logarithm of the penetration in m under the reference force.
-    ln_damping : tuple of float
-        Mean and standard deviation of the unknown for the damping, as in `Unknowns`.
+    ln_damping : tuple of float Mean and standard deviation of the logarithm of the damping or, for a restitution, of
+        its logit.
     noise : ndarray, shape (3,)
         Standard deviation of the measurements.
-    distance : float
-        Distance of the measured motion from nearby drawn motions, relative to the distances among drawn motions.
-    path : float
-        Distance of the measured path (mean and scatter of the pose over the load's period) from the path that the drawn
-        motions predict. It is a normal deviate among the same distances of drawn motions; 0 with too few poses.
-    law : float
-        Similarity of the motion to motions under another contact law, as a normal deviate among motions under the
-        assumed law. It is 0 if there is no other law, if too few motions under the other law can be simulated, or if
-        the contact is not hard.
-    odds : float
-        Logarithm of the odds of the other law. It is minus infinity where `law` is 0 for one of these reasons, and if
-        the motions are drawn about a given vector.
-    unseen : ndarray, shape (2,)
-        Standard deviation of the clearances in m due to quantities that the motion does not show: errors of the frame's
-        sides, the sensor's scales, and rotations of walls.
-    rounded : ndarray, shape (2,)
-        Overestimate of the clearances in m if the frame's corners have the radius `priors.ROUNDING`. It is zero if the
-        scene states the radius or the deviations of the sides.
+    distance : float Distance of the measured motion from nearby drawn motions, divided by the typical distance between
+        drawn motions.
+    path : float Distance of the measured path (mean and scatter of the pose over the load's period) from the path that
+        the drawn motions predict. The distance is given as a normal deviate with respect to the distances that drawn
+        motions have. It is 0 with too few poses.
+    law : float Similarity of the measured motion to motions under the alternative contact law (`unknowns.OTHER_LAW`).
+        It is a normal deviate with respect to motions under the assumed law. It is 0 if there is no alternative law, if
+        too few motions under the alternative law can be simulated, or if the contact is not hard.
+    odds : float Logarithm of the odds of the alternative law against the assumed law. It is minus infinity if the
+        alternative law was not compared, and if the motions are drawn about a given vector.
+    unseen : ndarray, shape (2,) Standard deviation of the clearances in m due to quantities that the motion does not
+        show. These quantities are errors of the frame's sides, errors of the sensor's scale factors, and rotations of
+        walls.
+    rounded : ndarray, shape (2,) Distance in m by which the clearances are overestimated if the frame's corners have
+        the radius `priors.ROUNDING`. It is zero if the scene states the radius or the deviations of the sides.
     """
 
     clearance: Array
@@ -133,7 +134,7 @@ class Bounced:
 
 
 def bounces(unknowns: Unknowns, poses: Poses) -> bool:
-    """Return whether the contact is so hard that the comparison of whole motions is needed."""
+    """Return whether the contact is so hard that measured and simulated motions must be compared by their features."""
     return _reach_noise(unknowns, _whole(poses)) < tuning.POSSIBLE and _is_narrow(unknowns, poses)
 
 
@@ -157,11 +158,12 @@ def _reach_noise(unknowns: Unknowns, q: Array) -> float:
 
 
 def bias_of_hard(unknowns: Unknowns, poses: Poses) -> Array:
-    """Return the sensor's bias of x and y in m and theta in rad if the contact is hard; zeros if the contact is soft.
+    """Return the sensor's bias of x, y and theta in m, m, rad if the contact is hard; zeros if the contact is soft.
 
-    A hard wall stops both corners at the same position, but the poses from a sensor with biased theta show two
-    positions. The bias of theta is therefore chosen so that the scatter of the farthest reaches is smallest. The biases
-    of x and y are removed first, because they change the reaches of a rotated head.
+    A hard wall stops both of its corners at the same position. If the measured theta is biased, the two corners seem to
+    stop at two positions. The bias of theta is therefore chosen so that the scatter of the farthest reaches is
+    smallest. The biases of x and y are removed before the search, because the reaches of a rotated head depend on x and
+    y.
     """
     q = _whole(poses)
     bias = np.zeros(3)
@@ -175,7 +177,8 @@ def bias_of_hard(unknowns: Unknowns, poses: Poses) -> Array:
 def _near_bias(unknowns: Unknowns, q: Array) -> Array:
     """Return a small bias, shape (3,), in m, m, rad.
 
-    The error of this estimate is corrected later, because it is also applied to drawn motions without bias.
+    The estimate has an error, which has no effect on the result: the same estimate is applied to drawn motions without
+    bias, so that the comparison shows the error.
     """
     q = _few(q, _MOST_NEAR_ROWS)
     bias = np.zeros(3)
@@ -194,13 +197,15 @@ def _few(q: Array, most: int) -> Array:
 
 
 def _off_centre(reach: Array) -> Array:
-    """Return half the differences of opposite reaches (left minus right, bottom minus top), shape (2,), in m."""
+    """Return half the difference between left and right reach, and half the difference between bottom and top reach,
+    shape (2,), in m.
+    """
     right, left, top, bottom = reach
     return 0.5 * np.array([left - right, bottom - top])
 
 
 def _widths(unknowns: Unknowns, q: Array, turns: Array) -> Array:
-    """Return the scatter of the farthest reaches in m, summed over the walls, for each bias of theta in `turns`."""
+    """Return the sum over the walls of the scatter of the farthest reaches in m, for each bias of theta in `turns`."""
     count = len(q)
     (low, middle), (far, farthest) = (
         (int(start * count), max(int(end * count), int(start * count) + 1)) for start, end in tuning.TURN_WINDOWS
@@ -218,9 +223,9 @@ def compare(
 ) -> Bounced | None:  # fmt: skip
     """Compare the measured motion with drawn motions.
 
-    The result is None if too few drawn motions can be simulated, or if the contact is not hard. The drawn motions have
-    hard contacts by default. If a vector of unknowns `near` is given, its softness and damping are the means of the
-    draws.
+    The result is None if too few drawn motions can be simulated, or if the contact is not hard. By default, the drawn
+    motions have hard contacts. If a vector of unknowns `near` is given, softness and damping are drawn about the values
+    in `near`.
     """
     eye = MotionFeatures(unknowns, poses, period)
     measured = eye.features(eye.q)
@@ -287,9 +292,9 @@ def compare(
 
 
 def by_range(unknowns: Unknowns, poses: Poses) -> Bounced:
-    """Return the result for a hard contact from the range of motion alone, because the load was not measured.
+    """Return the result for a hard contact from the range of motion alone, for the case that the load was not measured.
 
-    The walls yield by at most `tuning.FITTED` each; the penetrations of both are uniformly distributed up to this.
+    The penetration at each of two opposite walls is assumed to be uniformly distributed between 0 and `tuning.FITTED`.
     """
     eye = MotionFeatures(unknowns, poses, float(poses.t[-1] - poses.t[0]))
     yielding = tuning.FITTED / math.sqrt(6.0)
@@ -313,10 +318,10 @@ def by_range(unknowns: Unknowns, poses: Poses) -> Bounced:
 def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: Array) -> tuple[Array, Array]:
     """Return the attributes `unseen` and `rounded` of `Bounced`.
 
-    `reach`, shape (2,), contains the sums of opposite reaches in m. A resting head touches the frame at three corners,
-    always at the same angle. Errors of the sides, scales and corners therefore change the reach in the same way as a
-    different clearance. At a rotated wall the head always touches the same pad, which is displaced by half the
-    rotation. The rotations of opposite walls are independent.
+    `reach`, shape (2,), contains the sum of left and right reach, and the sum of bottom and top reach, in m. A resting
+    head touches the frame at three corners, always at the same angle. An error of a side, a scale factor or a corner
+    therefore changes the reach in the same way as a different clearance. At a rotated wall, the head always touches the
+    same pad, which is displaced by half the rotation. The rotations of opposite walls are independent.
     """
     scene = unknowns.scene
     width, height = (deviation_of(scene, path) for path in _SIDES)
@@ -343,7 +348,7 @@ def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: A
 
 @dataclass(frozen=True, eq=False)
 class _Spread:
-    """Distribution of the drawn contacts: mean and deviation of the logarithms of penetration and damping, shape (2,).
+    """Mean and standard deviation of the logarithms of penetration and damping for the draws, shape (2,) each.
 
     `bounds` are the smallest and the largest drawn penetration in m.
     """
@@ -386,7 +391,8 @@ class _Drawn:
         self.q: list[Array] = []
 
     def add(self, count: int, centre: Array, about: float, delay: float, most_work: int) -> None:
-        """Draw `count` more motions, observed with a delay of `delay` s; stop early if the work reaches `most_work`.
+        """Draw `count` motions, observed with a delay of `delay` s, and add them; stop early if the work reaches
+        `most_work`.
 
         The clearances are drawn with the mean `centre` and the standard deviation `about`, both in m.
         """
@@ -410,7 +416,8 @@ class _Drawn:
         numbers: Array = mean + np.concatenate([self.spread.deviation, np.full(3, tuning.HARD_DRAWN[3])]) * drawn
         numbers[0] = np.clip(numbers[0], *np.log(self.spread.bounds))
         if self.unknowns.scene.contact.law in OTHER_LAW.values():
-            # the damping under the other law is drawn as a fraction of the critical damping of the drawn stiffness
+            # the damping under the alternative law is drawn as a fraction of the critical damping of the drawn
+            # stiffness
             critical = self.unknowns.critical_damping(self.unknowns.force / math.exp(numbers[0]))
             numbers[1] = math.log(tuning.LAW_DAMPING[1] * critical) + tuning.LAW_DAMPING[2] * drawn[1]
         return numbers
@@ -428,10 +435,11 @@ class _Drawn:
 
 
 def _likeliest(features: Array, targets: Array, paths: Array, measured: Array, seen: Array) -> Array:
-    """Return the differences between most likely clearances and reaches in m, shape (n + 1, 2).
+    """Return the most likely clearances minus the reaches in m, shape (n + 1, 2).
 
-    The rows are for the n drawn motions and, last, for the measured motion. `paths` of the draws have the shape (n,
-    lags, k), and `seen`, the measured path, has the shape (lags, k). Only their first halves, the mean poses, are used.
+    The first n rows are for the drawn motions, and the last row is for the measured motion. The array `paths` contains
+    the paths of the drawn motions, shape (n, lags, k). The array `seen` is the measured path, shape (lags, k). Only the
+    first half of each path, the mean poses, is used.
     """
     before, after = _NO_LAG - 1, _NO_LAG + 1
     paths, seen = (path[..., : path.shape[-1] // 2] for path in (paths, seen))
@@ -468,12 +476,12 @@ def path_delay(eye: MotionFeatures, features: Array, drawn: list[Array], measure
 def _of_other_law(
     drawn: _Drawn, centre: Array, delay: float, most_work: int, by_odds: bool
 ) -> tuple[float, float]:  # fmt: skip
-    """Return the similarity of the measured motion to motions under the other law, and the log odds of that law.
+    """Return the similarity of the measured motion to motions under the alternative law, and the log odds of this law.
 
-    Goodness of fit does not separate laws with similar motions. Two other criteria are combined, because each criterion
-    finds cases that the other criterion misses: a classifier that is trained with draws of both laws (Pudlo et al.,
-    Bioinformatics 32 (2016) 859), and the ratio of the likelihoods. With `by_odds`, only half of the motions are drawn
-    if they give clear odds. The similarity is then irrelevant.
+    The goodness of fit does not separate laws with similar motions. The first result comes from a classifier that is
+    trained with draws of both laws (Pudlo et al., Bioinformatics 32 (2016) 859). The second result comes from the ratio
+    of the likelihoods. Both are used, because neither criterion finds all cases. If `by_odds` is set and half of the
+    draws give clear odds, the second half is not drawn, because the similarity is irrelevant.
     """
     other, nothing = drawn.of_other_law(), (0.0, -math.inf)
     if other is None:
@@ -494,11 +502,11 @@ def _of_other_law(
 
 
 def class_deviate(believed: Array, other: Array, measured: Array) -> float:
-    """Return how similar `measured` features are to the class `other` rather than to `believed`, as a normal deviate.
+    """Return a normal deviate that is large if the features `measured` resemble `other` more than `believed`.
 
-    The features have the shapes (m,), (k, m) and (n, m). The class label is regressed on the features, with the same
-    total weight for both classes. The deviate is the distance of the prediction for `measured` from the cross-validated
-    predictions for the class `believed`.
+    `believed` and `other` contain the features of motions under two laws, one motion per row; `measured` has the shape
+    (m,). A class label is regressed on the features, with the same total weight for both classes. The deviate is the
+    distance of the prediction for `measured` from the cross-validated predictions for the class `believed`.
     """
     features = np.concatenate([believed, other])
     sizes = [len(believed), len(other)]
@@ -516,10 +524,10 @@ def class_deviate(believed: Array, other: Array, measured: Array) -> float:
 def path_deviate(seen: Array, features: Array, drawn: list[Array], measured: Array) -> float:
     """Return the distance of the measured path from the drawn motions as a normal deviate; 0 with too few measurements.
 
-    The deviate refers to the distances of nearby drawn motions from the other drawn motions, which are the distances
-    for a correct model.
+    The distance is compared with the distances that nearby drawn motions have from the remaining drawn motions. A
+    correct model gives distances of the same size.
     """
-    # shape (n, lags, parts); the paths are compared at several lags, because the delay is not known exactly
+    # the shape is (n, lags, parts); the paths are compared at several lags, because the delay is not known exactly
     paths = np.array(drawn)
     there = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(seen).all(axis=0)
     if there.sum() < tuning.PATH_PHASES:
@@ -535,7 +543,8 @@ def path_deviate(seen: Array, features: Array, drawn: list[Array], measured: Arr
 
 
 def _distance_of_paths(features: Array, paths: Array, measured: Array, seen: Array) -> float:
-    """Return the mean square distance of a path `seen`, (lags, k), from its prediction by drawn paths, (n, lags, k).
+    """Return the mean square distance of the path `seen`, (lags, k), from the prediction by the drawn `paths`, (n,
+    lags, k).
 
     The distance is the Mahalanobis distance at the best lag. The covariance of the residuals of the drawn paths is
     shrunk toward equal variances (Ledoit and Wolf, J. Multivar. Anal. 88 (2004) 365).
@@ -565,7 +574,7 @@ class _Regressed:
 
 @dataclass(frozen=True, eq=False)
 class _Near:
-    """Matrices of a weighted regression on m features of n draws; draws near the measured features have large weights.
+    """Matrices of a regression on m features of n draws, in which draws near the measured features have large weights.
 
     distance, weight : (n,) squared distance of each draw from the measured features, and its weight
     scale : (m,) scatter of the features
@@ -606,10 +615,11 @@ class _Near:
 
 
 def regress_near(features: Array, targets: Array, measured: Array) -> _Regressed:
-    """Return the k targets that a regression predicts for the features `measured`, shape (m,), with their deviations.
+    """Return the values and deviations of k targets that a regression predicts for the features `measured`, shape (m,).
 
-    The regression is of targets (n, k) on features (n, m) of n draws. Draws near `measured` have large weights. The
-    deviations include the extrapolation if `measured` lies at the edge of the draws.
+    The arrays `targets`, shape (n, k), and `features`, shape (n, m), belong to n draws. Draws near `measured` have
+    large weights. If `measured` lies at the edge of the draws, the deviations include the uncertainty of the
+    extrapolation.
     """
     near = _Near.to(features, measured)
     value, error = near.regress(targets)
@@ -623,8 +633,8 @@ def regress_near(features: Array, targets: Array, measured: Array) -> _Regressed
 def _scatter_at(basis: Array, weight: Array, error: Array, leverage: Array) -> Array:
     """Return the residual variance of a regression at the measured features, shape (k,).
 
-    The variance depends on the features. The logarithm of the squared residuals is therefore also regressed on the
-    features (Blum and Francois).
+    The variance depends on the features. The logarithm of the squared residuals is therefore regressed on the features,
+    as proposed by Blum and Francois.
     """
     freed = 1.0 - np.minimum(leverage, 0.9)
     square = error**2 / freed[:, None]
@@ -685,15 +695,15 @@ class MotionFeatures:
         """Return a simulated motion as the sensor would measure it with a delay of `delay` s; None if it cannot be
         simulated.
 
-        `clearance`, shape (2,), is in m; `numbers` are those of `_Drawn`: logarithms of penetration and damping, load
-        gains.
+        `clearance`, shape (2,), is in m. The array `numbers` contains the logarithms of penetration and damping, and
+        three load gains.
         """
         vector = unknowns.nominal()
         vector[[GX, GY]], vector[DAMPING] = clearance, numbers[1]
         vector[GAIN] = np.clip(numbers[2:5], 0.7, 1.3)
         scene = unknowns.scene_of(vector)
-        # the stiffness is set again, because `scene_of` limits it, but the decay of bounces depends on larger values
-        # too
+        # `scene_of` limits the stiffness, but the decay of bounces depends on larger values, so the full value is set
+        # here
         contact = replace(scene.contact, stiffness=unknowns.force / math.exp(numbers[0]) ** scene.contact.exponent)
         start = np.concatenate([self.q[0], np.zeros(3)])
         start += np.array([1e-3, 1e-3, 4e-3, 0.05, 0.05, 0.2]) * rng.standard_normal(6)
@@ -707,9 +717,10 @@ class MotionFeatures:
         return np.array([self._path(q, lag_s) for lag_s in lags_s])
 
     def _path(self, q: Array, lag_s: float) -> Array:
-        """Return the path: mean pose minus its average, and logarithm of the scatter, at each phase of the load.
+        """Return the path of a motion, which is the mean and the logarithm of the scatter of the pose at each phase of
+        the load.
 
-        The shape is (240,). Phases with too few poses are NaN. The scatter depends on the decay of the bounces.
+        The shape is (240,). The average over all phases is subtracted from the mean. Phases with too few poses are NaN.
         """
         out = np.full((2, tuning.PATH_PHASES, 3), np.nan)
         for i, phases in enumerate(self._phases_at(lag_s)):
@@ -752,7 +763,7 @@ class MotionFeatures:
         return q if self._there.all() else filled(Poses(self._t, np.where(self._there, q, np.nan)))
 
     def features(self, q: Array) -> Array:
-        """Return the features of a motion: two sums of opposite reaches, three biases, and then all other features."""
+        """Return the features of a motion. The first five are two sums of opposite reaches and three biases."""
         whole = q[self._whole]
         bias = _near_bias(self._unknowns, whole)
         whole = whole - bias
@@ -799,8 +810,8 @@ class MotionFeatures:
         return _reach(self._unknowns, q)
 
     def _by_phase(self, q: Array) -> Array:
-        """Return mean reaches in m, shape (3, 4), in the load phases with the farthest reaches, in which the head
-        rests.
+        """Return mean reaches in m, shape (3, 4), over the load phases with the farthest reaches. In these phases the
+        head rests.
         """
         reach, phase = reaches(self._unknowns.scene, q), self._reach_phase
         count = np.bincount(phase, minlength=tuning.PATH_PHASES + 1)
