@@ -65,9 +65,11 @@ class Impact:
         A name of `WALLS`.
     distance : float
         Distance of the wall from the middle of the guide in m, computed for a rigid wall.
-    deeper : float Penetration in m that is part of `distance`, computed for a wall with the scene's stiffness.
-    restitution : float Coefficient of restitution, which is the normal speed of the corner after the impact divided by
-        the speed before the impact.
+    deeper : float
+        Penetration in m that is part of `distance`, computed for a wall with the scene's stiffness.
+    restitution : float
+        Coefficient of restitution, which is the normal speed of the corner after the impact divided by the speed before
+        the impact.
     gained : float
         Kinetic energy after the impact, divided by the energy before the impact.
     turned : ndarray, shape (2,)

@@ -93,29 +93,34 @@ class Bounced:
     ----------
     clearance, clearance_deviation : ndarray, shape (2,)
         Clearances and their standard deviations in m.
-    bias, bias_deviation : ndarray, shape (3,) Bias of x and y in m and of theta in rad, and the standard deviations of
-        the three biases.
+    bias, bias_deviation : ndarray, shape (3,)
+        Bias of x and y in m and of theta in rad, and the standard deviations of the three biases.
     ln_penetration : tuple of float
         Mean and standard deviation of the logarithm of the penetration in m under the reference force.
-    ln_damping : tuple of float Mean and standard deviation of the logarithm of the damping or, for a restitution, of
-        its logit.
+    ln_damping : tuple of float
+        Mean and standard deviation of the logarithm of the damping or, for a restitution, of its logit.
     noise : ndarray, shape (3,)
         Standard deviation of the measurements.
-    distance : float Distance of the measured motion from nearby drawn motions, divided by the typical distance between
-        drawn motions.
-    path : float Distance of the measured path (mean and scatter of the pose over the load's period) from the path that
-        the drawn motions predict. The distance is given as a normal deviate with respect to the distances that drawn
-        motions have. It is 0 with too few poses.
-    law : float Similarity of the measured motion to motions under the alternative contact law (`unknowns.OTHER_LAW`).
-        It is a normal deviate with respect to motions under the assumed law. It is 0 if there is no alternative law, if
-        too few motions under the alternative law can be simulated, or if the contact is not hard.
-    odds : float Logarithm of the odds of the alternative law against the assumed law. It is minus infinity if the
-        alternative law was not compared, and if the motions are drawn about a given vector.
-    unseen : ndarray, shape (2,) Standard deviation of the clearances in m due to quantities that the motion does not
-        show. These quantities are errors of the frame's sides, errors of the sensor's scale factors, and rotations of
-        walls.
-    rounded : ndarray, shape (2,) Distance in m by which the clearances are overestimated if the frame's corners have
-        the radius `priors.ROUNDING`. It is zero if the scene states the radius or the deviations of the sides.
+    distance : float
+        Distance of the measured motion from nearby drawn motions, divided by the typical distance between drawn
+        motions.
+    path : float
+        Distance of the measured path (mean and scatter of the pose over the load's period) from the path that the drawn
+        motions predict. The distance is given as a normal deviate with respect to the distances that drawn motions
+        have. It is 0 with too few poses.
+    law : float
+        Similarity of the measured motion to motions under the alternative contact law (`unknowns.OTHER_LAW`). It is a
+        normal deviate with respect to motions under the assumed law. It is 0 if there is no alternative law, if too few
+        motions under the alternative law can be simulated, or if the contact is not hard.
+    odds : float
+        Logarithm of the odds of the alternative law against the assumed law. It is minus infinity if the alternative
+        law was not compared, and if the motions are drawn about a given vector.
+    unseen : ndarray, shape (2,)
+        Standard deviation of the clearances in m due to quantities that the motion does not show. These quantities are
+        errors of the frame's sides, errors of the sensor's scale factors, and rotations of walls.
+    rounded : ndarray, shape (2,)
+        Distance in m by which the clearances are overestimated if the frame's corners have the radius
+        `priors.ROUNDING`. It is zero if the scene states the radius or the deviations of the sides.
     """
 
     clearance: Array
