@@ -1,8 +1,9 @@
 """Posterior of the wear coefficient, from clearances that were estimated over weeks.
 
-For any coefficient k_s, the clearance is the same function h(E) of the exposure E = k_s s / A. Here s is the travel and
-A the area of a pad. A history of clearances against travel therefore determines k_s. The posterior is computed on a
-grid of ln k_s with the log-normal prior of the scene's wear. The initial clearance is integrated out.
+The exposure of a pad is E = k_s s / A, where k_s is the wear coefficient, s the travel and A the area of the pad. The
+clearance is a function of E that does not depend on k_s. A history of clearances against travel therefore determines
+k_s. The posterior is computed on a grid of ln k_s with the log-normal prior of the scene's wear. The initial clearance
+is integrated out.
 """
 
 from __future__ import annotations
@@ -22,17 +23,17 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Upper bound on the number of grid points, and half width of the grid in prior deviations. The width is derived from a
-#: probability of 6e-5 outside the grid.
+#: Upper bound on the number of grid points, and half width of the grid in prior deviations. The half width is derived
+#: from the prior probability outside the grid, which is 6e-5.
 _POINTS, _REACH = 801, 4.0
-#: Bounds on the simulated wear path: it ends when a clearance has grown by `_FURTHER` times the growth in the history
-#: plus `_FURTHER_M` in m.
+#: Bounds on the simulated wear path. The path ends when a clearance has grown by `_FURTHER_M` [m] plus `_FURTHER` times
+#: the growth in the history.
 _FURTHER, _FURTHER_M = 2.0, 5e-4
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """Estimated clearances against travel.
+    """Estimated clearances at several values of the travel.
 
     travel : (n,) travel along the face in m since the first row; it must not decrease
     clearance, deviation : (n, 2) horizontal and vertical clearance, and their standard deviations, in m
@@ -76,7 +77,7 @@ class Coefficient:
         return Interval(self.quantile(0.5), self.quantile(0.05), self.quantile(0.95))
 
     def quantile(self, share: float) -> float:
-        """Return a quantile of k_s in m^2/N; the distribution is widened by the model error `tuning.PATH_DEVIATION`.
+        """Return a quantile of k_s in m^2/N. The posterior is widened by the model error `tuning.PATH_DEVIATION`.
 
         `share` is the probability below the quantile.
         """
@@ -98,7 +99,7 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
     scene : Scene
         A scene with wear; `wear.prior_m2_n` is the prior. Its clearances are replaced by the first row of the history.
     history : History
-        Clearances against travel.
+        Clearances at several values of the travel.
 
     Raises
     ------

@@ -1,9 +1,10 @@
-"""Contact forces measured by load cells at the guides, which narrow the intervals of contact and clearances.
+"""Contact forces that load cells at the guides measure. The forces narrow the intervals of contact parameters and
+clearances.
 
-The fit of the poses gives the motion, and the contact law gives the force of each pair. If the force of a load cell
-contradicts the force of its pair, the measured forces are not used. The reasons of the estimate then name the cell. If
-the forces of all cells together contradict the motion, the reasons name the contact law. Otherwise poses and forces are
-fitted together (module `force_fit`).
+The fit of the poses gives the motion, and the contact law gives the force of each pair. If the reading of a load cell
+contradicts the force of its pair, the measured forces are not used, and the field `reasons` of the estimate names the
+cell. If each cell agrees with its pair but the motion does not fit all forces, the field `reasons` names the contact
+law. If there is no contradiction, the module `force_fit` fits poses and forces together.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ from plow_twin.solve.compiled_scene import compile_scene
 
 Array = NDArray[np.float64]
 
-#: Guard against faulty readings: largest force [N] that is accepted.
+#: Largest force [N] that is accepted, a guard against faulty readings.
 _LARGEST = 1e12
-#: Largest trial value of the delay of the load cells in s, and step between trial values. The largest value is derived
-#: as three prior deviations of a sensor's delay.
+#: Largest trial value for the delay of the load cells in s, and step between two trial values. The largest trial value
+#: is derived as three prior deviations of a sensor's delay.
 _LARGEST_DELAY, _DELAY_STEP = 0.15, 2e-3
 #: The contact law as a Python function, because the compiled function cannot be called from Python.
 _LAW = getattr(free_force, "py_func", free_force)
@@ -54,8 +55,8 @@ class ContactForces:
     def of(t: ArrayLike, force: ArrayLike) -> tuple[ContactForces, int]:
         """Return the usable rows in order of time, and the number of rows that are left out.
 
-        A row is left out if its stamp is not finite or occurs twice. It is also left out if it contains no force, or a
-        force above 1e12 N.
+        A row is left out if its stamp is not finite or repeated, if it contains no force, or if it contains a force
+        above 1e12 N.
 
         Raises
         ------
@@ -120,9 +121,7 @@ class Feeling:
         self._depth = depth_of(turns)
 
     def at(self, shared: Array, states: Array, delay: float) -> Felt | None:
-        """Return penetrations and forces for given unknowns and a delay in s; None if the motion cannot be
-        simulated.
-        """
+        """Return penetrations and forces for given unknowns and a delay [s]; None if the motion cannot be simulated."""
         own = shared.copy()
         own[BIAS], own[DELAY] = 0.0, delay
         point = self._problem.evaluate(own, states)
@@ -136,8 +135,7 @@ class Feeling:
 
 
 def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> tuple[Array, Array]:
-    """Return penetrations in m and forces in N of the pairs, shape (n, 8) each, from poses and rates, shape (n, 3)
-    each.
+    """Return the penetrations in m and the forces in N, shape (n, 8) each, for poses and rates of shape (n, 3).
 
     `depth`, shape (8,), contains the outward displacement of each pad in m. The scene must state the damping. A
     restitution is not supported, because its damping depends on the speed of each touch.
@@ -179,7 +177,7 @@ def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells
     measured = forces.force - offset
     found_out, pairs = [], []
     largest = float(np.nanmax(felt.force))
-    # lower limit of the noise, because a cell that reads exactly 0 in flight also has a limited resolution
+    # the noise has a lower limit, because even a cell that reads exactly 0 in flight has a limited resolution
     noise = np.maximum(noise, 1e-4 * largest)
     for i, name in enumerate(PAIR_NAMES):
         there = np.isfinite(measured[:, i]) & (felt.swing >= 0)

@@ -1,14 +1,15 @@
-"""Discrepancy between machine and model, which changes the result of a fit and widens its intervals.
+"""Correction of a fit for the discrepancy between machine and model, which changes the values and widens the intervals.
 
 No machine matches the model exactly. Three kinds of discrepancy are considered:
 
-- Further unknowns, each with a prior: inertia, size of the frame, friction, exponent, differences between the walls,
-  and errors of the sensor. The further unknowns are estimated in one linearised step from the fit. Bayesian variable
-  selection samples which of the further unknowns differ from the scene. A quantity without evidence keeps its value in
-  the scene. A quantity that the motion does not determine widens the interval.
-- A constant error of the load in each swing. The size of these errors is estimated from all swings (empirical Bayes).
-- Remaining residuals, which are treated as noise. Large residuals, and residuals that stay correlated for long,
-  increase the variance of the measurements (tempered likelihood).
+- Further unknowns, each with a prior, are the inertia, the size of the frame, the friction, the exponent, differences
+  between the walls, and errors of the sensor. The further unknowns are estimated in one linearised step from the fit.
+  Bayesian variable selection samples which of the further unknowns differ from the scene. Without evidence of a
+  difference, an unknown has the value of the scene. An unknown that the motion does not determine widens the intervals.
+- The load is assumed to have a constant error in each swing, which is a part of the motion that begins in flight. The
+  size of the errors is estimated from all swings (empirical Bayes).
+- The remaining residuals are treated as noise. The variance of the measurements is increased if the residuals are
+  large, or if they stay correlated for long (tempered likelihood).
 
 References: George and McCulloch, J. Am. Stat. Assoc. 88 (1993) 881 (selection by Gibbs sampling); Hoeting et al., Stat.
 Sci. 14 (1999) 382 (averaging over models); Dempster, Laird and Rubin, J. R. Stat. Soc. B 39 (1977) 1 (the sizes of
@@ -39,8 +40,8 @@ from plow_twin.model.scene import Friction, Scene
 
 Array = NDArray[np.float64]
 
-#: Step of the difference quotient with respect to each quantity of a scene, by the path of the quantity. The steps are
-#: a fifth to a half of the prior deviations.
+#: Step of the difference quotient for each quantity of a scene, by the path of the quantity. The steps are a fifth to a
+#: half of the prior deviations.
 STATED: Final = {
     "head.mass_kg": 0.02,
     "head.inertia_kg_m2": 0.02,
@@ -49,12 +50,13 @@ STATED: Final = {
     "contact.exponent": 0.02,
     "friction.coefficient": 0.01,
 }
-#: Steps of the difference quotients with respect to the relative stiffness of a wall, and to a constant load in units
-#: of half the load's range.
+#: Steps of two difference quotients. The first step changes the relative stiffness of a wall. The second step is a
+#: constant load in units of half the load's range.
 _WALL_STEP, _PUSH_STEP = 0.02, 5e-3
-#: Guard against division by zero: smallest error of the load in units of half the load's range.
+#: Smallest error of the load in units of half the load's range, a guard against division by zero.
 _LEAST_PUSH = 1e-5
-#: Upper bounds on the iterations of expectation-maximisation in three series; the noise is tempered after each series.
+#: Upper bounds on the number of iterations of expectation-maximisation in three series. The noise is tempered after
+#: each series.
 _ROUNDS = (8, 5, 3)
 #: Upper bound on the number of sweeps of the sampler, and number of initial sweeps that are discarded.
 _SWEEPS, _BURNT = 50, 10
@@ -69,17 +71,17 @@ class Graded:
     Attributes
     ----------
     shared, covariance : ndarray, shape (SIZE,), (SIZE, SIZE)
-        The shared unknowns and their covariance. If the fit passes all checks, these values hold for a machine that
-        differs from the scene only in the quantities of the fit.
+        The unknowns of the whole window and their covariance. If the fit passes all checks, the machine is assumed to
+        differ from the scene only in the quantities of the fit.
     clearance, clearance_deviation : ndarray, shape (2,)
         Clearances in m and their standard deviations, for a machine that may differ from the scene in any quantity.
     differs : dict of str to (float, float, float)
-        For each further quantity, the probability of a difference from the scene, and mean and standard deviation of
-        the difference.
+        Three numbers for each further quantity: the probability of a difference from the scene, the mean of the
+        difference, and the standard deviation of the difference.
     load : ndarray, shape (3,)
         Standard deviation of the load's error in a swing, in units of half the load's range.
     inflation : ndarray, shape (3,)
-        Ratio of the variance of x, y and theta to the variance of the noise in the fit.
+        Variance of the measured x, y and theta, divided by the variance of the noise in the fit.
     surprise : float
         Mean square of the differences in units of their prior deviations, at least 1.
     harmonics : Harmonics, optional
@@ -130,7 +132,7 @@ def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) 
     ratio = max(1.0, linear.scatter()) * surprise
 
     def widened(step: Array, covariance: Array) -> Array:
-        """Return the covariance of the shared unknowns plus the errors of the linearised step."""
+        """Return the covariance of the shared unknowns, increased by the errors of the linearised step."""
         out: Array = ratio * covariance[:SIZE, :SIZE] + np.diag((tuning.BENT * step[:SIZE]) ** 2)
         out[[GX, GY], [GX, GY]] += bent**2 + unexplained**2
         return out
@@ -161,7 +163,8 @@ class _Column:
 
 
 def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
-    """Return the further quantities, and the derivatives of the prediction with respect to a constant load, (n, 3, 3).
+    """Return the further quantities, and the derivatives of the predicted measurements with respect to a constant load,
+    (n, 3, 3).
 
     A quantity is left out if its prior deviation is zero, or if the motion with its changed value cannot be simulated.
     """
@@ -216,15 +219,17 @@ def _of_sensor(problem: Problem, point: Point) -> Iterator[tuple[str, Array]]:
 
 
 def variants(scene: Scene) -> tuple[Scene, ...]:
-    """Return two changed scenes that need other compiled terms, with a different exponent and with friction."""
+    """Return the scene with a different exponent and the scene with friction, because both need separately compiled
+    kernels.
+    """
     return tuple(_moved(scene, path, STATED[path], 1.0) for path in ("contact.exponent", "friction.coefficient"))
 
 
 def _moved(scene: Scene, path: str, step: float, depth: float) -> Scene:
-    """Return a scene in which the number at a path is changed by `step`, a relative step for mass and inertia.
+    """Return the scene with the number at `path` changed by `step`, which is a relative step for mass and inertia.
 
-    If the exponent is changed, the stiffness is changed too, so that the force at the penetration `depth` in m is the
-    same.
+    With a change of the exponent, the stiffness is adjusted so that the force at the penetration `depth` in m does not
+    change.
     """
     part, name = path.split(".")
     if part == "friction":
@@ -240,10 +245,10 @@ def _moved(scene: Scene, path: str, step: float, depth: float) -> Scene:
 
 
 class _Linearised:
-    """The linearised problem.
+    """The least-squares problem, linearised at a fit.
 
-    The shared and the further unknowns form the border of the normal equations. Each swing has its own unknowns, the
-    starting state and the error of the load.
+    The border of the normal equations consists of the unknowns of the whole window and of the further unknowns. Each
+    swing has unknowns of its own, which are the starting state and the error of the load.
 
     inflation : (3,) factor on the variance of each component
     load : (3,) standard deviation of the load's error in a swing
@@ -251,8 +256,8 @@ class _Linearised:
 
     def __init__(self, problem: Problem, found: Fit, columns: dict[str, _Column], pushes: Array) -> None:
         every, waves = columns.values(), 0 if problem.harmonics is None else problem.harmonics.amplitude.size
-        # the harmonics are last in the border, at the slice `waves`; `names` are the names of the other further
-        # quantities
+        # `names` are the names of the further quantities except the harmonics, which are last in the border, at the
+        # slice `waves`
         self.names = list(columns)[: len(columns) - waves]
         self.waves = slice(SIZE + len(self.names), SIZE + len(columns))
         self._found, self._swing = found, found.point.swing
@@ -335,9 +340,7 @@ class _Linearised:
         return self._of(self._held)
 
     def _of(self, differs: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Return mean and covariance if the marked quantities differ, and the other quantities have the scene's
-        values.
-        """
+        """Return mean and covariance of the unknowns if only the marked quantities differ from the scene."""
         size, use = len(self._precision), np.append(np.arange(SIZE), SIZE + np.flatnonzero(differs))
         mean, covariance = np.zeros(size), np.zeros((size, size))
         inverse = np.linalg.inv(self._normal[np.ix_(use, use)])
@@ -345,7 +348,8 @@ class _Linearised:
         return mean, covariance
 
     def averaged(self, rng: np.random.Generator, prior: float) -> tuple[Array, Array, Array]:
-        """Return mean and covariance of the samples, and the share of samples in which each quantity differs.
+        """Return the mean of the samples, the covariance of the samples, and the share of samples in which each
+        quantity differs.
 
         `prior` is the prior probability of a difference. A quantity that the fit includes differs in all samples.
         """
@@ -398,7 +402,7 @@ class _Linearised:
         """
         own = len(self.names)
         z, often = ((self._value + mean[SIZE:]) * np.sqrt(self._precision[SIZE:]))[:own], often[:own]
-        # the weights of the quantities are the shares of samples in which they differ
+        # the weight of a quantity is the share of samples in which it differs from the scene
         return max(1.0, float((z**2 / np.maximum(often, 0.1)).sum() / max(often.sum(), 1.0)))
 
     def named(self, mean: Array, often: Array) -> dict[str, tuple[float, float, float]]:
@@ -410,7 +414,9 @@ class _Linearised:
 
 
 def _lasting(left: Array, swing: NDArray[np.int64], square: float) -> float:
-    """Return the correlation length of residuals in rows, which is the sum of their correlations over all lags."""
+    """Return the correlation length of residuals in rows, which is the sum over all lags of the correlations of the
+    residuals.
+    """
     rows = 1.0
     for lag in range(1, _LONGEST_LAG):
         one, other = left[:-lag], left[lag:]

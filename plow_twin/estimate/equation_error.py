@@ -1,14 +1,15 @@
 """Estimate of walls and stiffness from the weak form of the equations of motion.
 
 The method simulates no motion, so errors of the load do not accumulate. The equations are multiplied by smooth test
-functions psi and integrated by parts, so that no measured pose is differentiated:
+functions psi. Integration by parts then moves the derivatives from the measured poses q to psi:
 
     integral psi'' q  =  integral psi (load + contact) / M,
     contact = K sum n p (1 + d p'),   integral psi p p' = -1/2 integral psi' p^2,
 
-where p are the penetrations behind the four walls. Gauss-Newton steps determine the positions of the walls, K and K d.
-The remaining acceleration is treated as noise. The result is biased if contacts last only a few samples. The module
-`uncertain_load` corrects this bias.
+where p are the penetrations at the four walls, n the normals, M the mass, K the stiffness and d the damping.
+Gauss-Newton steps determine the positions of the walls, the factor K and the product K d. The remaining acceleration is
+treated as noise. If contacts last only a few samples, the result has a bias, which the module `uncertain_load`
+corrects.
 
 References: Shinbrot, Trans. ASME 79 (1957) 67 (modulating functions); Messenger and Bortz, J. Comput. Phys. 443 (2021)
 110525 (weak form).
@@ -33,7 +34,7 @@ from plow_twin.solve.compiled_scene import inertias
 
 Array = NDArray[np.float64]
 
-#: Definition of the walls: index of the wall of each pair in the order right, left, top, bottom.
+#: Index of the wall of each pair. By definition, the walls have the order right, left, top, bottom.
 _WALL: Final = np.argmax(np.stack(WALLS), axis=0)
 #: Parameters of the Gauss-Newton iteration:
 #:
@@ -43,17 +44,17 @@ _WALL: Final = np.argmax(np.stack(WALLS), axis=0)
 _STEPS, _SMALL, _LONGEST = 8, 2e-5, 3e-3
 #: Lower bounds on the interval between rows in s, and on the number of rows in half of a test function.
 _SHORTEST, _FEWEST = 5e-3, 3
-#: Unit of the stiffness in N/m, derived so that the column of the stiffness is about as large as the other columns.
+#: Unit of the stiffness in N/m, derived so that all columns of the linear system have about the same size.
 _UNIT = 1e7
-#: Deviate beyond which Huber's function is linear, and ratio of standard deviation to median absolute deviation,
-#: derived for a normal distribution.
+#: Deviate beyond which Huber's function is linear, and standard deviation divided by median absolute deviation. The
+#: quotient is derived for a normal distribution.
 _HUBER, _MAD = 2.0, 1.4826
-#: Starting values of a search within the bounds of the unknowns: clearances as shares of the range of motion, and
-#: penetrations in m.
+#: Starting values of a search, which lie within the bounds of the unknowns. `_SHARES` are clearances as shares of the
+#: range of motion, `_DEPTHS` are penetrations in m.
 _SHARES, _DEPTHS = (0.25, 0.5, 0.75, 0.95), (3e-3, 6e-3, 12e-3, 20e-3)
 #: Lower and upper bound on the penetration in m under the reference force.
 DEPTHS: Final = (2e-4, 3e-2)
-#: Guard against division by zero for columns without information.
+#: Smallest size of a column of the linear system, a guard against division by zero for columns without information.
 _SINGULAR = 1e-9
 
 
@@ -63,8 +64,9 @@ class Walls:
 
     reach : (4,) distance in m that the corners can move to the right, left, top and bottom before they touch the wall
     ln_depth : logarithm of the penetration in m under the reference force
-    damping : damping of the Hunt-Crossley law in s/m
-    left_over : (3,) logarithm of the scatter of the residual acceleration relative to the scatter of the acceleration
+    damping : damping factor of the Hunt-Crossley law in s/m
+    left_over : (3,) logarithm of the ratio of two scatters, that of the residual acceleration and that of the
+    acceleration
     loss : sum of the logarithms of the scatters of the residual acceleration
     """
 
@@ -81,7 +83,7 @@ class Walls:
 
     @property
     def features(self) -> Array:
-        """Features of the result for a regression, shape (7,), which begin with the clearances."""
+        """Features of the result for a regression, shape (7,). The first two features are the clearances."""
         return np.concatenate([self.clearance, [self.ln_depth, np.clip(self.damping, -2.0, 3.0)], self.left_over])
 
 
@@ -105,7 +107,8 @@ class EquationError:
         half = max(_FEWEST, round(0.5 * tuning.MODULATED / step))
         s, span = np.arange(1 - half, half) / half, half * step
         bump = 1.0 - s * s
-        # the test function (1 - s^2)^3 and its first two time derivatives, times the step of the integration
+        # the test function (1 - s^2)^3, its first time derivative and its second time derivative, each times the
+        # integration step
         self._value = step * bump**3
         self._slope = -6.0 * step / span * s * bump**2
         self._curve = step / span**2 * (24.0 * s * s * bump - 6.0 * bump**2)
@@ -128,8 +131,8 @@ class EquationError:
         return min(found, key=lambda one: one.loss)
 
     def fit(self, q: Array, reach: Array, ln_depth: float) -> Walls:
-        """Return the fit to poses `q` (n, 3) that starts from reaches (4,) in m and the logarithm of a penetration in
-        m.
+        """Return the fit to the poses `q`, (n, 3). It starts from the reaches (4,) in m and the logarithm of a
+        penetration in m.
         """
         poses = np.stack([np.interp(self._grid, self._t, column) for column in q.T], axis=1)
         corners, normals = self._geometry(poses)
@@ -160,7 +163,7 @@ class EquationError:
     def required_load(self, q: Array, reach: Array, ln_depth: float, damping: float) -> Load:
         """Return the load that moves the head along poses (n, 3) between walls with these properties.
 
-        It is averaged over `tuning.LOAD_AVERAGED`, because impacts falsify it.
+        The load is averaged over the time `tuning.LOAD_AVERAGED`, because its values during impacts are wrong.
         """
         poses = np.stack([np.interp(self._grid, self._t, column) for column in q.T], axis=1)
         stiffness = self._force / math.exp(ln_depth)
@@ -177,8 +180,8 @@ class EquationError:
         return Load(t, mean * self._inertia - weight)
 
     def _geometry(self, q: Array) -> tuple[Array, Array]:
-        """Return the reaches of the pairs in m, shape (n, 8), and the accelerations by unit forces of the pairs, (n, 3,
-        8).
+        """Return the reach of each pair in m, (n, 8), and the acceleration that a unit force of each pair causes, (n,
+        3, 8).
         """
         c, s = np.cos(q[:, 2]), np.sin(q[:, 2])
         body = np.stack([c, s, c * q[:, 0] + s * q[:, 1], -s * q[:, 0] + c * q[:, 1]], axis=1)
@@ -210,7 +213,9 @@ class EquationError:
         return found, target - columns @ found
 
     def _weighed(self, values: Array, kernel: Array) -> Array:
-        """Return the integrals of `values` (n, ...) times the test function, or a derivative of it, shape (m, ...)."""
+        """Return the integrals of `values`, (n, ...), times `kernel`, a test function or its derivative, shape (m,
+        ...).
+        """
         windows = np.lib.stride_tricks.sliding_window_view(values, len(kernel), axis=0)[:: self._apart]
         out: Array = windows @ kernel
         return out

@@ -50,23 +50,23 @@ if TYPE_CHECKING:
     from plow_twin.estimate.contact_forces import ContactForces
 
 Array = NDArray[np.float64]
-#: First guess for a fit, from the result of the previous window. The 21 numbers are the shared unknowns, the noise and
-#: the differences. An empty tuple means that there is no guess.
+#: First guess for a fit, from the result of the previous window. It consists of the unknowns of the whole window, the
+#: noise, and the differences from the model. An empty tuple means that there is no guess.
 Guess = tuple[float, ...]
 
-#: Upper bounds on the length of a window in load periods and in s, of which the longer one applies. Only the newest
-#: part of longer data is used.
+#: Upper bounds on the length of a window, in load periods and in s. The bound that gives the longer window applies. If
+#: the data are longer than the window, only the newest part is used.
 MOST_PERIODS, MOST_SPAN_S = 20.0, 60.0
-#: Upper bound in s on the length of data in which the period of the load is searched; it is the longest window of a
-#: node.
+#: Upper bound in s on the length of the data in which the period of the load is searched. It equals the longest window
+#: that a node accepts.
 _LONGEST_S = 600.0
-#: Normal deviate that a correct model exceeds in one of a hundred cases, derived from the normal distribution.
+#: Deviate that a correct model exceeds with a probability of 1 %, derived from the normal distribution.
 MOST_OTHER_LAW = round(float(ndtri(0.99)), 2)
-#: 95 % quantile of a half-normal distribution, derived from the normal distribution with unit variance.
+#: 95 % quantile of the absolute value of a standard normal variable, derived from the normal distribution.
 _HALF_NORMAL_P95 = float(ndtri(0.975))
 #: Bounds on the logarithm of a contact's penetration in m.
 _LN_PENETRATIONS = (math.log(1e-9), math.log(0.12))
-#: Definition of the walls of the cavity: indices of the two pairs at each wall.
+#: Definition of the walls of the cavity by the indices of the two pairs at each wall.
 _SIDES = {"left": (1, 7), "right": (3, 5), "top": (0, 2), "bottom": (4, 6)}
 
 
@@ -83,8 +83,8 @@ def estimate(
     Parameters
     ----------
     scene : Scene
-        The nominal scene. Its geometry, masses and gravity are assumed to be exact. Its clearances and contact are
-        means of the prior.
+        The nominal scene. Its geometry, masses and gravity are assumed to be exact. Its clearances and its contact
+        parameters are the means of the prior.
     load : Load
         The measured load.
     poses : Poses
@@ -92,7 +92,8 @@ def estimate(
     lost : int
         Number of rows that were left out before.
     gaps : Gaps, optional
-        Measured gaps. The clearances follow directly from the gaps, and so does the pose if no poses are measured.
+        Measured gaps, from which the clearances are computed directly. If no poses are measured, the poses are computed
+        from the gaps.
     forces : ContactForces, optional
         Measured contact forces, which determine the contact more accurately than the motion alone.
     """
@@ -110,8 +111,8 @@ def estimate_window(
 ) -> tuple[Estimate, Guess]:
     """Return the result of `estimate` for a window, and the guess for the next window.
 
-    The fit starts from `guess`, if there is one. If this fit fails a check, the estimate is repeated with a full
-    search.
+    The fit starts from `guess` if `guess` is not empty. If the fit from `guess` fails a check, the estimate is repeated
+    with a full search.
     """
     if scene.head.carries == "corners":
         span = (float(load.t[0]), float(load.t[-1]))
@@ -124,9 +125,8 @@ def estimate_window(
     found, following = _estimate(units.scene(scene), *its, lost, guess, units.gaps(gaps), units.forces(forces))
     found = units.in_si(found, scene)
     if units.only_time and found.sensor == "ok":
-        # The estimate scales time with the load's period. A machine of the paper's size has impacts of the same
-        # duration under any load. The comparison under an uncertain load is therefore repeated without the scaling of
-        # time.
+        # Times are in units of the load's period. For a machine of the paper's size, however, the duration of an impact
+        # does not depend on the period. The comparison under an uncertain load is therefore repeated with times in s.
         period = _period(load, poses)
         unknowns = Unknowns.stated(scene, load, poses)
         found = under_uncertain_load(found, unknowns, thinned(load, period)[0], poses, period)
@@ -219,7 +219,8 @@ def _from_motion(
     if guess:
         numbers = np.array(guess)
         shared, noise, differences = np.split(numbers, [SIZE, SIZE + 3])
-        # a guess from a fit is close to the optimum, but a contact harder than `FITTED` was not fitted
+        # a guess is close to the optimum, except for a contact harder than `FITTED`, for which the guess is not from a
+        # fit
         certain = unknowns.penetration_of(float(shared[SOFTNESS])) > tuning.FITTED
         near = refine(forward, unknowns, poses, period, unknowns.within(shared), noise, drift, differences, certain)
         verdict = judge(*near, period) if near else None
@@ -239,10 +240,10 @@ def _from_motion(
 
 
 def _without_load(unknowns: Unknowns, load: Load, poses: Poses, lost: int) -> Estimate:
-    """Estimate from the poses alone, because the load was not measured.
+    """Return the estimate from the poses alone, for the case that the load was not measured.
 
-    The range of motion is the clearance plus the penetrations of both walls. If the walls yield, the equations of
-    motion show how much, and which load moves the head between the walls.
+    The range of motion is the clearance plus the penetrations at two opposite walls. For walls that yield, the
+    penetrations and the load are estimated from the equations of motion.
     """
     nothing = _without_fit(unknowns, poses, lost, "load: the same value throughout, while the head moves")
     bias = bias_of_hard(unknowns, poses)
@@ -258,7 +259,8 @@ def _from_some_components(
 ) -> Estimate:
     """Return the estimate from poses in which one or two components were never measured.
 
-    If the fit gives no clearance, measured x and y are compared with motions under an uncertain load.
+    If the fit gives no clearance, and x and y were measured, the poses are compared with motions under an uncertain
+    load.
     """
     period = _period(load, poses)
     felt, _ = thinned(load, period)
@@ -284,7 +286,7 @@ def _searched(
     lost: int,
     forces: ContactForces | None,
 ) -> tuple[Estimate, Guess]:
-    """Return the estimate from the motion without a guess, by a search or by the comparison of whole motions."""
+    """Return the estimate from a search or from the comparison of whole motions; no guess is needed."""
     narrow = bounces(unknowns, poses)
     bounced = compare(forward, unknowns, poses, period) if narrow else None
     searched = candidate(forward, unknowns, poses, period) if bounced is None else None
@@ -315,7 +317,7 @@ def _searched(
             found, verdict = again, judge(*again, period)
     found, verdict = _with_differences(found, verdict, period)
     if bounced is None and _fails(found[1], verdict) and not verdict.sensor:
-        # a low pass or a change of the machine can resemble harmonics, so harmonics are tried after the differences
+        # a low pass of the sensor or a change of the machine can resemble harmonics, so harmonics are tried last
         found, verdict = with_harmonics(*plain, forward.load, period) or (found, verdict)
     result = summarise(*found, verdict, lost, forces if bounced is None else None)
     if bounced is None and _fails(found[1], verdict) and not verdict.broken:
@@ -340,12 +342,12 @@ def under_uncertain_load(
     period: float,
     fitted: tuple[Problem, Fit] | None = None,
 ) -> Estimate:
-    """Return an estimate whose withdrawn clearances are replaced by values that allow for errors of the load.
+    """Return an estimate with values that allow for errors of the load in place of the withdrawn clearances.
 
     The values come from a comparison with motions under uncertain loads. `result` is the estimate under the measured
-    load. It is returned without new clearances if it contains a clearance, or if the comparison gives no clearance.
-    `fitted` is a fit that failed a check and may have converged to a false optimum. A clearance of the fit that agrees
-    with the comparison is combined with it.
+    load. The clearances do not change if `result` contains a clearance, or if the comparison gives no clearance.
+    `fitted` is a fit that failed a check and may have converged to a false optimum. If a clearance of `fitted` agrees
+    with the comparison, the two values are combined.
     """
     if _known(result) or (felt is not None and felt.interval() > tuning.COARSEST):
         return result
@@ -391,7 +393,7 @@ def _from_bounced(unknowns: Unknowns, shared: Array, bounced: Bounced) -> Array:
 
 
 def with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
-    """Return an estimate that combines a fit and a comparison of the same motion; disagreement widens the intervals."""
+    """Return an estimate that combines the results of a fit and of a comparison; disagreement widens the intervals."""
     figures = result.figures | {"distance": bounced.distance, "path": bounced.path}
     figures["work"] += float(spent)
     if bounced.distance >= tuning.MOST_DISTANCE:
@@ -412,10 +414,10 @@ def with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
 
 
 def _with_apparent(result: Estimate, apparent: tuple[Interval, ...]) -> Estimate:
-    """Return an estimate with other apparent clearances, which hold for a frame of exactly the scene's size.
+    """Return an estimate with new apparent clearances, which hold for a frame of exactly the scene's size.
 
-    The clearances also allow for an error of the frame. Their shift and additional width relative to the apparent
-    clearances do not change.
+    The clearances of the estimate allow for an error of the frame. The shift and the additional width that distinguish
+    them from the apparent clearances do not change.
     """
     horizontal, vertical = (
         Interval.normal(
@@ -435,10 +437,11 @@ def _with_apparent(result: Estimate, apparent: tuple[Interval, ...]) -> Estimate
 def _with_differences(
     found: tuple[Problem, Fit], verdict: Verdict, period: float
 ) -> tuple[tuple[Problem, Fit], Verdict]:
-    """Return a fit that includes differences of walls and sensor, if the fit without differences fails or gives
-    evidence of differences.
+    """Return a fit with differences of walls and sensor if the fit without differences fails a check or shows that
+    differences exist; otherwise return the given fit.
 
-    Without the differences, a wall whose two pads differ by 1.2 mm makes the clearance 0.2 mm too small.
+    If the differences are ignored and the two pads of a wall differ by 1.2 mm, the estimated clearance is 0.2 mm too
+    small.
     """
     if verdict.sensor and not verdict.by_scale:
         return found, verdict
@@ -505,7 +508,9 @@ def with_gaps(result: Estimate, by_gaps: GapsFit) -> Estimate:
 
 
 def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: int, work: int) -> Estimate:
-    """Return the estimate, with intervals and states, from the comparison of a motion with a hard contact."""
+    """Return the estimate, with intervals and states, from the result of a comparison of whole motions with a hard
+    contact.
+    """
     sensor = judge_sensor(poses)
     found = (
         ("motion", bounced.distance, tuning.MOST_DISTANCE),
@@ -551,7 +556,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         horizontal_state=states[0],
         vertical_state=states[1],
         apparent=(apparent[0], apparent[1]) if all(state.known for state in states) else None,
-        # the bounces determine a lower limit of the stiffness only, so the interval extends to the hardest contact
+        # the bounces determine only a lower limit of the stiffness, so the interval extends to the hardest contact
         stiffness=Interval(float(mean), float(soft), max(float(hard), unknowns.hardest_believed)),
         damping=_damping(unknowns, Interval.normal(*bounced.ln_damping)),
         bias_x=bias[0],
@@ -573,7 +578,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
 
 
 def _both(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
-    """Return mean and deviation of the weighted mean of two independent measurements."""
+    """Return the weighted mean of two independent measurements, and its standard deviation."""
     weights = one[1] ** -2, other[1] ** -2
     return (one[0] * weights[0] + other[0] * weights[1]) / sum(weights), sum(weights) ** -0.5
 
@@ -583,7 +588,7 @@ def _apart(one: tuple[float, float], other: tuple[float, float]) -> float:
 
 
 def _both_of_one(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
-    """Return mean and deviation as `_both` does, but widened if the two estimates, from the same motion, disagree.
+    """Return the result of `_both` for two estimates from the same motion; the deviation is widened if they disagree.
 
     Reference: Birge, Phys. Rev. 40 (1932) 207 (the ratio of external to internal consistency).
     """
@@ -599,9 +604,10 @@ def _state(withdrawn: bool, observed: bool, rough: bool = False) -> State:
 
 
 def _unseen(fit: Fit) -> Array:
-    """Return the deviation of the clearances in m due to rotations of walls with an untouched pad, shape (2,).
+    """Return the standard deviation in m, shape (2,), that rotations of walls with an untouched pad cause in the
+    clearances.
 
-    The motion does not show the position of an untouched pad. The linearised fit does not contain this uncertainty.
+    The motion does not show the position of an untouched pad, and the linearised fit ignores this uncertainty.
     """
     square = np.zeros(2)
     seconds = fit.point.contact.sum(axis=0)
@@ -657,8 +663,8 @@ def _next_guess(problem: Problem, fit: Fit) -> Guess:
 def thinned(load: Load, period: float) -> tuple[Load, bool]:
     """Return a load without samples that hardly move the head, and whether the load is broad-band.
 
-    A load is broad-band if nearly all its samples move the head. Such a load is averaged instead. A load whose samples
-    are too rare to show its broad-band part counts as broad-band too.
+    A load is broad-band if nearly all its samples move the head. A broad-band load is averaged. A load with samples so
+    rare that a broad-band part would not be visible counts as broad-band.
     """
     samples, load = load, load.believable()
     rare = load.wrench is not samples.wrench
@@ -713,8 +719,8 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     if beside is not None:
         published = np.maximum(beside.clearance, LEAST_CLEARANCE)
         spread = np.hypot(beside.clearance_deviation, _between_optima(problem, shared))
-    # A change at an unknown time within the window shifts the mean clearance by a uniformly distributed share of the
-    # change.
+    # The clearance may have changed at an unknown time within the window. The mean over the window then differs from
+    # the newest clearance by a uniformly distributed share of the change.
     moved = verdict.changed / math.sqrt(3.0)
     deviation[[GX, GY]] = np.hypot(deviation[[GX, GY]], moved)
     spread = np.hypot(np.hypot(spread, moved), _unseen(fit))
@@ -722,11 +728,11 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     if not finished and not suspect:
         gain = f"the cost would still fall by {fit.gain_left:.0f}, expected at most {tuning.OUTLYING**2:g}"
         reasons = [f"the fit has not reached an optimum: {gain}"]
-    # compliant walls give way by this depth, so the range of motion can exceed the clearance
+    # compliant walls yield by `given`, so the range of motion can exceed the clearance
     given = tuning.GIVEN * float(np.exp(shared[SOFTNESS] + NORMAL_P95 * min(deviation[SOFTNESS], 1.0)))
     least = range_of_motion(unknowns.scene, poses)[0] - given
     share = predicted(fit).sum(axis=0) / np.maximum(np.isfinite(fit.point.residual).sum(axis=0), 1)
-    # the equations of motion couple the components, so the measured components also test the other clearance
+    # the equations of motion couple the components, so a measured component tests both clearances
     share = np.where(poses.measured, share, share[poses.measured].min())
     apparent, clearances, states = [], [], []
     untested: dict[int, Interval] = {}
@@ -833,14 +839,15 @@ def _numbers(unknowns: Unknowns, normal: list[Interval]) -> dict[str, Any]:
 
 
 def _plain(problem: Problem, fit: Fit) -> Array:
-    """Return the covariance due to noise and due to the uncertainty of the differences in the fit."""
+    """Return the part of the covariance that noise and the uncertainty of the differences in the fit cause."""
     return fit.covariance + of_differences(problem, fit) if problem.differences.any() else fit.covariance
 
 
 def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> Array:
     """Return the covariance of the shared unknowns, which is `plain` widened by the misfit.
 
-    The factor is `_widened`. The step that the fit has not yet made is added as an error.
+    The factor on the covariance is the result of `_widened`. The step that the fit has not yet made is added as an
+    error.
     """
     size = len(fit.shared)
     covariance: Array = plain * _widened(problem, fit, verdict) + np.outer(fit.left[:size], fit.left[:size])
@@ -849,11 +856,13 @@ def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> A
 
 
 def _widened(problem: Problem, fit: Fit, verdict: Verdict) -> float:
-    """Return the factor on the variance of the noise, from the scatter of the swings and the colour of the residuals.
+    """Return the factor on the variance of the noise that the scatter of the swings and the colour of the residuals
+    give.
 
-    All unknowns that move the head scatter for the same reason, so the mean ratio of their variances is used. The ratio
-    of a single unknown would be too random. The covariance of linked swings already contains the scatter. Coloured
-    residuals stay correlated for long, so the deviation, and not the variance, is multiplied by the colour.
+    All unknowns that move the head scatter for the same reason, so the ratio of observed to expected variance is
+    averaged over these unknowns. The ratio of a single unknown would be too random. The covariance of linked swings
+    already contains the scatter. Coloured residuals stay correlated for long, so the deviation, and not the variance,
+    is multiplied by the colour.
     """
     ratio = 1.0 if len(problem.link) else max(1.0, _scatter(problem, fit, np.diag(fit.covariance)))
     colour = max(verdict.figures.get(f"colour_{name}", 1.0) for name in COMPONENTS)
@@ -864,7 +873,7 @@ def _widened(problem: Problem, fit: Fit, verdict: Verdict) -> float:
 def _between_optima(problem: Problem, shared: Array) -> float:
     """Return the standard deviation of a clearance in m over optima that explain the motion equally well.
 
-    Several optima exist if the contact is hard or nearly hard, or if only one component was measured.
+    If the contact is hard or nearly hard, or if only one component was measured, there are several optima.
     """
     unknowns = problem.unknowns
     if problem.window.poses.measured.sum() == 1:
@@ -900,9 +909,11 @@ def _groups(
     states : list of State
         States of the horizontal and the vertical clearance.
     untested : dict
-        Clearances that no predicted motion tests, by axis. They replace the clearances of the pads along the axis.
+        Clearances that no predicted motion tests, by the index of the axis. The clearances between pads along this axis
+        are replaced by the given clearance.
     shared, added : ndarray
-        The unknowns of a machine that may differ from the model, and their covariance minus that of the fit.
+        The unknowns of a machine that may differ from the model, and the difference between two covariances, that of
+        these unknowns and that of the fit.
     """
     out = {}
     for name, (value, deviation) in by_group(problem, fit, widened).items():
@@ -924,7 +935,7 @@ def _correlation(covariance: Array) -> tuple[tuple[float, ...], ...]:
 
 
 def _unobserved(unknowns: Unknowns, deviation: Array, index: int, reach: float, noise: Array) -> Interval:
-    """Return the interval of a clearance that is not observed: the prior above the range in which the head has
+    """Return the interval of a clearance that is not observed, which is the prior above the range in which the head has
     moved.
     """
     nominal, spread = unknowns.nominal()[index], max(unknowns.deviations()[index], deviation[index])
@@ -934,7 +945,7 @@ def _unobserved(unknowns: Unknowns, deviation: Array, index: int, reach: float, 
 def _stiffness(unknowns: Unknowns, psi: Interval) -> Interval:
     """Return the stiffness from the softness `psi`.
 
-    If the interval includes contacts that are too hard to be resolved, it extends to `Unknowns.hardest_believed`.
+    The interval extends to `Unknowns.hardest_believed` if it includes contacts that are too hard to be resolved.
     """
     soft, hard = unknowns.stiffness_of(psi.p95), unknowns.stiffness_of(psi.p05)
     if unknowns.within(np.full(SIZE, psi.p05))[SOFTNESS] > psi.p05:
@@ -984,7 +995,7 @@ def _lacking(poses: Poses) -> tuple[str, ...]:
     )
     if lacking:
         return lacking
-    # the longest gap counts too, because a flight within the gap is not measured
+    # long gaps count as well as the mean interval, because a flight within a gap is not measured
     apart = max(poses.interval(), poses.gap())
     if apart > tuning.SPARSEST:
         lacking = (f"poses: got {1.0 / apart:.1f} a second, expected at least {1.0 / tuning.SPARSEST:.1f}",)
@@ -992,7 +1003,7 @@ def _lacking(poses: Poses) -> tuple[str, ...]:
 
 
 def _well_measured(poses: Poses) -> Poses | None:
-    """Return the poses without components that were hardly measured.
+    """Return the poses without the values of components that were hardly measured.
 
     The result is None if all or no components were measured well, or if the remaining poses are too rare.
     """

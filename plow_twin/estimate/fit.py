@@ -1,14 +1,14 @@
 """Least-squares fit of the unknowns, and of the state at the start of each swing, to the measured motion.
 
-The window is divided into *swings*, which are parts of the motion that begin in flight between the walls. In flight the
-state is known best, and its errors have the smallest effect. Each swing is simulated from its own starting state
-(multiple shooting). Errors of the load, and errors due to bounces, therefore do not accumulate from swing to swing.
-Levenberg-Marquardt steps minimise Huber's function of the residuals plus the terms of the prior.
+The window is divided into *swings*, which are parts of the motion that begin in flight between the walls. In flight,
+the state is known best, and an error of the state has the smallest effect on the later motion. Each swing is simulated
+from its own starting state (multiple shooting), so errors due to the load or to bounces do not accumulate from swing to
+swing. Levenberg-Marquardt steps minimise the sum of Huber's function of the residuals and the terms of the prior.
 
-If the load is unknown between its samples, the swings are short, and each swing is *linked* to the next swing: the
-start of the next swing may differ from the end of the swing, with the covariance of the unknown load (weak
-constraints). Simulations from displaced starting states give the variance of the prediction at each time, which is
-added to the variance of the measurement.
+If the load is unknown between its samples, the swings are short, and each swing is *linked* to the next swing. The
+start of the next swing may then differ from the end of the swing by a random jump, with the covariance that the unknown
+load causes (weak constraints). Simulations from displaced starting states give the variance of the prediction at each
+time. This variance is added to the variance of the measurement.
 
 References: Bock, Recent advances in parameter identification techniques for ODE (1983); Nocedal and Wright, Numerical
 Optimization, ch. 10; Huber, Robust Statistics, ch. 7; Tremolet, Q. J. R. Meteorol. Soc. 132 (2006) 2483.
@@ -38,17 +38,19 @@ from plow_twin.model.scene import Scene
 
 Array = NDArray[np.float64]
 
-#: Guard against a singular matrix: precision of an unknown without a prior.
+#: Precision of an unknown without a prior, a guard against a singular matrix.
 NO_PRIOR = 1e-6
 #: Steps of the difference quotients with respect to a starting state, in m, m, rad, m/s, m/s, rad/s.
 _DISPLACED = np.array([2e-4, 2e-4, 1e-3, 5e-3, 5e-3, 3e-2])
-#: Lower bound on the spectral density of an unknown acceleration in m2/s3 and rad2/s3. After a second it causes a rate
-#: of 0.1 mm/s or 0.1 mrad/s, which neither solver nor sensor can resolve.
+#: Lower bound on the spectral density of an unknown acceleration in m2/s3 and rad2/s3. With the lower bound, the
+#: acceleration causes in one second a change of rate of 0.1 mm/s or 0.1 mrad/s, which neither the solver nor a sensor
+#: can resolve.
 _LEAST_DRIFT = 1e-8
-#: Definition of the walls by their two pads: left and right with the top pad first, top and bottom with the left pad
-#: first.
+#: Definition of the walls left, right, top and bottom by the indices of two pads. The first pad is the top pad or the
+#: left pad of the wall.
 WALLS: Final = ((1, 7), (3, 5), (0, 2), (6, 4))
-#: Definition of the *differences*, which are unknowns by which machine and sensor differ from the model:
+#: Definition of the *differences*. A difference is an unknown by which the machine or the sensor differs from the
+#: model:
 #:
 #: - `turn_<wall>`: rotation of a wall, expressed as the distance in m by which the first pad in `WALLS` lies farther
 #:   out than the second pad
@@ -61,16 +63,18 @@ DIFFERENCE_STEPS: Final = np.array([2e-4, 2e-4, 2e-4, 2e-4, 1e-3, 1e-3, 4e-6])
 #: Step of the difference quotients with respect to the amplitude of a harmonic, in units of half the load's range.
 _HARMONIC_STEP = 5e-3
 #: Factor on the steps of all difference quotients for derivatives that must be accurate. A search needs large steps,
-#: which average over the kinks of the motion. With large steps, however, the curvature would seem to determine changes
-#: without effect on the motion. An example is a common factor on mass, inertia, stiffness and load.
+#: which average over the kinks of the motion. Large steps, however, give wrong derivatives for a change that has no
+#: effect on the motion. An example of such a change is a common factor on mass, inertia, stiffness and load.
 _FINE = 1.0 / 300.0
-#: Smallest number of poses of a swing, derived from its six unknowns, which two poses of three numbers would just
-#: determine.
+#: Smallest number of poses of a swing, derived from the six unknowns of a swing. Two poses, which are six numbers,
+#: would just determine the unknowns.
 FEWEST_OF_SWING = 4
 
 
 def huber_loss(z: Array) -> Array:
-    """Return Huber's function of absolute normalised residuals, a square that becomes linear beyond `tuning.HUBER`."""
+    """Return Huber's function of absolute normalised residuals, which is quadratic up to `tuning.HUBER` and linear
+    beyond.
+    """
     return np.where(z <= tuning.HUBER, z * z, tuning.HUBER * (2.0 * z - tuning.HUBER))
 
 
@@ -83,7 +87,7 @@ def huber_weight(z: Array) -> Array:
 class Window:
     """Poses divided into swings.
 
-    starts : (s + 1,) model times in s at which the swings begin, and the end of the last swing
+    starts : (s + 1,) model times in s at which the swings begin, followed by the end of the last swing
     states : (s, 6) first guesses of x, y, theta and their rates at the beginning of each swing
     """
 
@@ -99,15 +103,17 @@ class Window:
 
 @dataclass(eq=False)
 class Point:
-    """Values of all unknowns, and the motion that follows from the unknowns.
+    """Values of all unknowns, and the motion that is simulated with these values.
 
-    shared, states : (SIZE,), (s, 6) unknowns of the whole window, and starting states of the swings
+    shared : (SIZE,) unknowns that apply to the whole window
+    states : (s, 6) starting states of the swings
     swing : (n,) index of the swing of each pose, -1 outside all swings
     predicted : (n, 3) predicted measurements without the bias, NaN outside all swings
     residual : (n, 3) measured minus predicted values, NaN without a measurement
     rate : (n, 3) rates of the predicted measurements
     contact : (s, 8) time in s during which each pair is in contact
-    defect : (s - 1, 6) start of each swing minus end of the swing before; (0, 6) if swings are not linked
+    defect : (s - 1, 6) starting state of a swing minus final state of the previous swing; (0, 6) if swings are not
+    linked
     """
 
     shared: Array
@@ -125,7 +131,8 @@ class Point:
 class Linear:
     """Jacobians with respect to the shared unknowns and to the starting state of one swing.
 
-    rows : (n, 3, SIZE + 6) Jacobian of the predicted measurements, with the starting state of the swing of each row
+    rows : (n, 3, SIZE + 6) Jacobian of the predicted measurements; the last six columns are for the swing that contains
+    the row
     ends : (s - 1, 6, SIZE + 6) Jacobian of the ends of linked swings
     """
 
@@ -138,7 +145,7 @@ class Piece:
     """A part of the normal equations, for the shared unknowns and for one or two consecutive swings.
 
     swing : index of the first swing
-    rows, weighted : (m, SIZE + 6) or (m, SIZE + 12) Jacobian, and Jacobian times the weights
+    rows, weighted : (m, SIZE + 6) or (m, SIZE + 12) the Jacobian, and the Jacobian multiplied by the weights
     residual : (m,) residuals
     """
 
@@ -162,10 +169,10 @@ class Fit:
     covariance : (SIZE, SIZE) covariance of the shared unknowns
     factor : the factorised normal equations of all unknowns
     noise : (3,) standard deviation of the measurements
-    variance : (n, 3) variance with which each measurement is weighted
+    variance : (n, 3) variance of each measurement, the inverse of its weight
     jitter : (n, 3) variance of the unpredictable part of the motion
     linear : Jacobians at `point`
-    left : (SIZE + 6 s,) next step of the linearised problem, zero at an optimum
+    left : (SIZE + 6 s,) next step of the linearised problem, which would be zero at an optimum
     gain_left : predicted reduction of the cost by the step `left`
     """
 
@@ -183,7 +190,7 @@ class Fit:
 
     @property
     def finished(self) -> bool:
-        """Whether the fit has reached an optimum, so that its residuals show how well the model fits."""
+        """Whether the fit has reached an optimum, which is necessary for tests of the residuals."""
         return self.gain_left < tuning.OUTLYING**2
 
     @property
@@ -211,9 +218,9 @@ class _Rows:
     """Assignment of poses to swings, for stamps that are `shift` s late.
 
     swing : (n,) index of the swing of each pose, -1 outside all swings
-    inside, times : (k,) rows of the poses in swings, and their model times in s
+    inside, times : (k,) indices of the poses that lie in swings, and the model times of these poses in s
     inner : (s + 1,) index in `inside` of the first row of each swing
-    asked : times of a simulation in s, which include the ends of linked swings
+    asked : times in s at which a simulation returns the state, which include the ends of linked swings
     ends : indices in `asked` of the ends of linked swings
     edges : (s + 1,) index in `asked` of the first time of each swing
     """
@@ -229,8 +236,8 @@ class _Rows:
 
 
 def depth_of(turns: Array) -> Array | None:
-    """Return the outward displacement of each pad in m, shape (8,), from the rotations of the walls; None if all are
-    0.
+    """Return the outward displacement of each pad in m, shape (8,), from the rotations of the walls; None without
+    rotations.
     """
     if not turns.any():
         return None
@@ -252,9 +259,9 @@ class Problem:
     window : Window
         The measurements.
     prior : tuple of ndarray, shape (SIZE,), optional
-        Means and standard deviations of the shared unknowns; by default those of `unknowns`.
+        Means and standard deviations of the shared unknowns. By default, the prior of `unknowns` is used.
     horizon : float
-        Longest simulated part of a swing in s.
+        Duration in s of the longest part of a swing that is simulated.
     differences : ndarray, shape (7,), optional
         Values in the order of `DIFFERENCES`; zero by default.
     drift : ndarray, shape (3,), optional
@@ -293,7 +300,7 @@ class Problem:
         self, shared: Array, states: Array, differences: Array | None = None, push: Array | None = None,
         share: Array | None = None, change: Callable[[Scene], Scene] | None = None, load: Load | None = None,
     ) -> Point | None:  # fmt: skip
-        """Return the motion for given unknowns; None if the motion leaves the range of the model.
+        """Return the motion with the given unknowns; None if the motion leaves the range of the model.
 
         Parameters
         ----------
@@ -385,7 +392,8 @@ class Problem:
     def cost(self, point: Point, variance: Array) -> float:
         """Return twice the negative logarithm of the posterior, with Huber's function of the residuals.
 
-        A measurement outside all swings contributes 1, which is the expected contribution of a measurement.
+        A measurement that lies in no swing contributes 1, which is the expected contribution of a measurement in a
+        swing.
         """
         z = np.abs(point.residual) / np.sqrt(variance)
         loss = huber_loss(z)
@@ -398,7 +406,8 @@ class Problem:
     def linearise(self, point: Point) -> Linear:
         """Return the Jacobians of the predicted measurements and of the ends of the swings."""
         rows, ends = np.zeros((len(point.residual), 3, SIZE + OWN)), np.zeros((len(point.defect), 6, SIZE + OWN))
-        # derivatives that need the unchanged scene (states, gains) come first, because only the latest scene is cached
+        # The derivatives with respect to states and gains, which need the unchanged scene, are computed first, because
+        # only the latest scene is cached.
         displaced = self.steps * _DISPLACED
         together = self._evaluate(point.shared, point.states + np.diag(displaced)[:, None])
         for j in range(6):
@@ -466,7 +475,7 @@ class Problem:
             change = moved[index] - point.shared[index]
             other = self.evaluate(moved, point.states) if abs(change) > 0.5 * step else None
             if other is not None:
-                # a residual is measured minus predicted, so this difference of residuals is the change of the
+                # a residual is measured minus predicted, so the difference of two residuals is a change of the
                 # prediction
                 return np.nan_to_num((point.residual - other.residual) / change), (point.defect - other.defect) / change
         return np.zeros_like(point.residual), np.zeros_like(point.defect)
@@ -483,12 +492,14 @@ class Problem:
 
 def _by_state(point: Point, other: Point, index: int, moved: float) -> tuple[Array, Array]:
     ends = point.defect - other.defect
-    ends[:, index] += moved  # removes the change of the next swing's start, which is also displaced in `other`
+    ends[:, index] += moved  # `other` displaces all swings, so this sum cancels the change of the next swing's start
     return np.nan_to_num((point.residual - other.residual) / moved), ends / moved
 
 
 def link_weights(spans: Array, drift: Array) -> Array:
-    """Return the inverse covariance, shape (s, 6, 6), of pose and rate after s spans of white acceleration noise."""
+    """Return the inverse covariance of pose and rate that white acceleration noise causes in each of s spans, (s, 6,
+    6).
+    """
     drift = np.maximum(drift, _LEAST_DRIFT)
     weights = np.zeros((len(spans), 6, 6))
     place = np.arange(3)
@@ -501,7 +512,7 @@ def link_weights(spans: Array, drift: Array) -> Array:
 def fit(
     problem: Problem, shared: Array, states: Array, noise: Array, iterations: int, enough: float = 0.3, seed: int = 0
 ) -> Fit | None:
-    """Return the fit that begins at given unknowns; None if the motion cannot be simulated there.
+    """Return the fit that begins at given unknowns; None if the motion with these unknowns cannot be simulated.
 
     Parameters
     ----------
@@ -516,7 +527,7 @@ def fit(
     enough : float
         Reduction of the cost below which the fit ends as converged.
     seed : int
-        Seed of the random displacements that probe the predictability of the motion.
+        Seed of the random displacements that `unpredicted` uses.
     """
     point = problem.evaluate(problem.unknowns.within(shared), states)
     if point is None:
@@ -552,8 +563,8 @@ def fit(
 
 
 def pieces(problem: Problem, point: Point, linear: Linear, variance: Array) -> Iterator[list[Piece]]:
-    """Yield for each swing the parts of the normal equations from its measurements and from its link to the next
-    swing.
+    """Yield for each swing the parts of the normal equations that its measurements and its link to the next swing
+    give.
     """
     z = np.abs(point.residual) / np.sqrt(variance)
     weight = np.nan_to_num(huber_weight(z) / variance) * np.isfinite(point.residual)
@@ -588,12 +599,12 @@ def normal_equations(problem: Problem, point: Point, linear: Linear, variance: A
 
 
 def freed(swings: int, unknowns: int) -> float:
-    """Return the correction for the scatter that is lost by fitting `unknowns` to few swings, at most `MOST_FREED`."""
+    """Return the factor that restores the scatter lost by fitting `unknowns` to few swings, at most `MOST_FREED`."""
     return swings / max(swings - unknowns, swings / tuning.MOST_FREED)
 
 
 def joint_step(problem: Problem, found: Fit, columns: Array, precision: Array, pull: Array) -> tuple[Array, Array]:
-    """Return the first two results of `whole_step`: the step and its covariance."""
+    """Return the first two results of `whole_step`, which are the step and its covariance."""
     step, covariance, _ = whole_step(problem, found, columns, precision, pull)
     return step, covariance
 
@@ -601,7 +612,8 @@ def joint_step(problem: Problem, found: Fit, columns: Array, precision: Array, p
 def whole_step(
     problem: Problem, found: Fit, columns: Array, precision: Array, pull: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the linearised step of shared and further unknowns, its covariance, and the step of the starting states.
+    """Return the linearised step of all unknowns except the starting states, its covariance, and the step of these
+    states.
 
     Parameters
     ----------
@@ -610,12 +622,14 @@ def whole_step(
     columns : ndarray, shape (n, 3, k)
         Derivatives of the prediction with respect to the k further unknowns.
     precision, pull : ndarray, shape (k,)
-        Terms of the prior of the further unknowns in the matrix and in the right-hand side of the normal equations.
+        Terms that the prior of the further unknowns adds to the matrix and to the right-hand side of the normal
+        equations.
 
     Returns
     -------
     tuple of ndarray, shapes (SIZE + k,), (SIZE + k, SIZE + k), (s, 6)
-        The starting states are eliminated from the equations. Their step is 0 in swings with few poses.
+        The starting states are eliminated from the equations. The step of a starting state is 0 in a swing with few
+        poses.
     """
     size = SIZE + len(precision)
     normal = np.diag(np.concatenate([1.0 / problem.deviation**2, precision]))

@@ -1,14 +1,16 @@
-"""The follower, an ensemble of twins that follows one machine by means of measured poses and estimates.
+"""The follower, which is an ensemble of twins that measured poses and estimates keep close to one machine.
 
-The twins, called members, differ in clearances, contact and load gains. They are drawn from the prior at first, then
-from each valid estimate. New members start at the poses of the old members. The module `members` contains the members
-and the Kalman filter by which measured poses move the members.
+The twins, called members, differ in clearances, contact parameters and load gains. The parameters are drawn from the
+prior at the start, and from each valid estimate as soon as the estimate is finished. Newly drawn members start at the
+poses of the previous members. The module `members` contains the members and the Kalman filter by which measured poses
+move the members.
 
 The first member, the median twin, has the median of each parameter and no random noise, so its motion obeys the
-equations of motion. Before the first estimate it is the nominal twin, and no pose moves it. Otherwise, if the machine
-had larger clearances, the poses would press the median twin against its walls, and its forces would be less accurate.
-Until the first estimate, the poses move the second member instead, which is a copy of the first member. The median twin
-that is drawn from the first estimate starts at the pose of this copy.
+equations of motion. Before the first estimate, the median twin is the nominal twin, and no pose moves it. If poses
+moved the nominal twin and the machine had larger clearances, the poses would press the nominal twin against its walls
+and falsify its forces. Until the first estimate, the poses move the second member, which is a copy of the first member.
+When the first estimate is finished, the median twin is drawn from the estimate and starts at the pose of the second
+member.
 """
 
 from __future__ import annotations
@@ -49,19 +51,22 @@ Rows = NDArray[np.void]
 
 #: Default number of members, by definition.
 MEMBERS: Final = 128
-#: Lower bound on the time in s between two poses that are used. A pose that follows sooner contributes little but costs
-#: as much as any pose.
+#: Lower bound on the time in s between two poses that are used. A pose after a shorter time contributes little
+#: information, but causes the same computing time as any pose.
 APART_S: Final = 4e-3
 #: Lower and upper bound on the number of poses from which the noise is computed.
 _NOISE_ROWS: Final = (20, 400)
-#: Upper bound on the number of samples in one call, so that the rows of all members stay in the processor's cache.
+#: Upper bound on the number of samples in one call. With this bound, the rows of all members fit into the processor's
+#: cache.
 _CALL: Final = 20
-#: Rate in 1/s at which the clearances are computed, by definition the rate at which they are published.
+#: Rate in 1/s at which the clearances are computed. By definition, it equals the rate at which the clearances are
+#: published.
 _KNOWN_HZ: Final = 10.0
-#: Upper bound on the number of poses that wait until the model reaches their stamps; a session stores as many.
+#: Upper bound on the number of poses that wait until the model reaches their stamps. A session stores the same number
+#: of poses.
 _MOST_DUE: Final = MOST_MEASURED
-#: Definition of constant arrays: masks of a single row with intervals (`_YES`) and without intervals (`_NO`), no
-#: digests, and a change of zero of the clearances.
+#: Constant arrays. By definition, `_YES` and `_NO` are masks of a single row with intervals and without intervals. The
+#: remaining arrays stand for no digests and for clearances that do not change.
 _YES: Final = np.ones(1, bool)
 _NO: Final = np.zeros(1, bool)
 _NO_DIGESTS: Final = np.zeros(0, np.int64)
@@ -94,7 +99,8 @@ class Span:
 
 
 class _Behind(NamedTuple):
-    """Samples that only the first member has processed so far, with the rows of the first member.
+    """Samples that the first member has processed but the remaining members have not, with the rows of the first
+    member.
 
     `wanted` marks the rows for which intervals are computed. `ends` marks the rows at which a span of peaks and
     impulses ends. `begins` states whether a span begins with the first row.
@@ -118,10 +124,10 @@ class Follower:
     scene : Scene
         The nominal scene.
     members : int
-        Number of twins, either 1 or at least 20. With 1, only the parameters follow the machine; poses do not move the
-        twin, and its forces have no intervals.
+        Number of twins, either 1 or at least 20. A single twin adopts the parameters of estimates, but poses do not
+        move it, and its forces have no intervals.
     tol : float
-        As for `Twin`.
+        Tolerance of the solver, as for `Twin`.
     start : float
         Time in s of the scene's initial state.
     seed : int
@@ -151,7 +157,7 @@ class Follower:
         self.added = 0
         #: whether intervals of the forces are computed for each row instead of only for published rows
         self.every_row = False
-        #: whether a single published row is returned before `catch_up` advances the other members
+        #: whether a single published row is returned before `catch_up` advances all members except the first
         self.defers = False
         self._behind: _Behind | None = None
         #: minimum and maximum of each component of the load so far, shape (2, 3)
@@ -159,9 +165,10 @@ class Follower:
         self._ends, self._begins = _NO_DIGESTS, False
         self._span_start = start
         self._wrench = np.zeros(3)
-        #: numbers of poses that have moved the members, that were outliers, and that were dropped from a full queue
+        #: numbers of poses, in three groups: poses that have moved the members, outliers, and poses dropped from a full
+        #: queue
         self.poses_used = self.poses_outlying = self.poses_dropped = 0
-        #: number of times that members were drawn anew, and model time in s of the latest draw from an estimate
+        #: number of times that members were drawn, and model time in s of the latest draw from an estimate
         self.drawn, self._since = 0, start
         self._draw("", start, self._unworn())
         self._forget()
@@ -180,7 +187,7 @@ class Follower:
 
     def _draw(self, text: str, time: float, worn: Array) -> None:
         self._text = text
-        #: the followed estimate; None while the prior is followed
+        #: the estimate that the members follow; None while the members follow the prior
         self.estimate = Estimate.from_dict(json.loads(text)) if text else None
         self._load_share = _load_share(text)
         self._known = self._prior if self.estimate is None else _whole(self.estimate, self._prior)
@@ -241,7 +248,7 @@ class Follower:
         return self._ensemble.first.failure(status)
 
     def like(self, scene: Scene) -> Follower:
-        """Return a follower of another scene with the same settings; the counters of poses continue."""
+        """Return a follower of the scene `scene` with the settings and the counters of this follower."""
         found = Follower(scene, self._members, tol=self.tol, seed=self._seed)
         found.every_row, found.defers = self.every_row, self.defers
         found.poses_used, found.poses_outlying = self.poses_used, self.poses_outlying
@@ -279,10 +286,11 @@ class Follower:
     def advance_rows(
         self, t: Array, wrench: Array, rows: Rows | None, digest_after: NDArray[np.int64] = _NO_DIGESTS
     ) -> Advanced:
-        """Advance to given times, as `Twin.advance_rows` does; a row depends on all measurements before its time.
+        """Advance to given times, as `Twin.advance_rows` does. Each row depends on all measurements that were taken
+        before its time.
 
-        With `defers`, a row that is published alone is returned before the other members are advanced. `catch_up`
-        advances these members later.
+        If `defers` is set, a row that is published alone is returned before the second and all further members are
+        advanced. The method `catch_up` advances these members.
         """
         self.catch_up()
         if wrench.shape != (len(t), 3) or not np.isfinite(wrench).all():
@@ -316,7 +324,7 @@ class Follower:
     def _advance_first(
         self, t: Array, wrench: Array, rows: Rows, wanted: NDArray[np.bool_], ends: NDArray[np.bool_]
     ) -> int:
-        """Advance only the median twin, and return the number of failed advances; `catch_up` advances the other
+        """Advance only the median twin and return the number of failed advances; `catch_up` advances the remaining
         members.
         """
         failed = self._ensemble.advance_first(t, wrench, rows)
@@ -352,7 +360,7 @@ class Follower:
         return end
 
     def _moved(self, worn: Array) -> Array:
-        """Return the growth of the clearances and of the ends of their intervals due to wear, shape (..., 6), in m.
+        """Return the growth due to wear of the clearances and of their interval ends in m, shape (..., 6).
 
         `worn` contains the wear depths of the pads in m, shape (..., 8).
         """
@@ -390,7 +398,7 @@ class Follower:
             self._ensemble.stand_about(q, v)
 
     def set_travel_speed(self, speed_m_s: float) -> None:
-        """Set the travel speed along the face from now on, as `Twin.set_travel_speed` does."""
+        """Set the travel speed along the face, as `Twin.set_travel_speed` does."""
         self.catch_up()
         self._speed = abs(float(speed_m_s))
         self._ensemble.set_travel_speed(self._speed)
@@ -453,8 +461,8 @@ class Follower:
     def add_pose(self, t: float, q: ArrayLike, known: float = -math.inf) -> None:
         """Add a pose `q`, shape (3,), that was measured at time `t` in s; a component that was not measured is NaN.
 
-        The pose is used when the model reaches `t` or `known`, the later of the two times in s. A late pose is used at
-        once, provided that it is at most `LATEST_S` old.
+        The pose is used when the model reaches both `t` and the time `known` in s. A pose that is late by at most
+        `LATEST_S` is used at once.
         """
         self._add(max(t, known), [t, *np.asarray(q, dtype=np.float64).tolist()])
 
@@ -463,9 +471,9 @@ class Follower:
 
         The window of the estimate begins at time `start` in s.
 
-        The twin follows an estimate with both clearances. While it follows the prior, an estimate with one clearance is
-        enough. An estimate with more rough clearances does not replace an estimate from nearly the same motion. After a
-        withdrawn estimate, the twin follows the prior again.
+        The members follow an estimate that contains both clearances. Members that follow the prior also accept an
+        estimate with one clearance. An estimate does not replace an estimate from nearly the same motion that has fewer
+        rough clearances. After a withdrawn estimate, the members follow the prior.
         """
         self._add(t, _harmonics_from(text, start))
 
@@ -508,8 +516,8 @@ class Follower:
     def follow_estimate(self, known: str) -> None:
         """Follow the estimate that was the property `known` of another follower.
 
-        The times of the two followers may have different origins, so the harmonics of the load, which need a phase, are
-        dropped.
+        The model times of the two followers may have different origins. The phases of the load's harmonics are unknown
+        in this case, so the harmonics are dropped.
         """
         known = _harmonics_from(known, None)
         if known != self._text:
@@ -524,7 +532,7 @@ class Follower:
         self._ensemble.stand_like(before, self._wrench)
 
     def follow_parameters(self) -> None:
-        """Continue with a single twin, which poses do not move, from the state of the median twin."""
+        """Continue from the state of the median twin with a single twin that poses do not move."""
         self.catch_up()
         self._members = 1
         self._begin_anew(self._text)
@@ -548,14 +556,16 @@ class Follower:
             self._noise_rows.append(q)
 
     def _load_error(self) -> Array:
-        """Return the standard deviation of the load's error from a rough estimate, shape (3,), in N, N, N m; else
-        zero.
+        """Return the standard deviation of the load's error in N, N, N m, shape (3,). It is zero unless the estimate is
+        rough.
         """
         found: Array = tuning.LOAD_ERROR_SHARE * self._load_share * 0.5 * (self._range[1] - self._range[0])
         return found
 
     def _sensor(self) -> tuple[Array | None, float]:
-        """Return noise in m, m, rad and delay in s of the sensor; the noise is None if too few poses have been used."""
+        """Return the noise of the sensor in m, m, rad, and its delay in s. The noise is None if too few poses have been
+        used.
+        """
         found = self.estimate
         noise: Array | None = None
         if found is not None and found.noise is not None:
@@ -578,7 +588,8 @@ class Follower:
     def span(self) -> Span:
         """Return peaks and impulses since the previous call.
 
-        The result is valid only if no row has been published since then, because a published row ends the span.
+        The result is valid only if no row has been published since the previous call, because a published row ends the
+        span.
         """
         self.catch_up()
         start, self._span_start = self._span_start, self.time
@@ -587,7 +598,7 @@ class Follower:
         return found
 
     def held(self, t: float) -> Rows:
-        """Return the row, shape (1,), at a later time `t` under the load of the newest sample; the state does not
+        """Return the row, shape (1,), that the constant load of the newest sample gives at `t`; the state does not
         change.
         """
         self.catch_up()
@@ -600,14 +611,15 @@ class Follower:
 def follower(scene: Scene, follow: str, members: int, tol: float) -> Follower:
     """Return a follower of a scene.
 
-    With `follow` equal to `full`, it has `members` twins, which the poses move. With `parameters`, it is a single twin.
+    If `follow` is `full`, the follower has `members` twins, and poses move them. If `follow` is `parameters`, it has a
+    single twin.
     """
     return Follower(scene, members) if follow == "full" else Follower(scene, 1, tol=tol)
 
 
 def _harmonics_from(text: str, start: float | None) -> str:
-    """Return an estimate (JSON) whose harmonics of the load begin at time `start` in s, or without harmonics for
-    None.
+    """Return an estimate (JSON) with the phases of the load's harmonics counted from `start` [s]; None removes the
+    harmonics.
     """
     if _HARMONICS not in text:
         return text
@@ -620,8 +632,7 @@ def _harmonics_from(text: str, start: float | None) -> str:
 
 
 def _load_share(text: str) -> Array:
-    """Return the error of the load that a rough estimate (JSON) contains, in units of half the load's range, shape
-    (3,).
+    """Return the error of the load that a rough estimate (JSON) states, in units of half the load's range, shape (3,).
 
     The result is zero for other estimates.
     """

@@ -1,4 +1,6 @@
-"""Forces and clearances over recorded data, computed causally: each row depends only on earlier measurements."""
+"""Causal computation of forces and clearances over recorded data, in which each row depends only on earlier
+measurements.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,8 @@ from plow_twin.stream.session import Session
 
 Array = NDArray[np.float64]
 
-#: Length of the windows of the estimates in s, and time in s from the end of one window to the end of the next. By
-#: definition the two numbers are the defaults of the node.
+#: Length of a window of the estimate in s, and time in s between the ends of successive windows. By definition, the two
+#: numbers are the defaults of the node.
 WINDOW_S, INTERVAL_S = 32.0, 10.0
 #: Nanoseconds per second, by definition.
 _NS: Final = 1e9
@@ -63,7 +65,7 @@ class Followed:
 
 @dataclass(frozen=True)
 class TakenOver:
-    """An estimate and the time in s at which it was finished; `taken` states whether it replaced the twins."""
+    """An estimate and the time in s at which it was finished; `taken` states whether twins were drawn from it."""
 
     t: float
     estimate: Estimate
@@ -115,7 +117,7 @@ def follow(
 
 
 class _Steps:
-    """Loop over the load, in which a session receives all measurements in order of their stamps, as in a live twin."""
+    """Loop that passes the load and all measurements to a session in order of their stamps, as a live twin does."""
 
     def __init__(
         self, scene: Scene, load: Load, poses: Poses, gaps: Gaps | None, members: int, seed: int, span: float | None
@@ -136,7 +138,7 @@ class _Steps:
 
     def rows(self, dt: float | None) -> Iterator[Followed]:
         step = max(1, int(np.searchsorted(self._load.t, self._load.t[0] + _PART_S)))
-        # the first sample is a part by itself, because there is no motion before it
+        # the first sample is processed separately, because there is no motion before it
         for first in (0, *range(1, len(self._stamps), step)):
             part = slice(first, min(first + step, len(self._stamps)) if first else 1)
             if first:

@@ -1,8 +1,9 @@
 """Joint fit of poses and contact forces by Gauss-Newton steps, starting from the fit of the poses.
 
 The unknowns are the shared unknowns, the delay of the forces, and the logarithm of the gain of each load cell. The
-starting state of each swing is eliminated. Forces at times that are hard to predict have less weight, and Huber's
-function limits the influence of each force. The scatter of the scores of the swings widens the intervals (White 1982).
+starting state of each swing is eliminated. A force that is hard to predict has less weight, and Huber's function limits
+the influence of each force. The intervals are widened according to the scatter of the scores of the swings (White
+1982). A swing is a part of the motion that begins in flight.
 """
 
 from __future__ import annotations
@@ -22,17 +23,18 @@ from plow_twin.model.pairs import PAIR_NAMES
 
 Array = NDArray[np.float64]
 
-#: Upper bound on the number of rows, which is about 200 per second in a window of ten load periods.
+#: Upper bound on the number of rows. In a window of ten load periods, it corresponds to about 200 rows per second.
 _MOST_ROWS = 6000
 #: Parameters of the Gauss-Newton iteration:
 #:
 #: - upper bound on the number of steps
 #: - number of initial steps in which the predictability is probed
 #: - number of random probes in each of these steps
-#: - reduction of the cost, within noise, below which the iteration ends
+#: - reduction of the cost below which the iteration ends, because the step is within the noise
 _ROUNDS, _DRAWN_ROUNDS, _PROBES, _ENOUGH = 8, 3, 3, 0.5
-#: Steps of the two-sided difference quotients with respect to the delay in s and to a starting state. The larger
-#: one-sided steps of the fit of the poses made clearances wrong by 4 standard deviations.
+#: Steps of the two-sided difference quotients with respect to the delay in s and to a starting state. The steps are
+#: small and two-sided, because with the larger one-sided steps of the fit of the poses, clearances were wrong by 4
+#: standard deviations.
 _DELAY_STEP = 2e-5
 _STATE_STEPS = np.array([1e-5, 1e-5, 5e-5, 2e-4, 2e-4, 1.4e-3])
 
@@ -41,9 +43,9 @@ _STATE_STEPS = np.array([1e-5, 1e-5, 5e-5, 2e-4, 2e-4, 1.4e-3])
 class JointFit:
     """Result of the joint fit of poses and contact forces.
 
-    used : how the forces were used
+    used : properties of the load cells, or the reason why the forces were not used
     shared, covariance : (SIZE,), (SIZE, SIZE) shared unknowns and their covariance; None if the forces were not used
-    model, sensor : reasons against the model and against the sensor
+    model, sensor : evidence against the model, and evidence against the sensor
     """
 
     used: ForcesUsed
@@ -55,7 +57,7 @@ class JointFit:
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """Values of the unknowns: shared (SIZE,), states (s, 6), delay of the forces in s, logarithms of the gains (k,)."""
+    """Values of the unknowns, with the delay of the forces in s and the logarithms of the k gains."""
 
     shared: Array
     states: Array
@@ -77,8 +79,8 @@ class _Block:
     """Normal equations of a swing, from which its starting state has been eliminated.
 
     normal, score : (b, b), (b,) matrix and right-hand side for the other unknowns, which form the border
-    state : (6,) step of the starting state if the other unknowns do not change
-    answer : (6, b) derivative of the step of the starting state with respect to the steps of the other unknowns
+    state : (6,) step of the starting state if the border's unknowns do not change
+    answer : (6, b) derivative of the starting state's step with respect to the steps of the border's unknowns
     root : (6, 6) Cholesky factor of the covariance of the starting state
     """
 
@@ -129,7 +131,7 @@ def fit_jointly(problem: Problem, found: Fit, forces: ContactForces, widened: fl
 
 
 class _Joint:
-    """The fit of the poses, extended by measured forces; an *entry* is the force of one cell in one row."""
+    """The fit of the poses, extended by measured forces. The force of one cell in one row is called an *entry*."""
 
     def __init__(self, problem: Problem, found: Fit, feeling: Feeling, cells: Cells, widened: float) -> None:
         self._problem, self._found, self._feeling, self._cells = problem, found, feeling, cells
@@ -158,8 +160,8 @@ class _Joint:
             return not_used("the model cannot be run")
         linear, jacobian = self._linearised(at)
         for index in range(_ROUNDS):
-            # the random probes are drawn from the uncertainty of the poses, and from the second step on of the forces
-            # too
+            # in the first step, the random probes are drawn from the uncertainty of the poses; from the second step on,
+            # they are drawn from the joint uncertainty of poses and forces
             if index < _DRAWN_ROUNDS:
                 self._weigh(at.force)
                 known = self._blocks(at, linear, jacobian if index else 0.0 * jacobian)
@@ -335,8 +337,8 @@ class _Joint:
         return JointFit(used, place.shared, covariance[:SIZE, :SIZE])
 
     def _unfitted(self, at: _At) -> int:
-        """Return the number of swings whose forces do not fit, which indicates a false optimum of the starting
-        states.
+        """Return the number of swings with forces that do not fit, which indicate a false optimum of the starting
+        state.
         """
         z = (self._measured - at.force) ** 2 / self._spread
         z, swing = z[np.isfinite(z)], self._swing[np.isfinite(z)]
