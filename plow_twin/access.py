@@ -1,4 +1,4 @@
-"""Checks of hosts and reading of secrets, for every connection to another program."""
+"""Functions that check a host and read a secret, for connections to other programs."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Final
 
 from plow_twin.errors import InputError, Problem
 
-#: Longest secret [B]. It is the longest password that fits into an MQTT packet.
+#: Largest length [B] of a secret. A longer password does not fit into an MQTT packet.
 _LONGEST_SECRET: Final = 65_535
 
 
 def is_address(host: str) -> bool:
-    """Return whether a host is an IP address. A name is no address."""
+    """Return whether a host is an IP address and not a name."""
     try:
         ip_address(host)
     except ValueError:

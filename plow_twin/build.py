@@ -1,4 +1,4 @@
-"""Version of the package, and fingerprint of everything that determines the exact bits of a run's results."""
+"""Version of the package, and a fingerprint of everything that determines the exact bits of a run's results."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def build_fingerprint() -> Mapping[str, str]:
 
 
 def source_digest(package: Path) -> str:
-    """Return a hash of the sources of a package's numeric subpackages, as 16 hexadecimal digits."""
+    """Return 16 hexadecimal digits, a hash of the source files in a package's numeric subpackages."""
     digest = hashlib.sha256()
     for subpackage in NUMERIC_SUBPACKAGES:
         for path in sorted((package / subpackage).rglob("*.py")):

@@ -39,7 +39,7 @@ class Problem:
     Attributes
     ----------
     key : str
-        Path of a number, name of a file, or row where the problem was found.
+        Place of the problem: the path of a number, the name of a file, or a row.
     got : object
         The invalid value.
     expected : str
@@ -147,4 +147,4 @@ class TakenError(RecordingError):
 
 
 class ForeignRecordingError(RecordingError):
-    """A recording was not written by plow_twin. Another program may have written it."""
+    """A recording was not written by plow_twin."""

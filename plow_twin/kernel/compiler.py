@@ -1,7 +1,7 @@
-"""The decorator of compiled functions: numba with a disk cache that is invalidated when any kernel changes.
+"""Decorator that compiles functions by numba, with a disk cache that is invalidated when any kernel changes.
 
-Numba's own cache checks only the file of the cached function, and misses changes in the functions that it calls. Here
-the cache entry of each function contains a digest of the source of all kernels.
+Numba's own cache checks only the file of the cached function, and misses changes in the functions that it calls. The
+decorator adds to each cache entry a digest of the source of all kernels.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numba.np import linalg
 
 from plow_twin.kernel.linked import EntryCompiler, LinkedCompiler, for_any_value, garbage_kept, keep_from_python
 
-#: Relaxations for `fast` kernels. Sums may be reordered and fused; NaN and infinity are handled correctly.
+#: Flags of LLVM for `fast` kernels. They allow LLVM to reorder and fuse sums, but not to neglect NaN or infinity.
 FASTMATH: Final = frozenset({"contract", "reassoc", "nsz", "arcp"})
 
 #: Text of the warning about the cache, once the warning has been issued.
@@ -72,11 +72,12 @@ def kernel(
     fast : bool
         Whether sums may be reordered and fused.
     inline : {"code", "source"}, optional
-        "code" inlines the function's LLVM code into its callers, "source" its Python source. A function with inlined
-        source can return records, unlike other functions of numba. However, it compiles more slowly and follows the
-        caller's `fast`.
+        "code" inlines the LLVM code of the function into its callers. "source" inlines the Python source. Only a
+        function with inlined source can return records. Its compilation takes longer, and its sums are reordered if the
+        caller is `fast`.
     entry : bool
-        Whether Python calls the function, too. The wrapper for calls from Python takes a tenth of the compile time.
+        Whether the function can be called from Python. The wrapper for calls from Python takes a tenth of the compile
+        time.
     """
     options: dict[str, Any] = {"fastmath": set(FASTMATH)} if fast else {}
     if inline == "source":
@@ -93,8 +94,8 @@ def kernel(
         cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
         if cache_file is not None:
             cache_file._source_stamp = SOURCE_DIGEST
-            # numba compares the version before it unpickles the index. Without this order, an index that contains a
-            # type that has been removed from the sources would raise an error.
+            # numba compares the version before it unpickles the index. If the index were unpickled first, a type that
+            # the sources no longer contain would raise an error.
             cache_file._version = f"{numba.__version__} {SOURCE_DIGEST}"
             if inline != "source" and not entry:
                 keep_from_python(dispatcher)
@@ -105,10 +106,9 @@ def kernel(
 
 
 def for_kernels(entry: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a copy of an entry, which is a kernel that Python calls, for calls from other kernels.
+    """Return a copy of an entry for calls from kernels. An entry is a kernel that Python calls.
 
-    If a kernel called the entry itself, numba would also optimise the entry alone, and would generate machine code that
-    is never run.
+    If a kernel called the entry itself, numba would generate additional machine code for the entry, which is never run.
     """
     function = getattr(entry, "py_func", None)
     if function is None:
@@ -152,10 +152,11 @@ def share(cache_file: Any) -> None:
     """Make numba's disk cache of a function safe for processes that compile at the same time.
 
     Numba names the files of machine code by numbers from the index, and writes the index first. If two processes
-    compile different signatures, one process could therefore store its code under the signature of the other process.
+    compile different signatures, the code of one signature could therefore be stored under the other signature.
 
-    Here the name of a file is a hash of its content, and the file is written before the index. Two processes that write
-    at the same time can still lose an entry of the index. The signature of this entry is then compiled again.
+    This function makes the name of a file a hash of its content, and the file is written before the index. Two
+    processes that write at the same time can still lose an entry of the index. The signature of this entry is then
+    compiled again.
 
     Parameters
     ----------
@@ -170,7 +171,7 @@ def share(cache_file: Any) -> None:
         with cache_file._open_for_write(cache_file._data_path(name)) as file:
             file.write(code)
         overloads = cache_file._load_index()
-        # an existing index is loaded as empty if it belongs to other sources; its compiled files are then deleted
+        # an index that belongs to different sources is loaded as empty, and its compiled files are deleted
         if not overloads and Path(cache_file._index_path).exists():
             for old in Path(cache_file._cache_path).glob(f"{glob.escape(stem)}*.nbc"):
                 if old.name != name:

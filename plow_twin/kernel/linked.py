@@ -3,7 +3,7 @@
 LLVM optimises a kernel together with every kernel that it calls. By default, numba would also optimise each called
 kernel alone and generate its machine code, which takes a quarter of the compile time. The first compiler omits these
 steps and returns LLVM code that callers can link. Both compilers use numba's extension point (numba's manual,
-"Customizing the Compiler"). Each has its own class of code library.
+"Customizing the Compiler"). Each compiler has its own class of code library.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class LinkedLibrary(JITCodeLibrary):
             self._dynamic_globals += library._dynamic_globals
             environments |= _environments(library._final_module)
         for name in self._exported:
-            # with this linkage each caller gets its own copy of the kernel, and can drop the copy after inlining it
+            # this linkage gives each caller its own copy of the kernel, which LLVM can delete after inlining
             whole.get_function(name).linkage = "linkonce_odr" if self.fast else "weak_odr"
         self._shared_module = whole
         self._final_module = _variables(self._codegen._create_empty_module(self.name), environments)
@@ -77,9 +77,9 @@ class EntryLibrary(JITCodeLibrary):
     """Code of a kernel that Python calls. It contains its own copy of every kernel that it calls.
 
     If entries shared copies, all entries would use the copies of the entry that is loaded first. These copies were
-    optimised for that entry, so their last bits may differ. The copies become internal before LLVM's optimisation, so
-    that LLVM inlines kernels with one caller. Copies of `fast` kernels become internal only after the optimisation,
-    because inlining may change the order of their sums.
+    optimised for the first entry, so the last bits of results would depend on the order of loading. The copies become
+    internal before LLVM's optimisation, so that LLVM inlines kernels with one caller. Copies of `fast` kernels become
+    internal only after the optimisation, because inlining may change the order of their sums.
     """
 
     def _optimize_final_module(self) -> None:

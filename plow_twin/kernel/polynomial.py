@@ -1,8 +1,8 @@
-"""First root and maximum of a polynomial on an interval, by its Bernstein form, which ensures that no root is missed.
+"""First root and maximum of a polynomial on an interval. The method (Bernstein form) misses no root.
 
 The values of a polynomial lie between its smallest and its largest Bernstein coefficient. The number of sign changes of
-the coefficients is an upper bound of the number of roots. Both bounds become sharper when the interval is halved
-(Farouki, Comput. Aided Geom. Des. 29 (2012) 379).
+the coefficients is an upper bound of the number of roots. The bounds of the values and of the number of roots become
+sharper when the interval is halved (Farouki, Comput. Aided Geom. Des. 29 (2012) 379).
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def first_root_within(g: Array, n: int, h: float, w) -> float:
     """Return the root of `first_root`, given the Bernstein coefficients in `w.halves[0]`.
 
     An interval without a negative Bernstein coefficient has no root. An interval with exactly one sign change has
-    exactly one root. Every other interval is halved, and its left half is searched first.
+    exactly one root. An interval with several sign changes is halved, and its left half is searched first.
     """
     b, bounds = w.halves, w.bounds
     bounds[0, 0], bounds[0, 1] = 0.0, h
@@ -199,7 +199,7 @@ def _narrowed(g: Array, n: int, h: float, best: float, w) -> float:
 
 @kernel()
 def shift_column(g: Array, lane: int, n: int, x: float, out: Array) -> None:
-    """Write the coefficients of g(x + t) to one column of `out`, where the same column of g contains a polynomial g."""
+    """Write the coefficients of g(x + t) to column `lane` of `out`, for the polynomial in column `lane` of `g`."""
     for k in range(n + 1):
         out[k, lane] = g[k, lane]
     for r in range(n):

@@ -348,7 +348,7 @@ def exponent_of(typingctx: Any, value: Any) -> Any:
 
 @_operation
 def significand_of(typingctx: Any, value: Any) -> Any:
-    """Return the significand in [1, 2) of the positive number in each lane: the number over 2^`exponent_of`."""
+    """Return the significand in [1, 2) of the positive number in each lane: the number divided by 2^`exponent_of`."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         bits = builder.and_(builder.bitcast(arguments[0], _BITS), _each(2**52 - 1))

@@ -48,8 +48,8 @@ from plow_twin.solve.state import (
 
 #: Tightest and loosest admissible tolerance.
 TOLERANCE_RANGE = (1e-13, 1e-1)
-#: Admissible error of one step divided by the tolerance. It is small because the errors of hundreds of steps add up,
-#: and because impacts amplify them.
+#: Admissible error of one step divided by the tolerance. This share is small, because the errors of hundreds of steps
+#: add up, and impacts amplify these errors.
 STEP_SHARE = 3e-4
 #: Largest admissible error of a step, relative to the length scale. It limits the error at loose tolerances.
 LARGEST_STEP_ERROR = 1e-6
@@ -206,7 +206,7 @@ class _Description:
 
 
 class _Unchanged(NamedTuple):
-    """Results that do not depend on the clearance. `values` contains the fields of `PARAMS` among these results."""
+    """Results that do not depend on the clearance. `values` contains those results that are fields of `PARAMS`."""
 
     loads: LoadSet
     acceleration: float  #: largest acceleration in m/s^2
@@ -414,7 +414,7 @@ def _segments(scene: Scene, pieces: Pieces) -> Segments:
 
 
 def law_terms(contact: Contact) -> tuple[Terms, float]:
-    """Return the terms of the contact law, and D of its damping factor D / v0, or -1 for a constant factor."""
+    """Return the terms of the contact law, and the number D of a damping factor D / v0, or -1 for a constant factor."""
     law, exponent = LAWS[contact.law], float(contact.exponent)
     viscous = law.additive and bool(contact.damping)
     number = -1.0 if contact.restitution is None else law.damping_number(contact.restitution)
@@ -494,8 +494,8 @@ def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
     """Return the penetration in m below which the impulse until separation is negligible.
 
     A pair that separates from the penetration d at the speed v receives the impulse K d^(n+1) / ((n+1) v). This impulse
-    must be small compared with the velocity tolerance, because there can be many separations, and some of them can be a
-    hundred times slower.
+    must be small compared with the velocity tolerance, because there can be many separations, and some separations can
+    be a hundred times slower than the speed v.
     """
     exponent = scene.contact.exponent
     share = 1e-5 if exponent == 1.5 or float(exponent).is_integer() else 1e-8
@@ -506,8 +506,8 @@ def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
         release = max(release, _NOISE * geometry.half_diagonal(scene))
     friction = scene.friction
     if friction is not None and friction.stick_stiffness_n_m is not None and friction.coefficient > 0.0:
-        # when a pair becomes RELEASED, the force of the spring at its sticking corner jumps to zero, so this force must
-        # be negligible, too
+        # when a pair becomes RELEASED, the force of the spring at its sticking corner jumps to zero, so this spring
+        # force must be negligible at the depth
         stretch = max(1e-3 * tol * length, 1e-15 * geometry.half_diagonal(scene))
         held = stretch * friction.stick_stiffness_n_m / friction.coefficient
         # a corner needs at least 1e-11 s to cross the depth; for a faster crossing, its series would have non-finite
@@ -535,7 +535,7 @@ def _implicit(scene: Scene, terms: Terms, values: dict[str, Any]) -> Implicit | 
     if terms.slip is not None:
         damping += values["friction"] * largest_force / values["slip_speed"]
     overdamped = damping * mobility > OVERDAMPED_RATIO * math.sqrt(spring * mobility)
-    # the motion on a support can be overdamped, too
+    # the dampers of a support can make the motion overdamped
     if scene.support is not None:
         overdamped |= bool((values["frame_damping"] > OVERDAMPED_RATIO * np.sqrt(values["frame_stiffness"])).any())
     return new_implicit(scene.support is not None) if overdamped else None

@@ -29,7 +29,7 @@ from plow_twin.solve.state import ON, Harmonics, Segments
 class Acting(NamedTuple):
     """Loads and terms of the equations of motion, without the terms of the contact law.
 
-    Scenes have few different combinations of these types, so they share compiled code.
+    Scenes with the same types in this tuple share compiled code.
     """
 
     harmonics: Harmonics | None
@@ -75,8 +75,8 @@ def push(p, slip, stick, state, frozen, pair, force, c, s, theta, omega, x, y, v
 def about_mass(p, c, s, load):
     """Return the head's angular acceleration due to a load that acts at the cavity's centre.
 
-    It follows from the moment of the load about the centre of mass. Gravity is part of the load, but acts at the centre
-    of mass, so its contribution is removed.
+    The acceleration follows from the moment of the load about the centre of mass. Gravity is part of the load, but acts
+    at the centre of mass, so the moment of gravity is subtracted.
     """
     across = (c * p.offset[0] - s * p.offset[1]) * (load[1] + p.gravity)
     return -(across - (s * p.offset[0] + c * p.offset[1]) * load[0]) * p.inverse_inertia / p.inverse_mass
@@ -84,10 +84,10 @@ def about_mass(p, c, s, load):
 
 @kernel()
 def accelerate(p, acts, frozen, state, t, z, load, out) -> None:
-    """Write the rate of z = (x, y, theta, vx, vy, omega) to `out`. With a support, z is that of `to_world_both`.
+    """Write the rate of z = (x, y, theta, vx, vy, omega) to `out`. With a support, `to_world_both` defines z.
 
-    If `frozen` is true, the pairs with mode ON exert the force of their law, even where it would pull. Otherwise all
-    penetrating pairs exert force, and no pair pulls.
+    If `frozen` is true, the pairs with mode ON exert the force of their law, even where this force would pull.
+    Otherwise all penetrating pairs exert force, and no pair pulls.
     """
     load_at(p, acts.harmonics, acts.segments, t, load)
     _accelerate(p, acts.offset, acts.free, acts.slip, acts.stick, acts.support, frozen, state, z, load, out)

@@ -1,4 +1,4 @@
-"""Energy balance of a run: comparison of the change of energy and momentum with the work and impulse of the forces.
+"""Energy balance of a run. Changes of energy and momentum are compared with the work and impulse of the forces.
 
 The forces are computed at single instants, independently of the series: loads from the time, and contact forces by
 `model.contact` and `model.friction`. Powers and forces are integrated by Gauss-Legendre quadrature over each step of

@@ -1,7 +1,7 @@
 """Detection of the first event of a step.
 
-A guard function is a polynomial over the step. It is positive as long as a pair keeps its mode. The first root of any
-guard function is the event. `polynomial.first_root` finds it.
+A guard function is a polynomial over the step. It is positive as long as a pair keeps its mode. The event is the
+earliest root of all guard functions (`polynomial.first_root`).
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def _second_guard(p, state, w, order, pair, viscous, hysteretic, integer, fracti
     The second guard function depends on the mode:
 
     - ON: 1 + lambda d', or the force F for a law with a ramp.
-    - CLIPPED: the opposite of ON, which is positive as long as the force would pull.
+    - CLIPPED: the function for ON with the opposite sign. It is positive as long as the force would pull.
     - RELEASED: p.release - d.
     """
     g, mode = w.column[0], state.mode[pair]
@@ -156,9 +156,9 @@ def _unsafe_pairs(w, order, h):
 def _nothing_ends(p, state, w, order, h, penetrating, hysteretic) -> bool:
     """Return whether no pair changes its mode on [0, h], for an integer exponent without a ramp.
 
-    The function combines the first test of `_unsafe_pairs` with the test of `_stays`, for all pairs at once. The
-    function does not count a positive linear term. The allowances for rounding ensure that every guard function that
-    passes this test would also pass the two other tests.
+    The function combines the first test of `_unsafe_pairs` with the test of `_stays`, for all pairs at once. A positive
+    linear term is ignored. The allowances for rounding ensure that every guard function that passes this test would
+    pass `_unsafe_pairs` and `_stays`.
     """
     weights = w.per_pair
     for pair in range(PAIR_COUNT):
@@ -184,7 +184,7 @@ def _nothing_ends(p, state, w, order, h, penetrating, hysteretic) -> bool:
 
 @kernel(inline="code")
 def _next_mode(p, mode, viscous, fraction, ramp):
-    """Return the mode after `mode`, when the first guard function of a pair becomes negative."""
+    """Return the mode that follows `mode` when the first guard function of a pair becomes negative."""
     if mode == OFF:
         return ON if fraction is None or p.exponent == 1.5 else RELEASED
     if mode == ON and viscous is not None and ramp is None:

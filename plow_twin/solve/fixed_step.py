@@ -76,10 +76,10 @@ def _runge_kutta(p, acts, state, t, dt, z, trial, k, load) -> None:
 def end_coarsely(p, parts, state, totals, target, bound) -> int:
     """Advance the state to `target` by the Runge-Kutta steps of `bound`, and estimate the error. Return a `Status`.
 
-    The error estimate of a step is |k2 - k3| dt / 3, computed from the two middle stages, and has one order less than
-    the method. Errors of the velocity are multiplied by the remaining time. If a pair touches or separates within a
-    step, the error of its impulse is F dt / 2. This error is multiplied by the time in which the largest load moves the
-    head across the clearance.
+    The error of a step is estimated from the two middle stages as |k2 - k3| dt / 3. The order of this estimate is one
+    less than the order of the method. Errors of the velocity are multiplied by the remaining time. If a pair touches or
+    separates within a step, the error of its impulse is F dt / 2. This error is multiplied by the time in which the
+    largest load moves the head across the clearance.
     """
     terms = parts.terms
     acts, y, size = acting(parts), state.y, 6 if terms.support is None else 12
@@ -89,7 +89,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
     dt = (target - start) / bound.steps
     _to_world(p, parts.terms.support, state, z)
     for pair in range(PAIR_COUNT):
-        # CLIPPED and RELEASED pairs penetrate, too, so they are treated as ON
+        # CLIPPED and RELEASED pairs penetrate their walls, so they are treated as ON
         state.mode[pair] = OFF if state.mode[pair] == OFF else ON
     pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
     state.bounded += 1

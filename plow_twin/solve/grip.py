@@ -39,7 +39,8 @@ from plow_twin.solve.state import (
 )
 
 #: A negative first value of a guard function is treated as rounding error up to the sum of two bounds. `_ROUNDING` is
-#: relative to its terms at the start of the step, `_ROUNDING_OVER_STEP` to its largest term over the step.
+#: relative to the terms of the function at the start of the step. `_ROUNDING_OVER_STEP` is relative to the largest term
+#: over the step.
 _ROUNDING, _ROUNDING_OVER_STEP = 1e-10, 1e-13
 #: Rounding error of a corner's position along its wall, divided by `Params.leverage`, and of its slip rate, divided by
 #: `Params.threshold[0]`.
@@ -88,7 +89,7 @@ def _normal_force(p, state, pair, depth):
 
 @kernel()
 def grasp(p, state, pair, old) -> None:
-    """Set the corner of a pair that begins to push: it sticks with a relaxed spring, or slips if |T| exceeds mu_s N.
+    """Make the corner of a pair that begins to push stick with a relaxed spring, or slip if |T| exceeds mu_s N.
 
     N is computed from the previous mode `old`, because rounding of the depth would otherwise determine the result. At a
     touch, N is the force at depth 0, which is the force of the Kelvin-Voigt damper. For a CLIPPED pair, N is 0.
@@ -160,8 +161,7 @@ def grip_guard(p, state, w, order, pair, side) -> int:
     """Write a guard function of a corner to `w.column[0]`. Return the event of its root, or 0 without a guard function.
 
     A sticking corner has two guard functions, mu_s N -+ T, one for each direction of slip (`side`). A slipping corner
-    has one guard function, for side 0. This function is the condition for slip in the docstring of this module, times
-    dt/dsigma.
+    has one guard function, for side 0. It is the condition for slip in the docstring of this module, times dt/dsigma.
     """
     g, rate, force, drag = w.column[0], w.slip[0], w.force, w.slip[4]
     grip = state.grip[pair]

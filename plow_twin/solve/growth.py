@@ -1,4 +1,4 @@
-"""Growth of errors along a motion, from the fundamental matrices of successive stretches of time."""
+"""Computation of the growth of errors from the fundamental matrices of successive stretches of a motion."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from plow_twin.kernel.compiler import kernel
 #: Largest number of earlier times from which the growth of errors is computed. When this number is reached, every
 #: second time is removed.
 MOST_KEPT: Final = 256
-#: `_SQUARINGS`: largest number of squarings of a matrix. After this number, singular values whose ratio is within 1e-6
-#: of 1 are treated as equal. `_RANK_ONE`: a matrix with trace 1 is treated as having rank one if the trace of its
-#: square is larger than this value; the squarings then end.
+#: `_SQUARINGS`: largest number of squarings of a matrix. After these squarings, two singular values are treated as
+#: equal if their ratio is within 1e-6 of 1. `_RANK_ONE`: a matrix with trace 1 is treated as having rank one if the
+#: trace of its square is larger than this value. In this case the squarings end.
 _SQUARINGS, _RANK_ONE = 18, 1.0 - 1e-9
 
 
@@ -157,9 +157,14 @@ def follow_growth(matrices, changes, ends, since, kept, whole, basis, scratch, t
         Orthonormal basis. Updated at the end of each stretch.
     scratch : ndarray, shape (5 + s, k, k)
         Scratch space, with at least m numbers after the first five matrices.
-    totals, rows, growth, logs : ndarray, shapes (n, k, k), (n, p, k), (n,) and (n, k)
-        Arrays that receive the products, the effects of the parameters, the largest growth since an earlier time, and
-        the logarithms of the growth factors of the basis vectors.
+    totals : ndarray, shape (n, k, k)
+        Array that receives the products of the fundamental matrices.
+    rows : ndarray, shape (n, p, k)
+        Array that receives the effects of the parameters.
+    growth : ndarray, shape (n,)
+        Array that receives the largest growth since an earlier time.
+    logs : ndarray, shape (n, k)
+        Array that receives the logarithms of the growth factors of the basis vectors.
     """
     most = since.shape[2]
     for index in range(len(matrices)):

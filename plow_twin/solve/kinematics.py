@@ -32,7 +32,7 @@ _roll = by_field("roll", lambda p: p.roll, lambda p: 0.0)
 
 @kernel(inline="code")
 def along(p, c, s):
-    """Return cosine and sine of the angle of the state's axes. The arguments c and s belong to the head's angle."""
+    """Return cosine and sine of the angle of the state's axes, from cosine c and sine s of the head's angle."""
     if fixed_axes(p) is not None:
         return 1.0, 0.0
     return c, s

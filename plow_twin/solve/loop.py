@@ -121,8 +121,8 @@ def _clear(totals) -> None:
 def _undo(support, state, w, target) -> None:
     """Undo a failed advance: set the time to `target`, and the head to its state and wear before the advance.
 
-    If the advance began within a step, this step ends there. `w.saved_y` and `w.saved_wear` contain the saved state and
-    wear.
+    If the advance began within a step, this step is shortened to the time before the advance. `w.saved_y` and
+    `w.saved_wear` contain the saved state and wear.
     """
     set_row(state.y, 0, row(w.saved_y, 0))
     set_row(state.wear_depth, 0, row(w.saved_wear, 0))
@@ -212,17 +212,23 @@ def advance_rows(
 
     Parameters
     ----------
-    params, states : ndarray of records, shape (m,)
-        Constants and states of all members.
-    saved, work, totals : ndarray of records, shape (1,)
-        State before the current advance, scratch space, and sums. If `totals` is None, no sums are computed and no rows
-        are written. The motion is the same.
+    params : ndarray of records, shape (m,)
+        Constants of all members.
+    states : ndarray of records, shape (m,)
+        States of all members.
+    saved : ndarray of records, shape (1,)
+        State before the current advance.
+    work : ndarray of records, shape (1,)
+        Scratch space.
+    totals : ndarray of records, shape (1,), or None
+        Sums over an advance. With None, no sums are computed and no rows are written. The motion does not depend on
+        this choice.
     times : ndarray, shape (n,)
         Times in s, not decreasing.
     wrench : ndarray, shape (m, n + 1, 3), or None
-        Samples of the load, divided by mass and inertia: the sample before the first time, then the sample at each
-        time. The load is interpolated linearly between samples, and a step ends at each time. None selects the loads of
-        the scene.
+        Samples of the load, divided by mass and inertia. The sample before the first time precedes the samples at the
+        times. The load is interpolated linearly between samples, and a step ends at each time. None selects the loads
+        of the scene.
     rows : ndarray of `ROW`, shape (m, n), or None
         Array that receives the motion and the totals at each time, or None without `totals`.
     marks : ndarray of int64, shape (k,)
@@ -237,7 +243,8 @@ def advance_rows(
     Returns
     -------
     bool
-        Whether all advances are done. If not, the caller checks its limits and calls again with the same `pace`.
+        Whether all advances are done. Otherwise, the caller checks its limits and repeats the call with the same
+        `pace`.
     """
     parts, states = _unowned_loads(parts), unowned(states)
     w, count = work[0], times.size

@@ -33,8 +33,8 @@ from plow_twin.solve.state import (
     Y,
 )
 
-#: Largest penetration that is treated as zero, divided by the release penetration. The same ratio applies to speeds,
-#: relative to the speed that reaches the release penetration.
+#: Largest penetration that is treated as zero, divided by the release penetration. A speed is treated as zero below the
+#: same ratio times the speed that reaches the release penetration.
 SHALLOW = 1e-3
 #: Number of iterations in which damping and impact speed of a pair that starts in contact are computed in turn.
 _ROUNDS = 8
@@ -53,7 +53,7 @@ def penetration_and_rate(p, state, pair):
 
 @kernel()
 def _fallen_number(p, y, pair, speed):
-    """Return D for a restitution that decreases with the impact speed (`model.scene.Contact`).
+    """Return the damping number D for a restitution that decreases with the impact speed (`model.scene.Contact`).
 
     `speed` is the speed of approach in m/s.
     """
@@ -95,8 +95,8 @@ def _impact_speed(number, rate, energy) -> float:
     if number <= 0.0 or (energy <= 0.0 and rate == 0.0):
         return 0.0
     full = number - math.log1p(number)
-    # `low` is the speed of the impact that has this energy at its turning point, where the rate is zero; with another
-    # rate, the impact was faster
+    # `low` is the speed of the impact that has this energy at its turning point, where the rate is zero; a rate other
+    # than zero means that the impact was faster
     low = math.sqrt(number * number * energy / full)
     high = max(low, abs(rate)) * (1.0 + number)
     low = max(low, rate, -number * rate)

@@ -25,7 +25,7 @@ POINT = np.dtype(
         )
     ]
 )  # fmt: skip
-#: Number of steps per duration of the undamped impact, and longest impact divided by this duration.
+#: `_STEPS`: number of steps per duration of the undamped impact. `_LONGEST`: longest impact divided by this duration.
 _STEPS, _LONGEST = 800, 20
 
 
@@ -70,12 +70,16 @@ def strike_points(point, damping, normal_arm, tangential_arm, inertia, speed, sl
     point : ndarray of POINT, shape (1,)
     damping : ndarray, shape (m,)
         Damping factor lambda of each impact in s/m.
-    normal_arm, tangential_arm : ndarray, shape (m,)
-        Position of the touching point relative to the centre of mass in m, along the wall and away from the wall.
+    normal_arm : ndarray, shape (m,)
+        Position of the touching point along the wall in m, relative to the centre of mass.
+    tangential_arm : ndarray, shape (m,)
+        Position of the touching point away from the wall in m, relative to the centre of mass.
     inertia : float
         Square of the radius of gyration in m^2.
-    speed, slip : ndarray, shape (m,)
-        Speed of the point in m/s, towards the wall (> 0) and along the wall.
+    speed : ndarray, shape (m,)
+        Speed of the point towards the wall in m/s, above 0.
+    slip : ndarray, shape (m,)
+        Speed of the point along the wall in m/s.
     impulse : ndarray, shape (m, 2)
         Array that receives the impulses in m/s.
     """

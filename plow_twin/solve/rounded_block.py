@@ -41,8 +41,8 @@ _STEPS = 70.0
 _SLOWEST, _LEAST, _LARGEST = 0.01, 0.05, 0.9
 #: Impact speed in m/s below which restitution and friction are constant.
 _SMALLEST_IMPACT = 0.05
-#: Reference mobility of a corner times the mass, relative to which the effective mass of an impact is computed. The
-#: reference is the value for a uniform square that lands on the end of an edge.
+#: Mobility of a corner times the mass, for a uniform square that lands on the end of an edge. The effective mass of an
+#: impact is computed relative to this value.
 _USUAL_MOBILITY = 1.5
 
 
@@ -141,7 +141,8 @@ def toss_blocks(blocks, numbers, scatter, dt, rows) -> None:
         Damping numbers D for evenly spaced restitutions from 0 to 1.
     scatter : ndarray, shape (m, touches, 3)
         Scatter of each touch: a term added to the restitution, a term added to the logarithm of friction, and the
-        distance [m] of the normal force from the lowest point of the corner. Later touches use the last row.
+        distance [m] of the normal force from the lowest point of the corner. Touches beyond the last row use the last
+        row.
     dt : float
         Time between rows in s.
     rows : ndarray, shape (m, n, 6)

@@ -1,4 +1,4 @@
-"""Factors of a pad's wear other than force and travel along the face: in-plane sliding and running-in.
+"""Factors of a pad's wear by in-plane sliding and by running-in. These factors multiply the wear by force and travel.
 
     dh/dt = (k_s v / A) F sqrt(1 + (s' / v)^2) (1 + a exp(-h / h0))
 

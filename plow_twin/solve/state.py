@@ -1,6 +1,6 @@
 """Record types of the compiled kernels: constants of a scene, dynamic state, scratch space and totals.
 
-A part that a scene does not have is `None`. `None` has its own type in the compiled signature, so numba does not
+A part that is absent from a scene is `None`. `None` has its own type in the compiled signature, so numba does not
 compile the code of this part.
 """
 
@@ -33,10 +33,10 @@ CLIPPED: Final = 2
 #: Mode for exponents that are not integers: the penetration is less than `Params.release`, so the force of the pair is
 #: negligible.
 RELEASED: Final = 3
-#: Result of an event that leaves the mode unchanged: the penetration crosses the end of the damping ramp.
+#: Code of the event at which a penetration crosses the end of the damping ramp. This event does not change the mode.
 CROSSING: Final = 4
-#: Results of further events that leave the mode unchanged: a corner starts to slip along its wall, forward or backward,
-#: or starts to stick.
+#: Codes of the events at which a corner starts to slip forward along its wall, to slip backward, or to stick. These
+#: events do not change the mode.
 SLIPS_FORWARD: Final = 5
 SLIPS_BACKWARD: Final = 6
 STICKS: Final = 7
@@ -88,8 +88,8 @@ _STATUS_TEXT: Final = {
 }
 
 
-# The types below are records instead of tuples of arrays. A kernel then receives a single pointer, the shapes of arrays
-# are constants, and there is no reference counting.
+# Because the types below are records instead of tuples of arrays, a kernel receives a single pointer, and the shapes of
+# arrays are constants. There is no reference counting.
 
 _ROWS: Final = MAX_ORDER + 1
 _WIDE: Final = (_ROWS, PAIR_COUNT)
@@ -303,7 +303,7 @@ WORK: Final = np.dtype(
         ("damping", "f8", (3, 3)),
         ("rub", "f8", (6, *_WIDE)),  # wear: s' / v, sliding distance per travel, force times this distance; running-in
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
-        # most recent advance out of range: angle [rad], largest penetration [m], and index of this pair
+        # most recent advance out of range: angle [rad], largest penetration [m], and index of its pair
         ("beyond", "f8", (3,)),
     ]
 )
@@ -351,7 +351,7 @@ ROW: Final = np.dtype(
         ("measured_peak", "f8", (PAIR_COUNT,)),  # largest force in these advances
         ("held", "i8"),  # 1 if there was no sample for the stamp, so that the load was held constant
         ("corrected", "i8"),  # 1 if late samples have changed the motion since the previous publication
-        ("marked", "i8"),  # 1 if `held` or `corrected` is 1, in this publication or the previous one
+        ("marked", "i8"),  # 1 if `held` or `corrected` is 1, in the current or the previous publication
         ("orientation", "f8", (2,)),  # z and w of the head's quaternion
         ("twist", "f8", (3,)),  # rates along the head's own axes [m/s], and about z [rad/s]
         # The following fields are filled if the motion follows measurements. They contain the 5 % and 95 % quantiles
@@ -383,7 +383,7 @@ Segments: TypeAlias = NDArray[np.void]
 
 
 class Terms(NamedTuple):
-    """Terms of the equations of motion: 1 for a term that is present, `None` otherwise.
+    """Terms of the equations of motion. A term that is present is 1, and a term that is absent is `None`.
 
     `Params` contains the constants of the terms. The types of the terms are part of the compiled signature. Kernels
     take the terms as separate arguments, because numba omits a branch from the compiled code only if a separate
@@ -399,7 +399,7 @@ class Terms(NamedTuple):
     fraction: int | None  #: an exponent that is not an integer
     ramp: int | None  #: C increases with the penetration over a ramp
     wear: int | None
-    sliding: int | None  #: in-plane sliding causes wear, too
+    sliding: int | None  #: in-plane sliding adds to the wear
     running_in: int | None  #: new pads wear faster
     offset: int | None  #: the centre of mass is not at the cavity's centre
     free: int | None  #: at least one degree of freedom is locked
@@ -440,7 +440,7 @@ PACE: Final = np.dtype(
         ("slice", "i8"),  # number of steps in a slice
         ("left", "i8"),  # number of steps left in the slice
         ("row", "i8"),  # index of the next advance; all advances of one member precede those of the next member
-        ("underway", "i8"),  # 1 if this advance has started
+        ("underway", "i8"),  # 1 if the advance `row` has started
         ("mark", "i8"),  # index of the next element of `marks` (see `advance_rows`)
         ("failed", "i8"),
     ]

@@ -26,7 +26,7 @@ from plow_twin.solve.state import COS, CROSSING, OFF, ON, RELEASED, SIN, SLIPS_F
 from plow_twin.solve.totals import log_event
 from plow_twin.solve.tumbling import turn_at, turn_corners
 
-#: Methods in the order in which a step tries them. The order also appears in `lay_out_step`, which calls them by name.
+#: Methods in the order in which a step tries them. `lay_out_step` calls the methods by name, in the same order.
 METHODS: Final[tuple[Method, ...]] = (flight, rest, implicit, taylor)
 #: Longest step in s. This bound ensures that all powers of a step are finite.
 LONGEST_STEP = 100.0

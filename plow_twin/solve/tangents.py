@@ -10,9 +10,10 @@ column satisfies
     dd   = n . xi - arm phi + de,             dd' its rate,     dF = F_d dd + F_d' dd' + the change by the law's
     constants
 
-where n contains the coefficients of X and Y in a penetration, and de is the change of this penetration by a clearance.
-dtau is the derivative of the contacts' moment with respect to the angle. The coefficients of these equations are series
-over the step, so each order of a column is a sum of Cauchy products. Eight columns are computed in one vector.
+where d and F are penetration and force of a pair, n contains the coefficients of X and Y in the penetration, and de is
+the change of the penetration by a clearance. df and dF are the changes of f and F. dtau is the derivative of the
+contacts' moment with respect to the angle. The coefficients of these equations are series over the step, so each order
+of a column is a sum of Cauchy products. Eight columns are computed in one vector.
 
 At a touch the Kelvin-Voigt force jumps by C d'. The displaced motion touches earlier by the time dd / d'. When the
 undisplaced motion touches, the displaced motion has therefore already received the impulse C dd. At all other changes
@@ -37,7 +38,7 @@ from plow_twin.solve.step import complete_step, lay_out_series_step
 
 #: Number of columns that are computed in one vector.
 WIDTH: Final = 8
-#: Number of columns that are derivatives with respect to the state. The derivatives by parameters follow.
+#: Number of columns that are derivatives with respect to the state. They precede the derivatives by parameters.
 STATE_COLUMNS: Final = 6
 #: Indices of the components of a column.
 PLACE_X, PLACE_Y, PLACE_THETA, RATE_X, RATE_Y, RATE_THETA = range(6)
@@ -56,7 +57,7 @@ COLUMNS: Final = np.dtype(
         ("force", "f8", _OF_PAIRS),
         ("load", "f8", (3, _ROWS, WIDTH)),  # change of the load per mass and inertia, in world axes
         ("now", "f8", (6, WIDTH)),  # columns in head axes at the start of the step
-        ("factor", "f8", _EIGHT),  # change of each pair's lambda
+        ("factor", "f8", _EIGHT),  # change of each pair's damping factor lambda
         ("edge", "f8", _EIGHT),  # derivative of each pair's penetration with respect to a clearance
         ("constant", "f8", (3, WIDTH)),  # derivative of the constant load
         ("stiffness", "f8", (WIDTH,)),
@@ -423,7 +424,7 @@ def follow_columns(
     p, parts, state, w, along, columns, omegas, amplitudes, curved, ends, room, longest_wait, reached, budget, out,
     whole,
 ) -> int:  # fmt: skip
-    """Advance a motion and its columns to each of the times `ends`. A new stretch begins there if possible.
+    """Advance a motion and its columns to each of the times `ends`. If possible, a new stretch begins at each time.
 
     Parameters
     ----------

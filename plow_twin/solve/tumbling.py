@@ -1,8 +1,8 @@
 """Tumbling of a block: its corners are renamed when it turns beyond 45 degrees, and after each further quarter turn.
 
 Up to 45 degrees, the corner with the name bottom left is the lower left corner. Beyond 45 degrees, another corner
-becomes the lower left corner and receives this name. The state of each pair (mode, damping, anchor) is copied to the
-pair with the same wall and the corner's new name.
+becomes the lower left corner and receives the name bottom left. The state of each pair (mode, damping, anchor) is
+copied to the pair with the same wall and the corner's new name.
 
 A square block looks the same after a quarter turn, so the coefficients of its geometry do not change. The angle whose
 cosine and sine are in the state changes by 90 degrees (`kinematics.named_angle`).
@@ -20,8 +20,8 @@ from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import COS, OFF, OMEGA, ON, RELEASED, SIN, THETA
 from plow_twin.solve.totals import log_event
 
-#: The two pairs of each wall: the pair of the corner that leads in a counter-clockwise turn, and the pair of the other
-#: corner.
+#: The two pairs of each wall. The corner of the first pair leads in a counter-clockwise turn, and the corner of the
+#: second pair trails.
 _HANDED_OVER = tuple(
     (PAIR_NAMES.index(leading), PAIR_NAMES.index(following))
     for leading, following in (
