@@ -1,8 +1,9 @@
 """Contact forces with intervals, from an ensemble of twins whose parameters are drawn from an estimate.
 
-Clearances, contact parameters and load gains of each twin (member) are drawn from the estimate with their correlation.
-The interval of a force consists of quantiles over the members. After some load periods the initial states have no
-influence, so the differences between members show only the uncertainty of the estimate.
+A twin of the ensemble is called a member. The clearances, the contact parameters and the load gains of each member are
+drawn from the estimate with their correlations. The ends of a force's interval are quantiles of this force over the
+members. After some load periods the initial states have no influence, so the differences between members show only the
+uncertainty of the estimate.
 """
 
 from __future__ import annotations
@@ -25,17 +26,19 @@ from plow_twin.run.batch import TwinBatch
 
 Array = NDArray[np.float64]
 
-#: Default number of members, derived from a standard error of 1.4 % of the probability below the 5 % quantile.
+#: Default number of members. It is derived from the standard error of the probability below the 5 % quantile, which is
+#: 1.4 %.
 MEMBERS: Final = 256
-#: Definition of an interval: probabilities of its lower end, its middle and its upper end.
+#: Definition of an interval by three probabilities, for its lower end, its middle and its upper end.
 POINTS: Final = (0.05, 0.5, 0.95)
-#: Smallest number of members, derived from the 5 % quantile, below which at least one member must lie.
+#: Smallest number of members. It is derived from the condition that at least one member lies below the 5 % quantile.
 FEWEST: Final = 20
 #: Lower bound on the clearance of a member, as a share of the estimated clearance.
 _LEAST_SHARE = 0.02
 #: Tolerance of the solver for the members, equal to the tolerance in a fit.
 TOLERANCE: Final = tuning.TOLERANCE
-#: Upper bound on the number of samples in one call, so that the rows of all members stay in the processor's cache.
+#: Upper bound on the number of samples in one call. With this bound, the rows of all members fit into the processor's
+#: cache.
 _CALL = 10
 
 
@@ -51,7 +54,7 @@ class Forces:
     t : (n,) times in s
     force : (3, n, 8) force of each pair at the times `t` in N
     peak, impulse : (3, 8) largest force in N and impulse in N s of each pair from `start` to the end
-    members, left_out : number of members within the range of the model, and number of members that have left this range
+    members, left_out : numbers of members that are within the range of the model, and that have left this range
     """
 
     start: float
@@ -128,7 +131,7 @@ class ForceEnsemble:
         wrench : ndarray, shape (n, 3)
             Fx, Fy [N] and M [N m].
         over_time : bool
-            Whether the forces at each sample are computed, which doubles the cost; otherwise they are 0.
+            Whether the forces at each sample are computed, which doubles the cost. If not, the field `force` is 0.
 
         Raises
         ------
@@ -166,9 +169,9 @@ def quantiles(values: Array) -> Array:
 def forces_of(
     scene: Scene, found: Estimate, load: Load, members: int, settle_s: float, *, over_time: bool = True
 ) -> Forces:
-    """Return the forces under a load from the time `settle_s` [s] after its first sample on.
+    """Return the forces under a load, beginning `settle_s` [s] after the first sample of the load.
 
-    By then the initial states of the members have no influence.
+    The time `settle_s` must be so long that the initial states of the members have no more influence on the forces.
     """
     ensemble = ForceEnsemble(scene, found, members, start=float(load.t[0]))
     load = load.with_knot(float(load.t[0]) + settle_s)
@@ -220,8 +223,8 @@ def draw_biases(found: Estimate, members: int, rng: np.random.Generator) -> Arra
 
 
 def amplitudes_of(found: Estimate, members: int, rng: np.random.Generator) -> Array:
-    """Return amplitudes of the load's harmonics drawn from an estimate, shape (m, k, 3); the first member has the
-    means.
+    """Return amplitudes of the load's harmonics drawn from an estimate, shape (m, k, 3). The first member has the mean
+    amplitudes.
     """
     harmonics = found.load_harmonics
     return np.zeros((members, 0, 3)) if harmonics is None else harmonics.drawn(members, rng)
@@ -230,7 +233,8 @@ def amplitudes_of(found: Estimate, members: int, rng: np.random.Generator) -> Ar
 def loads_of(t: Array, wrench: Array, gain: Array, harmonics: Harmonics | None, amplitude: Array) -> Array:
     """Return the loads of the members, shape (m, n, 3).
 
-    `t` (n,) and `wrench` (n, 3) are samples; `gain` (m, 3) and `amplitude` (m, k, 3) belong to the members.
+    The samples have the times `t`, shape (n,), and the values `wrench`, shape (n, 3). The load of a member has the
+    gains of a row of `gain`, shape (m, 3), and the amplitudes of harmonics in `amplitude`, shape (m, k, 3).
     """
     if harmonics is not None:
         wrench = wrench + harmonics.basis(t) @ amplitude

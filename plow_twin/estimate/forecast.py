@@ -1,7 +1,7 @@
 """Forecast of the remaining life, which is the time until a clearance reaches its limit, as a distribution.
 
-Wear coefficient, present clearances and size of the load are drawn at random. Scenarios repeat the forecast with
-another load or another wear coefficient, and with the same random numbers.
+The wear coefficient, the present clearances and the size of the load are drawn at random. A scenario repeats the
+forecast with the same random numbers, but with a different load or wear coefficient.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _LEAST_SHARE = 0.9
 
 @dataclass(frozen=True)
 class Scenario:
-    """Another load and another wear coefficient, as multiples of the expected load and coefficient."""
+    """A scenario of a forecast: multiples of the expected load and of the expected wear coefficient."""
 
     name: str
     load: float = 1.0
@@ -46,7 +46,7 @@ class Scenario:
         Raises
         ------
         LifeError
-            If the text has another form, or a multiple is not above 0.
+            If the text has a different form, or a multiple is not above 0.
         """
         name, _, given = text.partition(":")
         numbers = {}
@@ -64,7 +64,7 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Plan:
-    """Limits of the clearances [m], horizon and planned stop [h], operation of the machine, and number of draws."""
+    """Settings of a forecast, such as the limits of the clearances [m], the horizon [h] and the planned stop [h]."""
 
     limit_horizontal_m: float
     limit_vertical_m: float
@@ -72,7 +72,7 @@ class Plan:
     stop_h: float | None = None
     face_length_m: float = 250.0
     shift_h: float = 8.0
-    #: relative standard deviation of the load's size
+    #: relative standard deviation of the size of the load
     load_deviation: float = 0.05
     draws: int = 2000
     seed: int = 0
@@ -108,7 +108,7 @@ class Forecast:
     now : (draws, 2) present clearances in m
     speed_m_s : travel speed in m/s
     plan : the plan of this forecast
-    path : wear from the present clearances on
+    path : wear path that begins at the present clearances
     scenarios : forecast of each scenario of the plan, by name
     """
 
@@ -121,7 +121,9 @@ class Forecast:
     scenarios: dict[str, Forecast] = field(default_factory=dict)
 
     def quantile(self, share: float) -> float | None:
-        """Return the hours within which the limit is reached with probability `share`; None beyond the horizon."""
+        """Return the number of hours within which the limit is reached with the probability `share`; None beyond the
+        horizon.
+        """
         value = float(np.sort(self.hours)[min(int(share * len(self.hours)), len(self.hours) - 1)])
         return value if math.isfinite(value) else None
 
@@ -130,9 +132,10 @@ class Forecast:
         return float(np.mean(self.hours <= hours))
 
     def clearances(self, hours: Array) -> Array:
-        """Return the 10 %, 50 % and 90 % quantiles of both clearances in m after n numbers of hours, shape (3, n, 2).
+        """Return quantiles of both clearances in m after `hours`, shape (n,). The result has the shape (3, n, 2).
 
-        A quantile is infinite beyond the end of the path, where a limit has been reached.
+        The quantiles are the 10 %, the 50 % and the 90 % quantile. A quantile is infinite if it lies beyond the end of
+        the path, at which a limit has been reached.
         """
         grown = self.path.clearance_growth()
         exposure = np.multiply.outer(self.rate, hours)
@@ -193,8 +196,9 @@ def forecast(
     deviation_m : tuple of float
         Standard deviations of the present clearances in m.
     known : Coefficient or None
-        Posterior of the wear coefficient from a history of clearances; None for the prior. The posterior already
-        includes the uncertainty of the load, so only the model error `tuning.PATH_DEVIATION` is drawn in addition.
+        Posterior of the wear coefficient from a history of clearances; None for the prior. The posterior includes the
+        uncertainty of the load. With a posterior, the size of the load is therefore not drawn, but the model error
+        `tuning.PATH_DEVIATION` is drawn.
 
     Raises
     ------
@@ -228,7 +232,7 @@ def _forecast(
     # a drawn clearance must stay above zero, even if the clearance is very uncertain
     now = np.maximum(rng.normal(0.0, 1.0, (plan.draws, 2)) * deviation_m, -_LEAST_SHARE * size)
     most = float(coefficient.max() * load.max()) * travel / wear.pad_area_m2
-    # the path must be long enough for the smallest drawn clearance, which is farthest from its limit
+    # the path must be so long that even the smallest drawn clearance, which is farthest from its limit, reaches it
     spare = tuple(float(value) for value in -now.min(axis=0))
     limit = (plan.limit_horizontal_m + spare[0], plan.limit_vertical_m + spare[1])
     path = wear_path(scene, limit, most)
@@ -246,7 +250,7 @@ def _forecast(
 
 
 def check_prior(wear: Wear) -> None:
-    """Raise `LifeError` if the wear coefficient of the scene lies outside the prior, from which forecasts are drawn."""
+    """Raise `LifeError` if the wear coefficient of the scene lies outside the prior that forecasts use."""
     low, high = wear.prior_m2_n
     if not low <= wear.coefficient_m2_n <= high:
         raise LifeError(
@@ -256,7 +260,9 @@ def check_prior(wear: Wear) -> None:
 
 
 def _exposure_at(exposure: Array, clearance: Array, limit: Array) -> Array:
-    """Return the exposure at which a non-decreasing clearance reaches each limit; infinite for a limit not reached."""
+    """Return the exposure at which a non-decreasing clearance reaches each limit; it is infinite for a limit out of
+    reach.
+    """
     rising = np.maximum.accumulate(clearance) + 1e-15 * np.arange(len(clearance))
     at = np.interp(limit, rising, exposure)
     return np.where(limit > rising[-1], np.inf, np.where(limit <= rising[0], 0.0, at))
@@ -280,11 +286,11 @@ def with_load(scene: Scene, multiple: float) -> Scene:
 
 
 def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth: Array | None = None) -> Scene:
-    """Return the scene with estimated clearances, which include all wear so far.
+    """Return the scene with estimated clearances, which are clearances of worn pads.
 
     `depth`, shape (8,), contains the wear depths of the pads in m, which are subtracted to obtain the clearances of new
-    pads. If the depths are not given, but the scene has running-in, the depths are computed from the growth of the
-    clearances. With running-in, worn pads wear more slowly than new pads.
+    pads. If the depths are not given but the scene has running-in, the depths are computed from the growth of the
+    clearances. The depths matter because with running-in, worn pads wear more slowly than new pads.
     """
     wear, new = scene.wear, scene.clearance
     if wear is None:
@@ -292,7 +298,7 @@ def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth:
     if depth is None:
         depth = np.zeros(PAIR_COUNT)
         if wear.running_in_ratio > 1.0:
-            # each of the two walls is assumed to have half of the growth
+            # each of two opposite walls is assumed to contribute half of the growth of the clearance
             depth += 0.5 * max(horizontal_m - new.horizontal_m, 0.0) * np.abs(NORMAL_X)
             depth += 0.5 * max(vertical_m - new.vertical_m, 0.0) * np.abs(NORMAL_Y)
     grown = 0.5 * depth @ np.abs(NORMAL_X), 0.5 * depth @ np.abs(NORMAL_Y)
@@ -303,8 +309,8 @@ def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth:
 def with_estimate(scene: Scene, facts: Mapping[str, Any]) -> tuple[Scene, tuple[float, float]]:
     """Return the scene with the values of an estimate (JSON), and the standard deviations of the clearances in m.
 
-    If a clearance was estimated, the estimated contact is used too, because the stiffness determines which pads are
-    loaded.
+    If a clearance was estimated, the estimated contact parameters are used, because the stiffness determines which pads
+    are loaded.
 
     Raises
     ------

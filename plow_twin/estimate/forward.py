@@ -20,17 +20,17 @@ from plow_twin.solve.state import EVENT, SEGMENT, TOTALS, Parts, Status, new_rec
 
 Array = NDArray[np.float64]
 
-#: Upper bounds on one simulation: number of steps per second of motion, number of steps in addition, and number of rows
-#: in the event log.
+#: Upper bounds on one simulation. The number of steps is at most `_STEPS` plus `_STEPS_PER_SECOND` for each second of
+#: motion. The event log has at most `_LOG_SIZE` rows.
 _STEPS_PER_SECOND, _STEPS = 20_000, 2_000
 _LOG_SIZE = 4096
-#: Cost of an implicit step in steps of the series, which counts towards the bound of the work.
+#: Cost of an implicit step, expressed as a number of series steps. The cost counts towards the upper bound on the work.
 _IMPLICIT_WORK = 10
 
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """Result of simulations: poses and rates of all rows, shape (n, 3) each, and contact times in s, shape (s, 8)."""
+    """Poses and rates of all rows of s simulations, shape (n, 3) each, and contact times in s, shape (s, 8)."""
 
     q: Array
     v: Array
@@ -79,11 +79,11 @@ class Forward:
         return Forward(self._scene, self.load)
 
     def of(self, scene: Scene) -> Forward:
-        """Return a model of another nominal scene under the same load, with the work counter at zero."""
+        """Return a model of the nominal scene `scene` under the load of this model, with the work counter at zero."""
         return Forward(scene, self.load)
 
     def under(self, load: Load) -> Forward:
-        """Return a model of the same nominal scene under another load, with the work counter at zero."""
+        """Return a model of this nominal scene under the load `load`, with the work counter at zero."""
         return Forward(self._scene, load)
 
     def run(
@@ -95,7 +95,7 @@ class Forward:
         Parameters
         ----------
         starts, states : ndarray, shape (s,), (s, 6)
-            Times in s at which the simulations begin, and x, y, theta and their rates at these times.
+            Times in s at which the simulations begin, and the states (x, y, theta and their rates) at these times.
         edges : ndarray of int64, shape (s + 1,)
             Simulation m fills the rows edges[m]:edges[m + 1].
         times : ndarray, shape (n,)

@@ -1,9 +1,8 @@
-"""Clearances from gap sensors, independent of the contact law, and poses if they are not measured otherwise.
+"""Clearances from gap sensors, independent of the contact law. If no poses are measured, the gaps give the poses.
 
-A gap is linear in the clearances and in the head's body coordinates (`model/geometry.py`). Each message with enough
-gaps therefore determines clearances and pose by least squares. Gaps of five pairs are enough. If theta is measured,
-gaps of four pairs are enough, one at each wall. The accuracy is limited by the constant errors of the sensors, which
-averaging does not reduce.
+A gap is linear in the clearances and in the head's body coordinates (`model/geometry.py`). A message with gaps of five
+pairs therefore determines clearances and pose by least squares. If theta is measured, gaps of four pairs are enough,
+one at each wall. The accuracy is limited by the constant errors of the sensors, which averaging does not reduce.
 """
 
 from __future__ import annotations
@@ -24,13 +23,16 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Guard against faulty readings: largest distance [m] that is accepted as a gap.
+#: Largest distance [m] that is accepted as a gap, a guard against faulty readings.
 _LARGEST = 1e3
-#: Upper bound on the iterations, in which the residual of the nonlinear equations corrects the pose.
+#: Upper bound on the number of iterations. In each iteration, the residual of the nonlinear equations corrects the
+#: pose.
 _ROUNDS = 4
-#: Lower bound on a singular value of the equations; below this value the sensors do not determine an unknown.
+#: Lower bound on a singular value of the equations. A smaller singular value shows that the sensors do not determine an
+#: unknown.
 _SINGULAR = 1e-6
-#: Definition of the groups of facing pads: indices of two opposite pairs, whose gaps determine a clearance.
+#: Definition of the groups of facing pads. A group consists of two opposite pairs, and their gaps determine a
+#: clearance.
 GROUPS: Final = {
     "horizontal_top": (1, 3),
     "horizontal_bottom": (7, 5),
@@ -60,8 +62,8 @@ class Gaps:
     def of(t: ArrayLike, gap: ArrayLike, deviation: float = 0.0) -> tuple[Gaps, int]:
         """Return the usable rows in order of time, and the number of rows that are left out.
 
-        A row is left out if its stamp is not finite or occurs twice. It is also left out if it contains no gap, or a
-        gap above 1e3 m.
+        A row is left out if its stamp is not finite or repeated, if it contains no gap, or if it contains a gap above
+        1e3 m.
 
         Raises
         ------
@@ -99,8 +101,8 @@ class GapsFit:
 def fit_gaps(scene: Scene, gaps: Gaps, poses: Poses) -> GapsFit | str:
     """Return the fit of clearances and poses to gaps, or a message why there is no fit.
 
-    If the gaps do not determine theta, it is taken from `poses`. Messages may contain different sets of sensors. The
-    most frequent set that determines the unknowns is used; it must occur in at least 20 messages.
+    If the gaps do not determine theta, theta is taken from `poses`. Messages may contain different sets of sensors. Of
+    the sets that determine the unknowns, the most frequent one is used. It must occur in at least 20 messages.
     """
     error = gaps.deviation or tuning.CONSTANT_ERROR
     rows = penetration_rows(replace(scene, clearance=Clearance(0.0, 0.0)))

@@ -1,6 +1,6 @@
-"""Harmonics that are missing from a measured load: Fourier terms at low multiples of the frequency of the load.
+"""Harmonics that are missing from a measured load, as Fourier terms at low multiples of the load's frequency.
 
-A working load is periodic, so the missing part is mostly periodic too, with the same period.
+A working load is periodic, so the missing part of a measured load is mostly periodic with the period of the load.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 COMPONENTS: Final = ("fx", "fy", "m")
 #: Upper bound on the number of corrections of a load's frequency, which converge quadratically.
 _CORRECTIONS = 6
-#: Number of knots in the shortest period of a harmonic, derived from an error of 0.9 % of the linear interpolation.
+#: Number of knots in the shortest period of a harmonic, derived from the error of linear interpolation, which is 0.9 %.
 _KNOTS = 24
 
 
@@ -31,8 +31,8 @@ class Harmonics:
     """Fourier terms that are added to a load: a constant, then sine and cosine of each multiple of the frequency.
 
     omega : angular frequency of the load in rad/s
-    multiples : multiples of `omega` that have terms
-    size : (3,) unit of the amplitudes in N, N, N m; in a fit half the range of the measured load
+    multiples : multiples of `omega` for which there are terms
+    size : (3,) unit of the amplitudes in N, N, N m. In a fit, it is half the range of the measured load.
     amplitude : (k, 3) amplitude of each term in units of `size`
     variance : (k, 3) variance of each amplitude in units of the square of `size`
     begin : time in s at which the phases are zero
@@ -97,7 +97,9 @@ class Harmonics:
         return replace(load, t=t, wrench=wrench + self.at(t))
 
     def moved(self, by: Array, variance: Array | None = None) -> Harmonics:
-        """Return harmonics with `by` added to the amplitudes, and with new variances, if given, shape (3 k,) each."""
+        """Return harmonics with `by`, shape (3 k,), added to the amplitudes. If `variance`, shape (3 k,), is given, it
+        replaces the variances.
+        """
         shape = self.amplitude.shape
         known = self.variance if variance is None else variance.reshape(shape)
         return replace(self, amplitude=self.amplitude + by.reshape(shape), variance=known)

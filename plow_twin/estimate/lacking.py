@@ -1,8 +1,9 @@
 """Fits with harmonics that are missing from the measured load.
 
-Two steps alternate: a linearised step of all unknowns, including the amplitudes of the harmonics, and a short fit of
-all unknowns except the amplitudes. The beginnings of the swings are fitted first, because they have few false optima.
-Whole swings are fitted afterwards.
+Two operations alternate. The first operation is a linearised step of all unknowns, including the amplitudes of the
+harmonics. The second operation is a short fit of all unknowns except the amplitudes. A swing is a part of the motion
+that begins in flight. The beginnings of the swings are fitted first, because the fit of a short motion has few false
+optima. Whole swings are fitted last.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ from plow_twin.estimate.verdict import Verdict, judge
 
 Array = NDArray[np.float64]
 
-#: Upper bounds on the number of fits with harmonics, on the iterations in each fit, and on the number of consecutive
-#: fits without improvement.
+#: Upper bounds on the number of fits with harmonics, the number of iterations in each fit, and the number of
+#: consecutive fits without improvement.
 _ROUNDS, _ITERATIONS, _IN_VAIN = 12, 6, 4
-#: Horizon, the upper bound on the fitted part of each swing, in the second stage relative to the first stage. The third
-#: stage fits whole swings.
+#: Horizon of the second stage, divided by the horizon of the first stage. The horizon is the upper bound on the fitted
+#: part of each swing. The third stage fits whole swings.
 _LONGER = 2.0
 
 
@@ -34,8 +35,8 @@ def with_harmonics(
     """Return a fit that includes harmonics of the measured load `felt`, and its verdict.
 
     The result is None if the load is not periodic, if swings are linked, if the motion cannot be simulated, or if a
-    check fails. The checks are made after each stage. If a stage fails a check, the fit of whole swings would fail too,
-    at a higher cost.
+    check fails. The checks are made after each stage, because a stage that fails a check shows that the expensive fit
+    of whole swings would fail.
     """
     harmonics, poses = Harmonics.of(felt), problem.window.poses
     if harmonics is None or len(problem.link):
@@ -59,7 +60,7 @@ def with_harmonics(
 def _alternated(
     problem: Problem, found: Fit, felt: Load, harmonics: Harmonics
 ) -> tuple[Problem, Fit, Harmonics] | None:
-    """Return the result of alternating steps of the amplitudes, which begin at `harmonics`, and fits of other unknowns.
+    """Return a fit with harmonics, computed by alternating linearised steps and fits that begin with `harmonics`.
 
     The result is None if the motion cannot be simulated.
     """

@@ -18,10 +18,11 @@ from plow_twin.estimate.regression import ridge, shrunk_root
 
 Array = NDArray[np.float64]
 
-#: Guard against division by zero: smallest variance of a feature.
+#: Smallest variance of a feature, a guard against division by zero.
 _LEAST = 1e-9
-#: Definition of the polynomial: indices of the parameters with terms up to the third degree (penetration, damping), and
-#: of the clearances, which are multiplied by these parameters.
+#: Definition of the polynomial. `_CURVED` are the indices of penetration and damping, for which there are terms up to
+#: the third degree. `_CHANGING` are the indices of the clearances, for which there are products with penetration and
+#: damping.
 _CURVED, _CHANGING = (0, 1), (5, 6)
 #: Parameters of the search for the most likely parameters with Levenberg-Marquardt steps:
 #:
@@ -46,9 +47,7 @@ class Draws:
 
 
 def log_odds(believed: Draws, other: Draws, measured: Array) -> float:
-    """Return the logarithm of the odds of the law of `other` against the law of `believed`, given m measured
-    features.
-    """
+    """Return the log odds of the law of `other` against the law of `believed`, given m measured features."""
     both = np.concatenate([believed.like, other.like])
     middle, scale = both.mean(axis=0), both.std(axis=0) + _LEAST
     surfaces = [_Surface.through(law.drawn, (law.like - middle) / scale) for law in (believed, other)]

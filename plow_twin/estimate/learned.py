@@ -1,13 +1,13 @@
 """Estimation of the members' parameters from the poses that move the members of a follower.
 
 With a hard contact the motion is too irregular for a fit, so an estimate hardly determines stiffness and load gains.
-These parameters are estimated from the poses while the twin follows the machine, as in a two-stage Kalman filter
-(Friedland, IEEE Trans. Autom. Control 14 (1969) 359):
+Stiffness and load gains are therefore estimated from the poses while the twin follows the machine. The method is
+similar to a two-stage Kalman filter (Friedland, IEEE Trans. Autom. Control 14 (1969) 359):
 
 1. The predicted poses of the members are regressed on the parameters of the members. The slope is the sensitivity of a
 pose to the parameters.
 2. The residuals of the regression give the covariance of a prediction with known parameters.
-3. The innovations, which are the differences between measured and predicted poses, then correct the parameters.
+3. The innovations, which are the differences between measured and predicted poses, correct the parameters.
 
 The stiffness, for example, affects the duration pi sqrt(m / K) of each rebound from a hard contact.
 """
@@ -73,7 +73,7 @@ def with_numbers(scene: Scene, numbers: Array) -> tuple[Scene, Array]:
 class Learner:
     """Normal distribution of the parameters of the machine given the poses, in units of `tuning.LEARNED_TO`.
 
-    A parameter is *learned* if it is estimated from the poses; other parameters have the drawn values.
+    A parameter is *learned* if it is estimated from the poses. A parameter that is not learned has the drawn value.
 
     Parameters
     ----------
@@ -91,7 +91,8 @@ class Learner:
         self._least, self._most = own.min(axis=0), own.max(axis=0)
         self.mean, self.covariance = own[0].copy(), np.cov(own.T).reshape(len(learned), -1)
         self._widest = np.sqrt(np.diag(self.covariance))
-        # standardised differences of the members from the mean; that of the first member, the median twin, is zero
+        # standardised differences of the members from the mean; the difference of the first member, the median twin, is
+        # zero
         white = own - own.mean(axis=0)
         white[0] = 0.0
         self._white = white @ np.linalg.inv(np.linalg.cholesky(self.covariance)).T
@@ -147,7 +148,7 @@ class Learner:
         rest = seen - apart @ slope
         alone = rest.T @ rest / (len(own) - len(self.open) - 1)
         inverse = np.linalg.inv(alone + np.diag(noise**2))
-        # random scatter of the members also causes a slope; the information in such a random slope is subtracted
+        # the random scatter of the members causes a random slope, and the information in the random slope is subtracted
         self._precision += slope @ inverse @ slope.T - spread * np.trace(inverse @ alone)
         self._score += slope @ inverse @ (off - (self.mean - middle) @ slope)
 
@@ -162,7 +163,8 @@ class Learner:
         # the linearisation is accurate within one standard deviation, which limits the step
         step /= max(1.0, float(np.abs(step / before).max()))
         self.mean = np.clip(self.mean + step, self._least, self._most)
-        # the machine changes with time, so deviations grow; the limits are one unit and the deviation of the estimate
+        # the machine changes with time, so deviations grow; a deviation is at least one unit and at most that of the
+        # estimate
         deviation = np.sqrt(np.diag(self.covariance))
         wider = np.maximum(deviation, 1.0) * np.exp(0.5 * (time - self.time) / tuning.LEARNED_FOR)
         share = np.minimum(wider, self._widest) / deviation
@@ -171,7 +173,7 @@ class Learner:
         self._begin()
 
     def numbers(self, which: NDArray[np.int64]) -> Array:
-        """Return the parameters of the members with the indices `which`, shape (k, 10), after learning."""
+        """Return the learned parameters of the members with the indices `which`, shape (k, 10)."""
         found = self._all[which].copy()
         own = self.mean + self._white[which] @ np.linalg.cholesky(self.covariance).T
         found[:, self.open] = np.clip(own, self._least, self._most)

@@ -1,10 +1,11 @@
-"""Wear over months, computed in seconds: a few load periods give the mean force on each pad, then many are skipped.
+"""Wear over months, computed in seconds. A simulation of a few load periods gives the mean force on each pad.
 
-The wear rate of a pad is k_s <F> v / A (Archard). Here k_s is the wear coefficient, <F> the mean force, v the travel
-speed and A the area of a pad. With the travel s in m, the exposure is defined as E = k_s s / A in 1/N. The wear depths
-h satisfy dh/dE = <F>(h), so they depend on time, travel speed and coefficient only through E. One path h(E) therefore
-holds for every coefficient. The path is computed with Heun's method. The step is limited by the difference from Euler's
-method, and by the change of the clearance.
+With the mean forces, the wear over many periods is extrapolated. The wear rate of a pad is k_s <F> v / A (Archard).
+Here k_s is the wear coefficient, <F> the mean force, v the travel speed and A the area of a pad. With the travel s in
+m, the exposure is defined as E = k_s s / A in 1/N. The wear depths h satisfy dh/dE = <F>(h), so they depend on time,
+travel speed and coefficient only through E. One path h(E) therefore holds for every coefficient. The path is computed
+with Heun's method. The step size is limited by the difference between Heun's and Euler's method, and by the change of
+the clearance.
 
 References: Archard, J. Appl. Phys. 24 (1953) 981; Lemaitre and Doghri, Comput. Methods Appl. Mech. Eng. 115 (1994) 197
 (jump in cycles); ISO 13381-1 (prognosis).
@@ -28,14 +29,15 @@ from plow_twin.run.simulate import simulate
 
 Array = NDArray[np.float64]
 
-#: Wear depth in m of a trial simulation that measures the sliding distance. The depth is above the rounding errors, and
-#: below the bound from which it would change the motion.
+#: Wear depth in m of a trial simulation that measures the sliding distance. The depth is larger than the rounding
+#: errors, and smaller than the bound above which it would change the motion.
 _TRACE_M = 1e-12
 #: Upper bound on the number of interpolated rows between two rows of a path with running-in.
 _FINER = 16
 #: Upper bound on the number of steps of a path.
 _MOST_STEPS = 400
-#: Lower bound on the clearance in m that limits a step, because steps from a clearance of zero would not grow.
+#: Lower bound on the clearance in m to which the size of a step is proportional. Without this bound, steps from a
+#: clearance of zero would not grow.
 _LEAST_CLEARANCE = 1e-3
 
 

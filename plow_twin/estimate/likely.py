@@ -20,11 +20,11 @@ from plow_twin.estimate.regression import ridge, shrunk_root
 
 Array = NDArray[np.float64]
 
-#: Guards against division by zero: smallest variance of a feature, and smallest deviation of a drawn parameter.
+#: Smallest variance of a feature, and smallest deviation of a drawn parameter, both as guards against division by zero.
 _LEAST, _SAME = 1e-14, 1e-12
-#: Definition of the quadratic terms: pairs of parameters among clearances, softness and damping.
+#: Definition of the quadratic terms by pairs of parameters. The parameters are two clearances, softness and damping.
 _CURVED = tuple(combinations_with_replacement(range(4), 2))
-#: Number of folds of the cross-validation, which bounds its cost.
+#: Upper bound on the number of folds of the cross-validation, which determines the computing time.
 _PARTS = 10
 #: Upper bounds on the number of Gauss-Newton steps, and on the size of a step in deviations of the draws.
 _STEPS, _LONGEST = 5, 1.5
@@ -72,7 +72,7 @@ def likeliest(drawn: Array, gain: float, motions: Seen, measured: Seen) -> Array
 
 
 def _likeliest(drawn: Array, gain: float, motions: Seen, asked: Seen) -> Array:
-    """Return the most likely clearances in m of k motions `asked`, shape (k, 2), from the model of the drawn
+    """Return the most likely clearances in m of the k motions `asked`, shape (k, 2), by the model of the drawn
     motions.
     """
     middle, scale = drawn.mean(axis=0), drawn.std(axis=0)

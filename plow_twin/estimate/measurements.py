@@ -18,17 +18,18 @@ from plow_twin.model.pairs import PAIR_COUNT
 
 Array = NDArray[np.float64]
 Deviation = tuple[float, ...]
-#: Standard deviations that are not stated; by definition they are 0.
+#: Standard deviations of a pose or a load without stated deviations. By definition, they are 0.
 UNSTATED: Deviation = (0.0, 0.0, 0.0)
-#: Smallest numbers of values for a standard deviation, derived from its relative error 1 / sqrt(2 n): 22 % for a load
-#: cell in contact, 16 % for poses and gaps, 10 % for the scatter in a comparison.
+#: Smallest numbers of values from which a standard deviation is computed, for load cells in contact, for poses and
+#: gaps, and for the scatter in a comparison. The numbers are derived from the relative error of a standard deviation,
+#: which is 1 / sqrt(2 n) for n values.
 FEWEST_IN_CONTACT, FEWEST_POSES, FEWEST_FOR_SCATTER = 10, 20, 50
-#: Upper bound on the interval in s between poses or samples that resolve the motion. Over this interval, the motion in
-#: a soft contact is nearly a cubic polynomial.
+#: Upper bound on the interval in s between poses or samples that resolve the motion. In a soft contact, the motion over
+#: the interval is nearly a cubic polynomial.
 RESOLVING: Final = 0.02
 #: Lower bound on the number of points between two knots when a load is averaged.
 _FINER = 8
-#: Guard against faulty data: largest component of a pose in m or rad, and of a load in N or N m.
+#: Largest accepted component of a pose in m or rad, and of a load in N or N m. Both are guards against faulty data.
 _LARGEST_POSE, _LARGEST_LOAD = 1e6, 1e15
 
 
@@ -49,7 +50,7 @@ class Poses:
     deviation : tuple of 3 float
         Stated standard deviation of each component; 0 if not stated.
     assumed : ndarray, shape (n, 3), optional
-        Poses of a model, which replace a component that was never measured where all three components are needed.
+        Poses of a model. Where all three components are needed, they replace a component that was never measured.
     """
 
     t: Array
@@ -66,8 +67,8 @@ class Poses:
     def of(t: ArrayLike, q: ArrayLike, deviation: Deviation = UNSTATED) -> tuple[Poses, int]:
         """Return the usable rows in order of time, and the number of rows that are left out.
 
-        A row is left out if its stamp is not finite or occurs twice. It is also left out if it contains no finite
-        component, or a component above 1e6.
+        A row is left out if its stamp is not finite or repeated, if no component is finite, or if a component is above
+        1e6.
 
         Raises
         ------
@@ -84,12 +85,14 @@ class Poses:
         return Poses(times[index], rows[index], deviation), len(times) - len(index)
 
     def interval(self) -> float:
-        """Return the mean interval in s per complete pose, from the number of measured components."""
+        """Return the median interval of the rows in s, divided by the share of components that were measured."""
         measured = int(np.isfinite(self.q).sum())
         return float(np.median(np.diff(self.t))) * self.q.size / max(measured, 1)
 
     def gap(self) -> float:
-        """Return the median gap in s between measured values of a component, in which a gap's weight is its length."""
+        """Return the weighted median of the gaps in s between measured values of a component; a gap's weight is its
+        length.
+        """
         gaps = np.sort(np.concatenate([np.diff(self.t[np.isfinite(column)]) for column in self.q.T]))
         return float(gaps[np.searchsorted(gaps.cumsum(), 0.5 * gaps.sum())])
 
@@ -125,8 +128,8 @@ class Poses:
     def fresh(self) -> Poses:
         """Return the poses without repeated values, which occur if a sensor is slower than its sender.
 
-        Repeated values are late and repeat the same noise. A longer repetition shows that the sensor has stopped. In
-        this case, all values are returned.
+        A repeated value is late, and its noise is not independent. If a value is repeated for a long time, the sensor
+        has stopped, and all values are returned.
         """
         one, next_one = self.q[:-1], self.q[1:]
         again = ((one == next_one) | (np.isnan(one) & np.isnan(next_one))).all(axis=1)
@@ -152,7 +155,8 @@ class Load:
     deviation : tuple of 3 float
         Stated standard deviation of each component; 0 if not stated.
     unknown : tuple of 3 float
-        Spectral density of the unknown part of the load between its samples, in N2 s and (N m)2 s (see `believable`).
+        Spectral density of the unknown part of the load between the samples, in N2 s and (N m)2 s, from the method
+        `believable`.
     """
 
     t: Array
@@ -186,7 +190,7 @@ class Load:
         return Load(np.array([start, end]), np.zeros((2, 3)))
 
     def between(self, start: float, end: float) -> Load:
-        """Return the samples that determine the load in [start, end]."""
+        """Return the samples that determine the load in the closed interval [start, end]."""
         first = max(int(np.searchsorted(self.t, start, side="right")) - 1, 0)
         last = min(int(np.searchsorted(self.t, end, side="left")) + 1, len(self.t))
         return Load(self.t[first:last], self.wrench[first:last])
@@ -221,11 +225,13 @@ class Load:
         return shares
 
     def period(self) -> float:
-        """Return the period in s of the strongest oscillation, or a tenth of the span without one."""
+        """Return the period in s of the strongest oscillation, or a tenth of the load's span if there is no
+        oscillation.
+        """
         return self.oscillation() or float(self.t[-1] - self.t[0]) / 10.0
 
     def oscillation(self) -> float | None:
-        """Return the period in s of the strongest oscillation, or None without one."""
+        """Return the period in s of the strongest oscillation, or None if there is no oscillation."""
         span = float(self.t[-1] - self.t[0])
         count = int(min(max(64, 4 * len(self.t)), 8192))
         grid = np.linspace(self.t[0], self.t[-1], count)
@@ -251,8 +257,8 @@ class Load:
     def smooth(self, step: float) -> Load:
         """Return values of a cubic spline through the samples at intervals of about `step` in s.
 
-        The deviation of the result includes `tuning.COARSE_GAIN`, because samples at long intervals may be averages,
-        which have a smaller amplitude than the load.
+        Samples at long intervals may be averages, which have a smaller amplitude than the load. The stated deviation of
+        the result therefore includes `tuning.COARSE_GAIN`.
         """
         t = np.linspace(self.t[0], self.t[-1], math.ceil((self.t[-1] - self.t[0]) / step) + 1)
         size = tuning.COARSE_GAIN * np.sqrt((self.wrench**2).mean(axis=0))
@@ -279,7 +285,7 @@ class Load:
         rows = self.wrench / np.where(scale > 0.0, scale, 1.0)
         out = np.zeros(len(rows))
         out[[0, -1]] = np.inf
-        # all lines of one level of the recursion are processed at once
+        # all lines of one recursion level are processed together
         left, right, least = np.array([0]), np.array([len(rows) - 1]), np.array([np.inf])
         while len(left):
             inner = right - left > 1
@@ -294,7 +300,7 @@ class Load:
             chord = rows[right] - rows[left]
             error = np.abs(rows[place] - rows[left][line] - along[:, None] * chord[line]).max(axis=1)
             largest = np.maximum.reduceat(error, first[:-1])
-            # index of the sample with the largest distance from each line, the first one if there are several
+            # index of the first sample with the largest distance from each line
             at = np.flatnonzero(error == largest[line])
             middle = place[at[np.unique(line[at], return_index=True)[1]]]
             least = np.minimum(least, largest)
@@ -306,13 +312,15 @@ class Load:
         return out
 
     def _roughness(self) -> tuple[Array, Array, Array]:
-        """Return the correlation of successive samples, and two spectral densities at low frequency, shape (3,) each.
+        """Return the correlation of successive samples and two spectral densities at low frequency, as three arrays of
+        shape (3,).
 
-        The first density is that of the load, the second that of the linear interpolation of its samples. The rough
-        part of the load is modelled as an Ornstein-Uhlenbeck process with the correlation a of successive samples. The
-        correlation follows from the mean square distance of samples from the straight line through two neighbours. If
-        the neighbours are twice as far away, this distance grows by the factor (1 + a) (3 - a^2) / (3 - a). The factor
-        is 2 for a Brownian motion (a = 1) and 1 for uncorrelated samples (a = 0).
+        The first spectral density is that of the load. The second spectral density is that of the linear interpolation
+        of the samples. The rough part of the load is modelled as an Ornstein-Uhlenbeck process with the correlation a
+        of successive samples. The correlation follows from the mean square distance of samples from the straight line
+        through two neighbours. If the neighbours are twice as far away, the mean square distance is larger by the
+        factor (1 + a) (3 - a^2) / (3 - a). For a Brownian motion, a = 1 and the factor is 2. For uncorrelated samples,
+        a = 0 and the factor is 1.
         """
         if len(self.t) < 5:
             return np.ones(3), np.zeros(3), np.zeros(3)
@@ -327,8 +335,8 @@ class Load:
     def believable(self) -> Load:
         """Return the best estimate of the load between its samples, with the spectral density of the unknown part.
 
-        Samples at long intervals without correlation do not determine the load between them. Only the strong
-        oscillations of such samples are used.
+        If samples at long intervals are uncorrelated, they do not determine the load between two samples. In this case,
+        only the strong oscillations in the samples are used.
         """
         correlation, its, of_samples = self._roughness()
         # samples are treated as uncorrelated if the correlation is within three standard errors of zero
@@ -347,7 +355,8 @@ class Load:
     def averaged(self, count: int) -> Load:
         """Return the least-squares fit of a piecewise linear load with `count` equidistant knots.
 
-        The difference from the original load has a mean of zero over some knots, so it hardly moves the head.
+        The difference between the fit and the original load has a mean of zero over several knots, so it hardly moves
+        the head.
         """
         knots = np.linspace(self.t[0], self.t[-1], count)
         within = max(_FINER, math.ceil(2.0 * len(self.t) / count))
@@ -401,14 +410,15 @@ def useless_deviation() -> Deviation:
 
 
 def believed(stated: Deviation, q: Array, own: Array) -> tuple[Array, Deviation]:
-    """Return poses without components of a large stated deviation, and the deviations of the remaining components.
+    """Return poses without the components that have a large stated deviation, and the deviations of all remaining
+    components.
 
     Parameters
     ----------
     stated : tuple of 3 float
         Lower limit of the deviation of each component.
     q, own : ndarray, shape (n, 3)
-        Poses, and the standard deviation of each component; NaN if not stated.
+        Poses, and standard deviations of their components. A deviation that is not stated is NaN.
 
     Returns
     -------
@@ -444,9 +454,9 @@ def usable_rows(
 ) -> tuple[Array, Array, int]:
     """Return stamps (n,) and rows (n, 8) in order of time, and the number of rows that are left out.
 
-    A row has a number for each pair. It is left out if its stamp is not finite or occurs twice, if it contains no
-    number, or if a number exceeds `largest`. Arrays of the wrong shape raise an exception of type `error`. Its message
-    contains the texts `names`, for a set of rows and for a number.
+    A row has a number for each pair. It is left out if its stamp is not finite or repeated, if it contains no number,
+    or if a number exceeds `largest`. For arrays of the wrong shape, an exception of the type `error` is raised. The
+    message of the exception contains the texts `names`, which name a set of rows and a number.
     """
     times, rows = np.asarray(t, dtype=np.float64), np.array(values, dtype=np.float64)
     if times.ndim != 1 or rows.shape != (len(times), PAIR_COUNT):

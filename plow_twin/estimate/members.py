@@ -1,12 +1,13 @@
-"""The members of a follower, which are twins drawn from a prior or an estimate and moved by an ensemble Kalman filter.
+"""The members of a follower. They are twins that are drawn from a prior or an estimate and moved by an ensemble Kalman
+filter.
 
-Each measured pose moves all members, with perturbed observations (Burgers et al., Mon. Weather Rev. 126 (1998) 1719). A
-late pose corrects the present state through the covariance between past and present states. With a hard contact, a
-correction of a tenth of a millimetre could cause a false impact. A member therefore skips a correction that would press
-it against a wall with more than half of the head's weight.
+The filter uses perturbed observations (Burgers et al., Mon. Weather Rev. 126 (1998) 1719). A late pose corrects the
+present state through the covariance between past and present states. With a hard contact, even a correction of a tenth
+of a millimetre can cause a false impact. A correction is therefore skipped if it would press a member against a wall
+with more than half of the head's weight.
 
 Parameters that an estimate hardly determines are estimated from the poses (module `learned`). At each pose, some
-members adopt the parameters learned so far.
+members adopt the present estimates of these parameters.
 """
 
 from __future__ import annotations
@@ -37,16 +38,15 @@ from plow_twin.stream.outputs import clearances
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 
-#: Upper bound on the age in s of a late pose that is used, including the sensor's delay. The motion is stored for this
-#: time.
+#: Upper bound on the age in s of a pose that is used. The age includes the delay of the sensor. The motion is stored
+#: for the same time.
 LATEST_S: Final = 0.25
 #: Lower bound on the interval in s between stored states of the motion.
 _PATH_S: Final = 2e-3
-#: Upper bound on the number of consecutive outliers that are ignored. More consecutive outliers show that the head has
-#: really moved.
+#: Upper bound on the number of consecutive outliers that are ignored. If there are more, the head has really moved.
 _MOST_OUTLYING: Final = 5
-#: Lower bound on the number of members whose parameters are changed together, because a call costs as much as the
-#: change of three members.
+#: Lower bound on the number of members that adopt parameters together. Fewer members would be inefficient, because the
+#: fixed cost of a call equals the cost of three members.
 _AT_ONCE: Final = 8
 #: Slice that selects all members.
 _ALL: Final = slice(None)
@@ -84,8 +84,8 @@ class Ensemble:
     ) -> None:  # fmt: skip
         scenes, gain = draw_scenes(scene, known, members, rng) if members > 1 else ([scene], np.ones((1, 3)))
         scenes[0], gain[0] = middle_of(scene, known)
-        #: whether poses move the first member, which is the case for an estimate; for the prior, poses move the second
-        #: member instead, which is a copy of the first
+        #: Whether poses move the first member. If the members are drawn from an estimate, poses move the first member.
+        #: If they are drawn from the prior, poses move the second member, which is a copy of the first member.
         self._steers_first = known.horizontal_state is not State.PRIOR
         if not self._steers_first and members > 1:
             scenes[1], gain[1] = scenes[0], gain[0]
@@ -96,21 +96,22 @@ class Ensemble:
             states = (known.horizontal_state, known.vertical_state)
             self.moved_before = np.where([[state.known] for state in states], widening(scene, worn)[:, None], 0.0)
             scenes = [_worn(one, scene, worn, self.moved_before[:, 0]) for one in scenes]
-        #: the first member is advanced separately, so that its forces are available before the other members are
+        #: the first member is advanced separately, so that its forces are available before all further members are
         #: advanced
         self.first = Twin(scenes[0], tol=tol, excitation="sampled", start=start)
         self.others = TwinBatch(scenes[1:], tol=tol, start=start) if members > 1 else None
         self._scene, self._gain, self._rng, self._speed = scene, gain, rng, 0.0
         self._numbers = numbers_of(scenes, gain, draw_biases(known, members, rng))
-        # `_turn` is the next member to adopt learned parameters, `_waiting` the number of members due to adopt
-        # parameters
+        # `_turn` is the index of the next member that adopts learned parameters, and `_waiting` is the number of
+        # members that are due
         learns = learns and self._steers_first and members > 1
         self._learner = Learner.of(self._numbers.copy(), start) if learns else None
         self._turn, self._waiting = 0, 0.0
-        # harmonics that are missing from the measured load, and amplitudes for each member, (m, k, 3), in N, N, N m
+        # harmonics that are missing from the measured load, and the amplitudes of each member in N, N, N m, shape (m,
+        # k, 3)
         self._harmonics = known.load_harmonics
         self._amplitude = amplitudes_of(known, members, rng)
-        # error of the load of each member in N, N, N m, and time in s up to which the errors have been advanced
+        # load error of each member in N, N, N m, and time in s up to which the load errors have been advanced
         self._load_off, self._drifted = np.zeros((members, 3)), start
         self._walls = np.stack([penetration_rows(one) for one in scenes])
         self._clearance = np.array([[one.clearance.horizontal_m, one.clearance.vertical_m] for one in scenes])
@@ -166,7 +167,7 @@ class Ensemble:
     def advance_others(
         self, t: Array, wrench: Array, rows: Rows, wanted: NDArray[np.bool_], ends: NDArray[np.bool_]
     ) -> None:
-        """Advance the other members to the time of the first member, and add intervals to the first member's rows.
+        """Advance all further members to the time of the first member, and add intervals to the first member's rows.
 
         `wanted` marks the rows that receive intervals. `ends` marks the rows at which a span of peaks and impulses
         ends.
@@ -191,7 +192,9 @@ class Ensemble:
         self._newest = whole[:, -1]
 
     def settle(self) -> None:
-        """Copy rates, wear and penetration from the newest rows; to be called before they are used."""
+        """Copy rates, wear and penetration from the newest rows. The caller must do so before it uses the copied
+        values.
+        """
         rows, self._newest = self._newest, None
         if rows is not None:
             self._v, self.worn, self._depth = rows["v"].copy(), rows["wear_depth"].copy(), rows["penetration"].copy()
@@ -212,7 +215,7 @@ class Ensemble:
             row["followed"] = WITH_INTERVALS
 
     def held(self, t: float, row: Rows) -> None:
-        """Write the row at a later time `t` under the load of the newest sample; the state does not change."""
+        """Write the row that the constant load of the newest sample gives at `t`; the state does not change."""
         before = self.twins()
         row[:] = self.first.advance(t).rows
         self._sums[0, 0] = row["force"][0]
@@ -226,8 +229,8 @@ class Ensemble:
         self._peak[:], self._impulse[:] = 0.0, 0.0
 
     def span(self) -> tuple[Array, Array]:
-        """Return peaks and impulses of the span, shape (3, 8) each: value of the first member, 5 % and 95 %
-        quantile.
+        """Return peaks and impulses of the span, shape (3, 8) each. The rows contain the value of the first member, the
+        5 % quantile and the 95 % quantile.
         """
         return np.stack(self._points(self._peak)), np.stack(self._points(self._impulse))
 
@@ -267,10 +270,10 @@ class Ensemble:
     def stand_like(self, before: Ensemble, wrench: Array) -> None:
         """Start from the state of the members `before`, under the load `wrench`.
 
-        Poses are scaled to the clearances; peaks and impulses are copied. Measured poses move the second member of a
-        prior, but the first member of an estimate. If an estimate follows a prior, its first member therefore starts at
-        the pose of the second member. If a prior follows an estimate, its second member starts at the pose of the first
-        member.
+        The poses are scaled to the clearances. Peaks and impulses are copied. Measured poses move the second member of
+        an ensemble that was drawn from a prior, but the first member of an ensemble that was drawn from an estimate. If
+        an estimate replaces a prior, the new first member therefore starts at the pose of the old second member. If a
+        prior replaces an estimate, the new second member starts at the pose of the old first member.
         """
         before.settle()
         from_ = np.where(before.good, np.arange(len(before.good)), int(np.argmax(before.good)))[: len(self.good)]
@@ -303,17 +306,18 @@ class Ensemble:
     def _room(self) -> Array:
         """Return the scale in m of a member's motion in x, y and theta, shape (m, 3), or 1 for a locked direction.
 
-        The scale is the horizontal clearance, the vertical clearance, and the smaller of the two.
+        The scales are the horizontal clearance for x, the vertical clearance for y, and the smaller clearance for
+        theta.
         """
         room = np.column_stack([self._clearance, self._clearance.min(axis=1)])
         return np.where(self._free, room, 1.0)
 
     def _shares(self, room: Array) -> Array:
-        """Return the quotients of `_room` and another scale `room`, shape (m, 3), by which poses are scaled."""
+        """Return the result of `_room` divided by the scale `room` of other members, shape (m, 3)."""
         return np.divide(self._room(), room, out=np.ones_like(room), where=room > 0.0)
 
     def _stand(self, q: Array, v: Array, force: Array, which: NDArray[np.int64] | None = None) -> None:
-        """Move members to poses `q`, but only so far from the middle that no pair bears much more than `force`, (m,
+        """Move members toward the poses `q`, but only so far that no pair bears much more than `force` [N], shape (m,
         8).
         """
         which = np.arange(len(q)) if which is None else which
@@ -334,9 +338,9 @@ class Ensemble:
     def correct(self, t: float, q: Array, noise: Array, load_error: Array) -> bool:
         """Correct the members with a pose that was measured at time `t`, and return whether the pose was used.
 
-        The correction is a step of the ensemble Kalman filter. It also corrects the errors of the members' loads, whose
-        standard deviation in N, N, N m is `load_error`, shape (3,). A pose that is too late is not used. An outlier is
-        used only after several consecutive outliers.
+        The correction is a step of the ensemble Kalman filter. The errors of the members' loads are corrected in the
+        same step. Their standard deviation in N, N, N m is `load_error`, shape (3,). A pose that is too late is not
+        used. An outlier is used only after several consecutive outliers.
         """
         self.settle()
         there = np.flatnonzero(np.isfinite(q) & self._free)
@@ -346,7 +350,7 @@ class Ensemble:
         after = min(bisect_left(times, t), len(times) - 1)
         path = np.stack([self._path[index][1] for index in range(after - 1, len(times))])
         share = min((t - times[after - 1]) / (times[after] - times[after - 1]), 1.0)
-        # measurement that the sensor of each member would have given
+        # measured pose that the sensor of each member would have given
         then = ((1.0 - share) * path[0] + share * path[1] + biases_of(self._numbers))[:, there]
         since = self.first.time - self._drifted
         self._drift(load_error)
@@ -399,8 +403,8 @@ class Ensemble:
     def _learn(self, since: float) -> None:
         """Update the learned parameters every `tuning.LEARNED_EACH` s, and let members adopt the parameters.
 
-        The first member adopts the parameters at once. The other members follow one after another, each about once in
-        `LEARNED_EACH`. `since` is the time in s since the previous pose.
+        The first member adopts the parameters at once. All further members adopt them one after another, each about
+        once in `LEARNED_EACH` s. `since` is the time in s since the previous pose.
         """
         learner, count = self._learner, len(self.good) - 1
         if learner is None:
@@ -424,7 +428,8 @@ class Ensemble:
         """Set the parameters of the members with the ascending indices `which`, and scale their poses to the new
         clearances.
 
-        The parameters of a member do not change if the new values need other equations, as an overdamped contact does.
+        The parameters of a member do not change if the new values need a different kernel, as an overdamped contact
+        does.
         """
         now = [self.first.scene, *(() if self.others is None else self.others.scenes)]
         changed = [with_numbers(now[place], own) for place, own in zip(which.tolist(), numbers, strict=True)]
@@ -543,7 +548,7 @@ def _bytes(rows: Rows) -> NDArray[np.uint8]:
 
 
 def _off(q: Array, then: Array, there: NDArray[np.int64]) -> Array:
-    """Return the pose `q` minus the poses `then`, shape (..., k), in the k components `there`; angles are in [-pi,
+    """Return the pose `q` minus the poses `then`, shape (..., k), for the k components `there`. Angles are in [-pi,
     pi].
     """
     off: Array = q[there] - then
@@ -568,7 +573,7 @@ def widening(scene: Scene, worn: Array) -> Array:
 
 
 def middle_of(scene: Scene, known: Estimate) -> tuple[Scene, Array]:
-    """Return the scene, and the load gains, shape (3,), with the median values of an estimate."""
+    """Return the scene and the load gains, shape (3,), that have the median values of an estimate."""
     if known.horizontal_state is State.PRIOR:
         return replace(scene, loads=(), wear=None), np.ones(3)
 

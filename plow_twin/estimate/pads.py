@@ -1,10 +1,10 @@
-"""Rotations of walls, lever arm and low pass of the sensor, and the clearances between facing pads.
+"""Estimate of the differences from the model, and of the clearances between facing pads.
 
-The two pads of a wall may be worn differently, which rotates the wall. The rotations of the walls, the lever arm and
-the low pass are called *differences* from the model. They are estimated in one linearised step from a fit. If the
-differences are so large that the fit fails a check, the fit is repeated with the differences as unknowns. Poses do not
-determine how a clearance is divided between the two sides of the head. A bias of the sensor has the same effect as a
-different division.
+The two pads of a wall may be worn differently, which rotates the wall. The sensor may have a lever arm and a low pass.
+The rotations, the lever arm and the low pass are called *differences* from the model. They are estimated in one
+linearised step from a fit. If the differences are so large that the fit fails a check, the fit is repeated with the
+differences as unknowns. Poses do not determine how a clearance is divided between the two sides of the head. A bias of
+the sensor has the same effect as a different division.
 """
 
 from __future__ import annotations
@@ -23,15 +23,16 @@ from plow_twin.estimate.unknowns import GX, GY, SIZE
 
 Array = NDArray[np.float64]
 
-#: Definition of the clearance of each group of facing pads. It is the clearance of the axis with the given index, plus
-#: the rotations of the left, right, top and bottom wall times the given factors.
+#: Definition of the clearance of each group of facing pads. The clearance of a group is the sum of two terms. The first
+#: term is the clearance of the axis with the given index. The second term is the sum of the rotations of the left,
+#: right, top and bottom wall, each times the given factor.
 _MADE_OF: Final = {
     "horizontal_top": (GX, np.array([0.5, 0.5, 0.0, 0.0])),
     "horizontal_bottom": (GX, np.array([-0.5, -0.5, 0.0, 0.0])),
     "vertical_left": (GY, np.array([0.0, 0.0, 0.5, 0.5])),
     "vertical_right": (GY, np.array([0.0, 0.0, -0.5, -0.5])),
 }
-#: Upper bounds on the number of fits with differences, and on the iterations in each fit.
+#: Upper bounds on the number of fits with differences, and on the number of iterations in each fit.
 _ROUNDS, _ITERATIONS = 6, 15
 assert list(_MADE_OF) == list(GROUPS)
 
@@ -93,7 +94,7 @@ def with_differences(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None
 def of_differences(problem: Problem, found: Fit) -> Array:
     """Return the part of the covariance of the shared unknowns that uncertain differences cause, shape (SIZE, SIZE).
 
-    For example, the position of a pad is uncertain if the head touches only the other pad of the wall.
+    For example, if the head touches only one pad of a wall, the position of the second pad is uncertain.
     """
     _, covariance = _joint_step(problem, found)
     held = np.linalg.inv(covariance)[:SIZE, :SIZE]

@@ -1,4 +1,4 @@
-"""Prior standard deviations of the numbers of a scene, either stated in the scene or by default."""
+"""Prior standard deviations of the numbers of a scene. They are stated in the scene or have default values."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from plow_twin.model.scene import Mark, Scene
 
 #: Prior standard deviations of numbers without a stated deviation, by kind and by mark (the source of a number).
 #:
-#: - clearance, stiffness, damping: a drawing does not show wear, and the contact is seldom known unless measured
+#: - clearance, stiffness, damping: a drawing does not show wear, and contact parameters are seldom known without a
+#:   measurement
 #: - mass, inertia: a drawing gives the values to some percent
-#: - frame: a drawing gives the sides up to a tolerance and to the rounding of the corners
+#: - frame: a drawing gives the sides up to a tolerance, and it does not show the rounding of the corners
 #: - exponent, friction: the contact law is idealised, and friction is seldom documented
 #:
-#: Units: m for clearance and frame; deviation of the logarithm for stiffness and damping, and of the logit for a
-#: restitution; a relative deviation for mass and inertia; 1 for exponent and friction.
+#: The deviations of clearance and frame are in m. The deviations of stiffness and damping are those of the logarithm,
+#: and the deviation of a restitution is that of the logit. The deviations of mass and inertia are relative. The
+#: deviations of exponent and friction are dimensionless.
 DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
     "clearance": {Mark.GIVEN: 8e-3, Mark.MEASURED: 2e-3, Mark.RECONSTRUCTED: 8e-3, Mark.ASSUMED: 8e-3},
     "stiffness": {Mark.GIVEN: 2.5, Mark.MEASURED: 0.5, Mark.RECONSTRUCTED: 2.5, Mark.ASSUMED: 2.5},
@@ -35,9 +37,10 @@ BIAS: Final = (5e-3, 5e-3, 0.02)
 #: Prior standard deviations of quantities that a scene cannot state:
 #:
 #: - `stiffness_<wall>`: stiffness of a wall relative to the stiffness of the contact
-#: - `turn_<wall>`: rotation of a wall: difference between the outward displacements of its two pads in m
-#: - `scale_<axis>`, `lever_<axis>`: scale factor, and lever arm in m, of the sensor
-#: - `filter`: squared time constant of the sensor's low pass in s2, without its mean delay, which is fitted
+#: - `turn_<wall>`: rotation of a wall, as the difference in m between the outward displacements of its two pads
+#: - `scale_<axis>`: scale factor of the sensor
+#: - `lever_<axis>`: lever arm of the sensor in m
+#: - `filter`: squared time constant of the sensor's low pass in s2; the mean delay of the low pass is fitted separately
 #: - `clock`: relative drift of the sensor's clock
 UNSTATED: Final = {
     **{f"stiffness_{wall}": 0.1 for wall in ("left", "right", "top", "bottom")},

@@ -18,7 +18,7 @@ def ridge(basis: Array, penalty: float, weight: Array | None = None) -> tuple[Ar
     basis : ndarray, shape (n, k)
         Design matrix. The first column is the constant term, which is not penalised.
     penalty : float
-        Number that is added to the diagonal of the normal matrix.
+        Number that is added to the diagonal of the normal matrix, except for the constant term.
     weight : ndarray, shape (n,), optional
         Weights of the rows.
     """
@@ -30,8 +30,8 @@ def ridge(basis: Array, penalty: float, weight: Array | None = None) -> tuple[Ar
 
 
 def shrunk_root(covariance: Array, least: float) -> Array:
-    """Return the Cholesky factor of a covariance that is shrunk toward its diagonal; `least` is added to the
-    diagonal.
+    """Return the Cholesky factor of a covariance after it has been shrunk toward its diagonal and `least` has been
+    added to the diagonal.
     """
     share = tuning.SHRINKAGE[0]
     shrunk = (1.0 - share) * covariance + np.diag(share * np.diag(covariance) + least)

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 #: 95 % quantile of the standard normal distribution, from which the ends of a 90 % interval are derived.
 NORMAL_P95: Final = float(ndtri(0.95))
-#: Bound in standard deviations beyond which the tail of the normal distribution is treated as exponential.
+#: Lower bound in standard deviations from which on the tail of the normal distribution is treated as exponential.
 _FAR = 30.0
 _STANDARD: Final = NormalDist()
 
@@ -92,7 +92,7 @@ class Cell:
     rows : number of rows in which the pair of the cell is in or near contact
     gain : measured force divided by true force
     offset, noise : median and standard deviation of the readings during flight in N
-    left_over : share of the force that remains unexplained beyond noise
+    left_over : share of the force that neither the motion nor the noise explains
     """
 
     rows: int
@@ -142,7 +142,7 @@ class ForcesUsed:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The measured motion, and the fitted motion of the model with the bias and the delay of the sensor.
+    """The measured motion, and the fitted motion as a sensor with bias and delay would measure it.
 
     t : (n,) stamps in s
     measured : (n, 3) x, y in m and theta in rad, NaN without a measurement
@@ -164,7 +164,7 @@ class Motion:
         return Motion(self.t * time, self.measured * scale, self.model * scale)
 
     def moved(self, by: Array) -> Motion:
-        """Return the motion after `by` (x, y, theta), shape (3,), has been added to measured and fitted poses."""
+        """Return the motion with `by` (x, y, theta), shape (3,), added to the measured and to the fitted poses."""
         return Motion(self.t, self.measured + by, self.model + by)
 
 
@@ -201,12 +201,11 @@ class Estimate:
     forces_measured : ForcesUsed, optional
         Use of measured contact forces; None if no forces were measured.
     differs : dict of str to (float, float, float)
-        For each further quantity of machine and sensor, the probability of a difference from the scene, and mean
-        and standard deviation of the difference.
+        Three numbers for each further quantity of the machine and of the sensor: the probability of a difference from
+        the scene, the mean of the difference, and the standard deviation of the difference.
     apparent : tuple of (Interval, Interval), optional
-        Clearances in m with which a machine with exactly the scene's frame would move like the measured machine.
-        They are present if they are more accurate than the true clearances. Twins are then drawn from the apparent
-        clearances.
+        Clearances in m for which a machine with exactly the scene's frame would move like the measured machine. They
+        are present if they are more accurate than the true clearances. If they are present, twins are drawn from them.
     load_harmonics : Harmonics, optional
         Harmonics that are missing from the measured load, with times of the window; None without evidence of
         harmonics.

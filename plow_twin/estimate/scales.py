@@ -1,8 +1,9 @@
-"""Test of the sensor's scale factors, because an error of a scale factor causes an error of the clearances.
+"""Test of the sensor's scale factors. An error of a scale factor would cause an error of the clearances.
 
-The motion determines the scale factors in two ways: load, mass and gravity give the accelerations during flight, and
-the size of the frame gives the displacement of a rotated head. The scale factors are estimated in one linearised step
-from a fit, with all other unknowns eliminated (score test).
+The scale factors follow from two comparisons. In flight, the measured acceleration is compared with the acceleration
+that load, mass and gravity cause. In contact, the measured displacement of a rotated head is compared with the
+displacement that the size of the frame allows. The scale factors are estimated in one linearised step from a fit, with
+all other unknowns eliminated (score test).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ class Scales:
     """Estimated scale factors of the sensor.
 
     scale : (3,) measured values divided by true values of x, y and theta
-    chi2 : chi^2 of the three scale factors, 3 on average if the factors are 1
+    chi2 : chi^2 of the three scale factors. If the factors are 1, the mean of chi^2 is 3.
     """
 
     scale: Array

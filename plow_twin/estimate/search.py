@@ -1,7 +1,8 @@
 """Search for the best fit.
 
-The search has several stages. From stage to stage, the *horizon*, which is the fitted part at the beginning of each
-swing, grows, and the number of candidates decreases.
+The search has several stages. A swing is a part of the motion that begins in flight. The part at the beginning of each
+swing that is fitted is called the *horizon*. From stage to stage, the horizon grows and the number of candidates
+decreases.
 """
 
 from __future__ import annotations
@@ -37,11 +38,13 @@ class Stage:
     keep: int
 
 
-#: Smallest numbers of rows within a horizon and within a swing, derived from the six unknowns of the start of a swing.
+#: Smallest number of rows in a horizon, and smallest number of rows in a swing. Both are derived from the number of
+#: unknowns in the starting state of a swing, which is six.
 _FEWEST_ROWS = (8, 12)
-#: Values of the differences if a low pass of the sensor is the only difference, with its time constant from the prior.
+#: Values of the differences from the model if a low pass of the sensor is the only difference. The time constant of the
+#: low pass is derived from its prior.
 LOW_PASS: Final = np.array([0.0] * LAG + [UNSTATED["filter"]])
-#: Stages of the search, with bounds on the horizon, on the iterations and on the number of candidates.
+#: Stages of the search. Each stage has a horizon, and upper bounds on the numbers of iterations and candidates.
 STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
 #: Upper bound on the number of swings, which determines the cost of a fit.
 _MOST_SWINGS = 350
@@ -73,10 +76,10 @@ def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float)
 
 
 def _have_met(fits: list[Fit], newest: Fit) -> bool:
-    """Return whether the two best fits agree in clearances and loss, and one of the two is the fit `newest`.
+    """Return whether the two best fits agree in clearances and loss, and whether `newest` is one of the two fits.
 
-    `fits` are sorted by loss. Two starting points with different stiffness that lead to the same clearances and loss
-    have found the optimum. If only the clearances agree, a starting state in one of the fits is in a false optimum.
+    `fits` are sorted by loss. If two starting points with different stiffness lead to equal clearances and equal loss,
+    they have found the optimum. If only the clearances agree, one of the fits has a starting state in a false optimum.
     """
     if len(fits) < 2 or newest not in fits[:2]:
         return False
@@ -88,9 +91,9 @@ def _have_met(fits: list[Fit], newest: Fit) -> bool:
 def behind_low_pass(problem: Problem, found: Fit) -> Fit | None:
     """Return a fit of the same swings with the time constant of the sensor's low pass fixed at its prior deviation.
 
-    The result is None if the new fit is not clearly better, or if the poses are too rare to show a low pass. Steps from
-    a fit without a low pass do not lead to a slow low pass, whose time constant exceeds the duration of an impact. A
-    separate fit is therefore needed.
+    The result is None if the new fit is not clearly better, or if the poses are too rare to show a low pass. A low pass
+    is slow if its time constant exceeds the duration of an impact. A separate fit is needed, because steps from a fit
+    without a low pass do not lead to a slow low pass.
     """
     if problem.window.poses.interval() > RESOLVING:
         return None
@@ -105,9 +108,9 @@ def refine(
     forward: Forward, unknowns: Unknowns, poses: Poses, period: float, shared: Array, noise: Array, drift: Array | None,
     differences: Array | None = None, close: bool = False,
 ) -> tuple[Problem, Fit] | None:  # fmt: skip
-    """Return a fit to all poses from a good starting point; None if it cannot be simulated.
+    """Return a fit to all poses that begins at a good starting point; None if the motion cannot be simulated.
 
-    The beginnings of the swings are fitted first, then whole swings.
+    The beginnings of the swings are fitted first, and whole swings are fitted last.
 
     Parameters
     ----------
@@ -122,13 +125,13 @@ def refine(
     noise : ndarray, shape (3,)
         First guess of the standard deviation of the measurements.
     drift : ndarray, shape (3,), or None
-        Spectral density of the acceleration due to the unknown part of a broad-band load in m2/s3 and rad2/s3; None for
-        any other load.
+        Spectral density of the acceleration in m2/s3 and rad2/s3 that the unknown part of a broad-band load causes;
+        None for a load that is not broad-band.
     differences : ndarray, shape (7,), optional
         Fixed differences from the model.
     close : bool
-        Whether the starting point is close to the optimum. The fit then converges with long swings even if the contact
-        is hard.
+        Whether the starting point is so close to the optimum that the fit converges with long swings even if the
+        contact is hard.
     """
     hard = not close and bool(np.exp(shared[SOFTNESS]) < tuning.HARD)
     rows = poses.interval() * np.array(_FEWEST_ROWS)
@@ -144,7 +147,7 @@ def refine(
         forward, unknowns, window, horizon=min(near_horizon(poses, period), horizon), differences=differences
     )
     starts = [shared]
-    if unknowns.is_hard(shared):  # other contacts need no second starting point
+    if unknowns.is_hard(shared):  # a contact that is not hard needs no second starting point
         starts.append(range_of_hard(unknowns, poses, shared))
     fits = []
     for start in starts:
@@ -182,7 +185,9 @@ def states_at(window: Window, shared: Array) -> Array:
 
 
 def better_states(problem: Problem, shared: Array, states: Array) -> Array:
-    """Return starting states in which the end of the previous swing replaces a state if it fits the poses better."""
+    """Return starting states. A state is replaced by the end of the previous swing if this end fits the poses
+    better.
+    """
     window, scene = problem.window, problem.unknowns.scene_of(shared)
     gain = shared[GAIN]
     poses = window.poses

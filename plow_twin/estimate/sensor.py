@@ -16,15 +16,16 @@ from plow_twin.estimate.measurements import Poses, filled
 
 Array = NDArray[np.float64]
 
-#: Number of rows of the parabola that gives the measured pose at the start of a swing. It is derived from the number of
-#: rows over which a slow sensor smooths a kink.
+#: Number of rows to which a parabola is fitted for the measured pose at the start of a swing. It is derived from the
+#: number of rows over which a slow sensor smooths a kink of the motion.
 _ROWS: Final = 7
 
 
 def moved_by_lever(q: Array, v: Array, lever: Array) -> tuple[Array, Array]:
     """Return poses and rates, (n, 3) each, as a sensor with a lever arm measures them.
 
-    `lever`, shape (2,), is the lever arm in m in the axes of the head. Its constant value at theta = 0 is subtracted.
+    `lever`, shape (2,), is the lever arm in m in the axes of the head. The displacement by the lever arm at theta = 0,
+    which is constant, is subtracted.
     """
     c, s = np.cos(q[:, 2:]), np.sin(q[:, 2:])
     arm, across = lever, np.array([-lever[1], lever[0]])

@@ -1,4 +1,4 @@
-"""Starting points of a fit: division into swings, clearances from the range of motion, and several stiffnesses."""
+"""Starting points of a fit. The motion is divided into swings, which are parts that begin in flight."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from plow_twin.model.scene import Scene
 
 Array = NDArray[np.float64]
 
-#: Definition of the walls: masks of the pairs at the right, left, top and bottom wall, shape (8,) each.
+#: Definition of the walls right, left, top and bottom by masks of their pairs, shape (8,) each.
 WALLS: Final = (NORMAL_X > 0.0, NORMAL_X < 0.0, NORMAL_Y > 0.0, NORMAL_Y < 0.0)
 #: Indices of the two pairs at each wall, in the order of `WALLS`.
 _PADS: Final = [np.flatnonzero(wall).tolist() for wall in WALLS]
@@ -38,7 +38,7 @@ def reaches(scene: Scene, q: Array) -> Array:
     """Return the reaches in m toward the right, left, top and bottom wall, shape (n, 4).
 
     The reach is the distance of the corner nearest to the wall from the centre of the cavity, minus half the size of
-    the frame. In contact, it equals half the clearance plus the penetration.
+    the frame. In contact, the reach equals half the clearance plus the penetration.
     """
     rows = geometry.penetration_rows(scene)[:4]
     c, s = np.cos(q[:, 2]), np.sin(q[:, 2])
@@ -54,7 +54,7 @@ def smooth_width(poses: Poses, span: float = 0.06) -> int:
 
 
 def range_of_motion(scene: Scene, poses: Poses) -> tuple[Array, Array]:
-    """Return clearances, shape (2,), and bias of x and y, shape (2,), in m from the range of motion."""
+    """Return the clearances and the biases of x and y in m, shape (2,) each, that follow from the range of motion."""
     reach = reaches(scene, smoothed(filled(poses), smooth_width(poses)))
     right, left, top, bottom = np.quantile(reach, 0.99, axis=0)
     # the signs are reversed, because the frame moves to the left relative to a head that moves to the right
@@ -64,7 +64,7 @@ def range_of_motion(scene: Scene, poses: Poses) -> tuple[Array, Array]:
 def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
     """Return poses divided into swings of at least `shortest` s.
 
-    A swing begins in flight, at a time at which the head is away from the walls and moves on a parabola.
+    A swing begins in flight, when the head is away from the walls and moves on a parabola.
     """
     interval = poses.interval()
     raw, t = filled(poses), poses.t
@@ -79,7 +79,7 @@ def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
     while t[-1] > starts[-1] + 2.0 * apart:
         near = np.flatnonzero((t > starts[-1] + apart) & (t < starts[-1] + 2.0 * apart) & (room > clear))
         if not len(near):
-            # without a suitable start for a long time, the swing ends after a whole period
+            # if no suitable start follows for a long time, the swing ends after a whole load period
             far = np.flatnonzero((t > starts[-1] + 2.0 * apart) & (room > clear))
             end = min(float(t[far[0]]) if len(far) else np.inf, starts[-1] + period)
             near = np.flatnonzero((t >= end) & (t < end + apart))
@@ -94,9 +94,11 @@ def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
 
 
 def _parabola(t: Array, q: Array, start: float, noise: Array) -> tuple[Array, float]:
-    """Return pose and rate at the time `start`, shape (6,), from parabolas through nearby poses, and the misfit.
+    """Return pose and rate at the time `start`, shape (6,), by parabolas through nearby poses, and the misfit of the
+    parabolas.
 
-    The longest span that fits up to noise is used. A longer span contains an impact, which would falsify the rates.
+    The parabolas have the longest span for which the misfit is explained by noise. A longer span contains an impact,
+    which would falsify the rates.
     """
     near, misfit = np.zeros(0, np.int64), np.inf
     state = np.zeros(6)
@@ -148,7 +150,7 @@ def first_vectors(problem: Problem, most: int) -> list[Array]:
 
 
 def _matched(problem: Problem, vector: Array, measured: Array) -> list[tuple[float, Array]]:
-    """Return the vector, with its loss, whose clearances are adjusted to the range of motion `measured` in m.
+    """Return `vector` with clearances adjusted to the range of motion `measured` in m, and the loss.
 
     The result is a list of one item, or empty if the motion cannot be simulated.
     """
