@@ -3,8 +3,9 @@
     additive laws     F = K d^n + C psi(d) d',  psi = 1 (Kelvin-Voigt) or u^2 (3 - 2 u), u = min(d / ramp, 1)
     all other laws    F = K d^n (1 + lambda d')
 
-Equation 6 of the paper, the original contact law, is lost. These laws replace it. `contact_laws` computes lambda from
-the restitution. The solver determines whether a pair is in contact. It sets the force to zero where the law would pull.
+Equation 6 of the paper, the original contact law, is lost. The laws above replace this equation. `contact_laws`
+computes lambda from the restitution. The solver determines whether a pair is in contact. It sets the force to zero
+where the law would pull.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ def free_force(
 ) -> float:
     """Return the contact law's force F in N for the penetration d in m and its rate d' in m/s.
 
-    F is negative where the law would pull. `damping_factor` is lambda in s/m and `viscous` is C in N s/m; one of them
-    is zero. `ramp` in m is zero for a law without a ramp.
+    F is negative where the law would pull. `damping_factor` is lambda in s/m, and `viscous` is C in N s/m. Either
+    lambda or C is zero. `ramp` in m is zero for a law without a ramp.
     """
     elastic = stiffness * (penetration if exponent == 1.0 else max(penetration, 0.0) ** exponent)
     if ramp > 0.0 and penetration < ramp:

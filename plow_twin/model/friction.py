@@ -1,7 +1,7 @@
 """Regularised Coulomb friction of a pair, T = mu N tanh(s' / v_s), and a test for Painleve's case.
 
 s' is the rate at which the corner of the frame slides along the wall of the head. The friction T pulls the wall along
-with the corner. Under a smaller steady load T, the corner creeps at v_s atanh(T / (mu N)) instead of sticking.
+with the corner. Under a steady load T below mu N, the corner creeps at v_s atanh(T / (mu N)) instead of sticking.
 `solve.grip` implements friction with stick, which needs additional states. Source: Andersson, Soederberg and
 Bjoerklund, Tribol. Int. 40 (2007) 580, eq. 5.
 """

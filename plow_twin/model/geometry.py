@@ -18,7 +18,7 @@ corner c = (cx, cy) is at
 
     p_x = X + c cx - s cy              p_y = Y + s cx + c cy
 
-so the equations have the same form with other coefficients.
+so the equations of both kinds of head have the same form, with different coefficients.
 
 For a rounded corner, C is the centre of its arc. The radius is subtracted from the distance of each wall. Friction acts
 at the touching point, which is one radius away from C (`roll`).

@@ -1,4 +1,4 @@
-"""Import of Python modules that define contact laws. A user names a module in a command; a file cannot name modules."""
+"""Import of Python modules that define contact laws. The modules are named in a command, never in a file."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def load_laws(names: Iterable[str]) -> None:
 
 
 def loaded_laws() -> tuple[str, ...]:
-    """Return the names of the imported modules, so that child processes can import them too."""
+    """Return the names of the imported modules, so that child processes can import the same modules."""
     return tuple(_loaded)
 
 

@@ -1,4 +1,4 @@
-"""Running-in: the wear coefficient of a new pad is higher and decreases with the wear depth h.
+"""Running-in of a pad. The wear coefficient of a new pad is high, and decreases with the wear depth h.
 
 The wear coefficient is k_s (1 + (r - 1) exp(-h / h0)). Let z be the depth to which k_s alone would have worn the pad.
 Then

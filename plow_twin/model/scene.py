@@ -127,8 +127,8 @@ class Clearance:
 class Contact:
     """Normal contact. All pairs have the same law with the same parameters.
 
-    A scene gives either `damping` or `restitution`; a law without damping needs neither. Under the default law, an
-    impact has exactly the given restitution.
+    A scene gives one of `damping` and `restitution`. Under a law without damping, a scene gives none of the two. Under
+    the default law, an impact has exactly the given restitution.
 
     The restitution can decrease with the impact speed w = v (m' / m)^p:
 
@@ -136,7 +136,8 @@ class Contact:
       `restitution_mass_power`.
     - If w exceeds v1 = `restitution_speed_m_s`, the restitution is multiplied by (w / v1)^-q with q =
       `restitution_fall`.
-    - The product of `restitution_fall_along_s_m` and the speed of the centre of mass along the wall is then subtracted.
+    - The product of `restitution_fall_along_s_m` and the speed of the centre of mass along the wall is subtracted from
+      this restitution.
 
     References
     ----------
@@ -522,7 +523,7 @@ def _check_wear(wear: Wear, contact: Contact) -> Iterator[Problem]:
 
 
 def fastest_travel(wear: Wear | None, contact: Contact) -> float:
-    """Return the largest speed along the face in m/s: A / (k_s C) with the damping C, or inf without C or wear.
+    """Return the largest speed along the face in m/s, A / (k_s C) with the damping C. Without C or wear, return inf.
 
     Above this speed, a force wears the pad faster than it moves the head, so no contact can last.
     """
@@ -533,7 +534,7 @@ def fastest_travel(wear: Wear | None, contact: Contact) -> float:
 
 
 def check_travel_speed(scene: Scene, speed_m_s: float) -> None:
-    """Raise an `ArgumentError` if the scene does not admit a speed along the face in m/s. The speed has either sign."""
+    """Raise an `ArgumentError` if the scene does not admit a speed along the face in m/s. The speed may be negative."""
     fastest = fastest_travel(scene.wear, scene.contact)
     if not math.isfinite(speed_m_s):
         raise ArgumentError(f"speed_m_s: got {speed_m_s!r}, expected a finite speed in m/s")

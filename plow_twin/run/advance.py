@@ -32,7 +32,7 @@ class _Column(Generic[Number]):
 
 
 class _View:
-    """Columns of one row or of many rows. A column of one row is an array, too."""
+    """Columns of one row or of many rows. Even the column of a single row is an array."""
 
     __slots__ = ("rows",)
 

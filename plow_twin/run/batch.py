@@ -89,8 +89,8 @@ class TwinBatch:
 
     Each SIMD vector advances eight twins if no scene has a ramp, wear, friction, a support, locks, an offset centre of
     mass or overdamped contact. The bits of such a twin's results do not depend on the other twins of the batch. The
-    results agree with those of a `Twin` within the tolerance. In all other batches, a twin gives results that are
-    bit-identical to a `Twin` with the same terms.
+    results agree with those of a `Twin` within the tolerance. In batches with any of these terms, a twin gives results
+    that are bit-identical to a `Twin` with the same terms.
     """
 
     def __init__(
@@ -240,8 +240,8 @@ class TwinBatch:
         moved : array_like, shape (m, 6)
             Displacement of x, y [m], theta [rad] and their rates for each twin.
         again : bool
-            Whether the twins were displaced from the same twin before. If True, the damping factor of a continuing
-            contact is unchanged in each twin. If False, it is copied from the sampled twin.
+            Whether an earlier call displaced the twins from the same sampled twin. If True, the damping factor of a
+            continuing contact is unchanged in each twin. If False, it is copied from the sampled twin.
 
         Raises
         ------
@@ -297,7 +297,7 @@ class TwinBatch:
         Returns
         -------
         ndarray of bool, shape (k,)
-            False for a twin whose scene was not replaced, because the terms of its equations would have changed.
+            False for a twin if its scene was not replaced, because the new scene has different terms.
         """
         changed = np.zeros(len(scenes), dtype=bool)
         own = list(self.scenes)

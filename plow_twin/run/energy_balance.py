@@ -19,17 +19,22 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """Balance of energy and momentum of a run: comparison of integrals of the forces with the change of the state.
+    """Balance of energy and momentum of a run. Integrals of the forces are compared with the change of the state.
 
     Attributes
     ----------
-    kinetic_j, stored_j : tuple of float
-        Kinetic energy, including a frame on springs, and elastic energy K d^(n+1) / (n+1) of the contacts in J. Each
-        tuple contains the value at the start and the value at the end.
-    load_work_j, gravity_work_j : float
-        Work in J of the loads without gravity, and work of gravity including its constant moment.
-    contact_work_j, friction_work_j : float
-        Energy in J that normal contact forces and friction take from the head.
+    kinetic_j : tuple of float
+        Kinetic energy in J at the start and at the end. The energy of a frame on springs is included.
+    stored_j : tuple of float
+        Elastic energy K d^(n+1) / (n+1) of the contacts in J, at the start and at the end.
+    load_work_j : float
+        Work in J of the loads without gravity.
+    gravity_work_j : float
+        Work in J of gravity and of its constant moment.
+    contact_work_j : float
+        Energy in J that normal contact forces take from the head.
+    friction_work_j : float
+        Energy in J that friction takes from the head.
     support_work_j : float
         Energy in J that the springs and dampers of a `Support` take.
     dissipated_j : float

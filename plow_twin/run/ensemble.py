@@ -1,4 +1,4 @@
-"""Runs of many scenes on all cores. The scenes can differ in clearance, stiffness, load or initial state.
+"""Runs of many scenes on all cores. The scenes can have different clearances, stiffnesses, loads and initial states.
 
 Scenes whose only terms are their contact law and harmonic loads share SIMD vectors (`solve.lanes`). All other scenes
 run one by one.
@@ -40,8 +40,12 @@ class Ensemble:
         Times of the output rows in s.
     q, v : ndarray, shape (m, n, 3)
         Pose x, y [m], theta [rad] and its rates. The rows after a failure are NaN.
-    peak, impulse, time_in_contact : ndarray, shape (m, 8)
-        Largest force [N], impulse [N s] and time in contact [s] of each pair over the whole motion.
+    peak : ndarray, shape (m, 8)
+        Largest force of each pair in N.
+    impulse : ndarray, shape (m, 8)
+        Impulse of each pair in N s.
+    time_in_contact : ndarray, shape (m, 8)
+        Time in which each pair is in contact in s.
     makes : ndarray of int64, shape (m, 8)
         Number of touches of each pair.
     set_time : ndarray, shape (m, 2, 16)
@@ -51,8 +55,10 @@ class Ensemble:
         Number of changes of contact mode.
     wear_depth : ndarray, shape (m, 8)
         Wear depth of each pad at the end in m.
-    steps, status : ndarray of int64, shape (m,)
-        Number of steps, and `Status` of each member. A failure of one member does not stop the others.
+    steps : ndarray of int64, shape (m,)
+        Number of steps of each member.
+    status : ndarray of int64, shape (m,)
+        `Status` of each member. A member that fails does not stop the run of the ensemble.
     """
 
     t: Array
@@ -80,7 +86,7 @@ def simulate_many(
     max_steps: int = BUDGET,
     max_wall_s: float = MOST_SECONDS,
 ) -> Ensemble:
-    """Simulate every scene from t = 0 to `t_end`. The bits of a result depend only on its own scene.
+    """Simulate every scene from t = 0 to `t_end`. The bits of a result do not depend on the other scenes.
 
     Scenes run eight at a time in the lanes of a SIMD vector if they have constant or harmonic loads, a contact law
     without a ramp, and no further terms. The results of these scenes agree with `simulate` within the tolerance. For
@@ -103,7 +109,7 @@ def simulate_many(
     Returns
     -------
     Ensemble
-        Rows, statistics and status of each member. A failure of one member does not stop the others.
+        Rows, statistics and status of each member. A member that fails does not stop the call.
 
     Raises
     ------

@@ -29,8 +29,8 @@ from plow_twin.solve.tangents import ALONG, STATE_COLUMNS, follow_columns
 
 Array = NDArray[np.float64]
 
-#: `DISPLACEMENT`: displacement of a shadow relative to the clearance. `_LEAST_DISPLACEMENT`: its smallest value near a
-#: wall. `SHADOW_TOLERANCE`: tolerance of the motion of a shadow.
+#: `DISPLACEMENT`: displacement of a shadow relative to the clearance. `_LEAST_DISPLACEMENT`: smallest displacement of a
+#: shadow near a wall. `SHADOW_TOLERANCE`: tolerance of the motion of a shadow.
 DISPLACEMENT: Final = 1e-7
 _LEAST_DISPLACEMENT: Final = 1e-10
 SHADOW_TOLERANCE: Final = 1e-12
@@ -44,9 +44,9 @@ _CLEAR_OF_WALLS: Final = 100.0
 _MOST_MERGED: Final = 20
 #: Largest number of solver steps of a shadow in one stretch.
 _SHADOW_BUDGET: Final = 10**7
-#: `_EQUATIONS_TOLERANCE`: tolerance of the motion along which the equations are linearised. The error of the
-#: derivatives is then some 1e-6 times the growth of errors. If this error exceeds `_LARGEST_ERROR`, the tolerance of
-#: the run is used.
+#: `_EQUATIONS_TOLERANCE`: tolerance of the motion along which the equations are linearised. With this tolerance, the
+#: error of the derivatives is some 1e-6 times the growth of errors. If this error exceeds `_LARGEST_ERROR`, the
+#: tolerance of the run is used.
 _EQUATIONS_TOLERANCE, _LARGEST_ERROR = 1e-6, 1e-2
 #: `_FIRST_SLICE`: number of steps before the first check of the time limit. `_MOST_WITHOUT_IMPLICIT`: largest number of
 #: explicit steps in a scene that may need implicit steps.
@@ -199,7 +199,7 @@ class StretchProduct:
         self._basis, self._scratch = np.eye(size), np.zeros((5 + MOST_KEPT, size, size))
 
     def follow(self, matrices: Array, changes: Array, ends: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
-        """Multiply the product by the matrices of further stretches. The attributes then refer to the end of the last.
+        """Multiply the product by the matrices of successive stretches, and update the attributes.
 
         At a time within a stretch, `growth` includes only errors of coordinates. In the middle of an impact, a stiff
         contact turns any displacement into a large, temporary difference of velocities.
@@ -216,7 +216,7 @@ class StretchProduct:
         Returns
         -------
         totals, rows, growth : ndarray, shapes (n, k, k), (n, p, k) and (n,)
-            The values of the attributes at each of the n times.
+            The attributes `total`, `rows` and `growth` at each of the n times.
         logs : ndarray, shape (n, k)
             Logarithms of the factors by which a stretch has extended the vectors of a basis, in the row of the end of
             the stretch. All other rows are 0.
@@ -241,7 +241,7 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
     t_end : float
         End of the motion in s, above 0.
     tol : float
-        Tolerance of the simulated motion. The derivatives may be computed with another tolerance.
+        Tolerance of the simulated motion. The tolerance of the derivatives may be different.
     parameters : sequence of str
         Paths of the parameters with respect to which derivatives are computed, from `sensitivity_parameters`.
 
@@ -424,8 +424,9 @@ def _beside(
 ) -> list[State]:
     """Return a state and its shadows: one for each free coordinate or rate, and one for each changed scene.
 
-    `moved` contains the displacements of the first group. Shadows of changed scenes are not displaced. The damping
-    factors of these shadows were set at their own touches, and are taken from the states `before`.
+    `moved` contains the displacements of the shadows for coordinates and rates. Shadows of changed scenes are not
+    displaced. The damping factors of these shadows were set at their own touches, and are taken from the states
+    `before`.
     """
     start = _pose_and_rate(_follow(compiled, state, float(state.time), work))
     states = [state]

@@ -62,8 +62,10 @@ class Result:
         the Taylor series, or one evaluation of the right-hand side in a fixed step.
     wear_depth : ndarray, shape (8,)
         Wear depth of each pad at the end in m.
-    wall_s, compile_s : float
-        Wall-clock times in s of the run and of the compilation before the run.
+    wall_s : float
+        Wall-clock time of the run in s, without compilation.
+    compile_s : float
+        Wall-clock time in s of the compilation before the run.
     energy_balance : EnergyBalance or None
         Balance of energy and momentum, if it was requested.
     sensitivity : Sensitivity or None
@@ -144,9 +146,9 @@ def simulate(
     on_progress : callable, optional
         Function that is called with the completed share of the motion, 0..1, some fifty times a second.
     sensitivity : bool or sequence of str
-        Whether to integrate the linearised motion, too, which shows whether the tolerance is met
-        (`Result.sensitivity`). If errors grow too much, a `ToleranceWarning` is issued. A sequence contains paths of
-        parameters (`sensitivity_parameters`); the derivatives with respect to these parameters are then computed, too.
+        Whether to integrate the linearised motion, which shows whether the tolerance is met (`Result.sensitivity`). If
+        errors grow too much, a `ToleranceWarning` is issued. A sequence of parameter paths (`sensitivity_parameters`)
+        selects derivatives with respect to these parameters.
 
         The computation takes some five times as long as the run. It takes a hundred times as long, or longer, for
         scenes with friction, wear, a ramp, a table, a locked degree of freedom or overdamped contact.
@@ -167,7 +169,7 @@ def simulate(
         limit.
     RunInterrupted
         The user pressed Ctrl-C. The attribute `result` of the error contains the motion up to the interruption. The
-        error is also a `KeyboardInterrupt`.
+        class of the error is a subclass of `KeyboardInterrupt`.
     """
     check_times(t_end, output_dt, method, dt)
     check_limits(max_steps, max_wall_s)

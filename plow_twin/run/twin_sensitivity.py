@@ -1,7 +1,8 @@
-"""Growth of errors and effects of parameters along the motion of a live twin.
+"""Derivatives of a live twin's motion with respect to its initial state and to parameters.
 
-Growth and effects are computed from shadows, which are copies of the twin with a small displacement or a changed
-parameter. At the end of each stretch, an interval of some 0.1 s, the shadows start again beside the twin.
+The derivatives are computed from shadows, which are copies of the twin with a small displacement or a changed
+parameter. The motion is divided into stretches of some 0.1 s. At the start of each stretch, the shadows are set to the
+state of the twin or to a displaced state.
 """
 
 from __future__ import annotations
@@ -44,8 +45,8 @@ class TwinSensitivity:
     Parameters
     ----------
     twin : Twin
-        A twin with `excitation="sampled"`. From now on only the method `advance` of this object may advance the twin.
-        The results of this method are bit-identical to `Twin.advance`.
+        A twin with `excitation="sampled"`. After the creation of this object, only its method `advance` may advance the
+        twin. The results of this method are bit-identical to `Twin.advance`.
     parameters : sequence of str
         Paths of the parameters with respect to which derivatives are computed, from `sensitivity_parameters`.
 

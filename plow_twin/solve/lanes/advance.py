@@ -51,8 +51,8 @@ from plow_twin.solve.method.rest import slow_enough
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, Status, X, Y
 from plow_twin.solve.step import LONGEST_STEP
 
-#: Number of steps towards a sample under constant load, after which a lane is checked for rest. The check costs as much
-#: as these steps.
+#: Number of steps under constant load between two samples, after which a lane is checked for rest. The check costs as
+#: much as this number of steps.
 _MAY_REST: Final = 32
 #: Size of a term that is treated as zero, divided by the admissible size of the term of the last order
 #: (`method.series`).
@@ -93,8 +93,8 @@ class Samples(NamedTuple):
 
 
 #: Indices in `Samples.progress`: current block, number of twins that another method continues, state of the current
-#: block, first twin of the thread, and the twin after its last twin. The state of a block is `_LOADED` in the lanes,
-#: `_LEFT` if one of its twins has left the lanes, and otherwise 0.
+#: block, first twin of the thread, and the twin after its last twin. The state of a block is `_LOADED` if it is in the
+#: lanes, `_LEFT` if one of its twins has left the lanes, and 0 in all other cases.
 BLOCK_NOW, OTHERS, LOADED, FIRST, END = range(5)
 _LOADED, _LEFT = 1, 2
 
@@ -263,7 +263,7 @@ def _clear_sums(s, lanes, bits) -> None:
 
 @kernel()
 def _fail(s, lanes, lane, code) -> None:
-    """Undo a failed advance: the twin gets its previous state at the time of the next sample.
+    """Undo a failed advance. The twin has its previous state at the time of the next sample.
 
     The caller has to call `note_modes` afterwards.
     """
@@ -441,7 +441,7 @@ def _get_ready(s, viscous, hysteretic, power, fraction, rest, lanes, budget) -> 
 
 @kernel()
 def _leave(s, lanes, lane) -> None:
-    """Remove a twin from its lane, so that another method continues it from the previous sample.
+    """Remove a twin from its lane, so that a method without lanes continues it from the previous sample.
 
     The caller has to call `note_modes` afterwards.
     """
@@ -492,8 +492,9 @@ def advance_lanes(
     """Advance the twins of all blocks through all samples. Return False if `iterations` iterations were not sufficient.
 
     `eight` and `work`, shape (1,), are lanes and scratch space. `budget` is the largest number of steps of an advance
-    to a sample. If an advance fails, the twin keeps its state, and its time becomes that of the sample. A twin at rest
-    leaves its lane with its state at the previous sample, and another method continues it (`Samples.other`).
+    to a sample. If an advance fails, the state of the twin is unchanged, and its time becomes the time of the sample. A
+    twin at rest leaves its lane with its state at the previous sample. A method without lanes continues it
+    (`Samples.other`).
     """
     s, lanes, w = _unowned_samples(s), eight[0], work[0]
     for _ in range(iterations):

@@ -4,7 +4,7 @@ An event is the time at which a guard function becomes negative. Only few guard 
 step. Each lane lists these guard functions, and each iteration searches eight of them, from any lanes.
 
 If a CLIPPED or RELEASED pair separates from its wall, no force changes, so the step does not end. The rest of the step
-is then searched for the next touch of this pair.
+is searched for the next touch of this pair.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ from plow_twin.solve.state import CLIPPED, COS, OFF, ON, RELEASED, SIN, X, Y
 
 #: Largest difference of the times of two simultaneous events, divided by the size of the step that ends with them.
 _AT_ONCE = 1e-12
-#: Conditions for the end of a search for a root. `_FOUND`: relative change of the root; the next change would be of the
-#: order of its cube. `_STRAIGHT`: effect of the curvature on the change. `_ROUNDED`: relative change due to rounding.
+#: Conditions for the end of a search for a root. `_FOUND`: relative change of the root. The next change would be of the
+#: order of the cube of this change. `_STRAIGHT`: effect of the curvature on the change. `_ROUNDED`: relative change due
+#: to rounding.
 _FOUND, _STRAIGHT, _ROUNDED = 1e-6, 1e-3, 2e-16
 _MOST_CHANGES = 80
 #: Factor for rounding. If the step has been shortened since the search for a root began, a root that exceeds the step
@@ -49,7 +50,8 @@ def _list_guards(lanes, order, hysteretic, power, fraction) -> None:
     The guard functions depend on the mode and on the penetration d:
 
     - OFF: -d.
-    - ON: F / K = d + (C / K) d'. For the damping lambda d', there are two functions: d and 1 + lambda d'.
+    - ON, with the damping C d': F / K = d + (C / K) d'.
+    - ON, with the damping lambda d': d and 1 + lambda d'.
     - CLIPPED: d, and the force with the opposite sign.
     - RELEASED (`modes`): d, and the distance to the release penetration.
     """
@@ -175,8 +177,8 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
             term = fused(of_rate * (k + 1.0), deeper, of_depth * depth)
             deeper = depth
         else:
-            # the series variable may be a root of time; the rate d' is then not the derivative of the series of d, but
-            # has its own series
+            # the series variable may be a root of time; in this variable, the series of the rate d' is not the
+            # derivative of the series of d
             term = of_depth * depth
             if damped != 0 and k < order:
                 deeper = linear_at(
@@ -206,7 +208,7 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
 
 @kernel()
 def _choose_guards(lanes, at, hysteretic, fraction) -> int:
-    """Choose up to eight guard functions, the next one of each lane first. Return their number."""
+    """Choose up to eight guard functions, beginning with the next function of each lane. Return their number."""
     count, before = 0, -1
     while before < count < WIDTH:
         before = count
@@ -375,7 +377,7 @@ def first_events(lanes, w, order, full, hysteretic, power, fraction) -> None:
     for lane in range(WIDTH):
         lanes.event[lane] = -1
     _list_guards(lanes, order, hysteretic, power, fraction)
-    # every iteration searches at least one guard function of each lane that has any left to search
+    # every iteration searches at least one guard function of each lane whose list is not empty
     for at in range(GUARDS):
         lanes.rounds[0] = at
         count = _choose_guards(lanes, at, hysteretic, fraction)
@@ -408,7 +410,7 @@ def _write_chosen(lanes, at, order, full, fraction):
 
 @kernel()
 def _search(lanes, w, at, order, bits) -> None:
-    """Search the first root of each guard function. List it again if a shorter step may change the result."""
+    """Search the first root of each guard function. A function stays listed if a shorter step may change its root."""
     guard = lanes.guard[at]
     single, several = isolate(lanes, guard, w, order, bits)
     if single != 0:
@@ -436,7 +438,7 @@ def _search(lanes, w, at, order, bits) -> None:
 
 @kernel()
 def _next_mode(lanes, lane, mode, viscous, fraction):
-    """Return the mode after `mode`, when the first guard function of a pair becomes negative."""
+    """Return the mode that follows `mode` when the first guard function of a pair becomes negative."""
     if mode == OFF:
         return ON if fraction is None or lanes.exponent[lane] == 1.5 else RELEASED
     if fraction is not None:  # noqa: SIM102 - left out by types
@@ -447,7 +449,7 @@ def _next_mode(lanes, lane, mode, viscous, fraction):
 
 @kernel(inline="source")
 def _other_mode(mode):
-    """Return the mode after `mode`, when the second guard function of a pair becomes negative."""
+    """Return the mode that follows `mode` when the second guard function of a pair becomes negative."""
     return CLIPPED if mode == ON else ON
 
 

@@ -1,4 +1,4 @@
-"""The main loop for lanes. Each lane runs a scene with the scene's own steps, and then takes the next scene."""
+"""The main loop for lanes. Each lane runs one scene after another, with steps that do not depend on other lanes."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def _another_method(p, harmonics, extent, flight, rest, state, lanes, lane, w, s
 
 @kernel()
 def _look(members, flight, rest, lanes, lane, w, t_end, budget, in_range) -> int:
-    """Return `OK` if the lane can take the next step of its scene, or else the status with which the scene leaves."""
+    """Return `OK` if the lane can take the next step, or the status with which the scene has to leave the lane."""
     member = lanes.member[lane]
     p, state = members.params[member], members.states[member]
     if not in_range and not lane_in_range(lanes, p, state, lane):
@@ -339,10 +339,10 @@ def run_lanes(
 
     Returns False if `iterations` iterations were not sufficient.
 
-    `power` is 1 for exponents other than 1, and `fraction` is 1 for exponents that are not integers; otherwise they are
-    None. `t` contains the times of the output rows, `order` is the order of the series, and `budget` the largest number
-    of steps of a scene. A scene leaves its lane with a `Status` or with `OTHER_METHOD`. After the last iteration, all
-    scenes leave with `PAUSED`.
+    `power` is 1 for exponents other than 1, and None for the exponent 1. `fraction` is 1 for exponents that are not
+    integers, and None for integers. `t` contains the times of the output rows. `order` is the order of the series.
+    `budget` is the largest number of steps of a scene. A scene leaves its lane with a `Status` or with `OTHER_METHOD`.
+    After the last iteration, all scenes leave with `PAUSED`.
     """
     members, queue, t = _unowned_members(members), unowned(queue), unowned(t)
     waiting = 0

@@ -1,4 +1,4 @@
-"""The series variable sigma of each lane for exponents that are not integers: time, or a root of time.
+"""Choice of each lane's series variable sigma (time or a root of time), for exponents that are not integers.
 
 The time since the start of a step is t = alpha sigma + beta sigma^2 / 2 (`method.series`). For the exponent 1.5, sigma
 is derived from the square root of the time since a recent touch, or of the time until a near separation, as in

@@ -26,8 +26,9 @@ WIDTH: Final = 8
 COMPONENTS: Final = 8
 #: Indices in `moment` of the factors of cosine, sine, X and Y in the contacts' moment.
 DC, DS, DX, DY = range(4)
-#: Numbering of guard functions: the first guard functions of the eight pairs begin at 0, their second guard functions
-#: at `SECOND`. Guard functions of pairs that separate within the step and may touch again begin at `AGAIN`.
+#: Numbering of guard functions. The first guard functions of the eight pairs begin at 0. The second guard functions of
+#: the pairs begin at `SECOND`. The guard functions for a new touch after a separation in the same step begin at
+#: `AGAIN`.
 SECOND: Final = PAIR_COUNT
 AGAIN: Final = 2 * PAIR_COUNT
 GUARDS: Final = 3 * PAIR_COUNT
@@ -135,8 +136,8 @@ LANES: Final = np.dtype(
         ("whole", "f8", _LANES_OF),  # longest admissible step in s
         ("reach", "f8", _LANES_OF),  # guard functions of an iteration: end of the interval that is searched
         ("root", "f8", _LANES_OF),  # guard functions of an iteration: first root
-        ("begin", "f8", _LANES_OF),  # guard functions of an iteration: time of the pair's separation, else 0
-        ("parted", "f8", _PAIRS),  # time at which a CLIPPED pair separates within the step, else infinity
+        ("begin", "f8", _LANES_OF),  # guard functions of an iteration: time of the pair's separation, or 0
+        ("parted", "f8", _PAIRS),  # time at which a CLIPPED pair separates, or infinity
         ("peak", "f8", _PAIRS),
         ("impulse", "f8", _PAIRS),
         ("time_in_contact", "f8", _PAIRS),
@@ -185,8 +186,8 @@ LANES: Final = np.dtype(
 )
 
 
-#: Terms that lanes support: those of a contact law without a ramp, harmonic loads, flight and rest. For a step of
-#: flight or rest, the scene is taken out of its lane.
+#: Terms that lanes support. They are the terms of a contact law without a ramp, harmonic loads, flight and rest. For a
+#: step of flight or rest, the scene is taken out of its lane.
 _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "fraction", "flight", "rest"}
 
 

@@ -2,8 +2,8 @@
 
 If the contact force is linear in penetration and rate, the sum over a scene's acting pairs is one affine map of the
 state. An order then needs twelve Cauchy products, for any number of acting pairs. A force with the damping lambda d'
-needs more products for each slot of acting pairs (`record`). K d (1 + lambda d') is K (d + lambda / 2 (d^2)'), which
-needs half a product more. d^n (1 + lambda d') needs three products more.
+needs more products for each slot of acting pairs (`record`). The force K d (1 + lambda d') = K (d + lambda / 2 (d^2)')
+adds half a product for each slot. The force K d^n (1 + lambda d') adds three products for each slot.
 """
 
 from __future__ import annotations
@@ -552,8 +552,7 @@ def accurate_steps(lanes, w, order, power, fraction) -> int:
         here = coarse_log2(exact_row(lanes.threshold, i) / size) * w.inverse[order - i]
         least = choose(below(here, least), here, least)
     shorter = below(coarse_exp2(least), whole)
-    # over a long step, an admissible error of the velocity results in an error of the position that is too large; the
-    # step is then shortened
+    # a long step is shortened, because an admissible error of the velocity results in a large error of the position
     stretch = least + exact_row(lanes.stretch, 0)
     stretch = choose(below(zero, stretch), stretch, zero)
     step = choose(shorter, coarse_exp2(fused(stretch, exact_splat(-w.inverse[order]), least)), whole)

@@ -1,4 +1,4 @@
-"""Equilibrium of a head that is held by its contacts: conditions on the pairs, stiffness, and distance."""
+"""Equilibrium of a head that is held by its contacts. The functions compute its stiffness and its distance."""
 
 from __future__ import annotations
 

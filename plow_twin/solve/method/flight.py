@@ -2,7 +2,8 @@
 
 Without contact, position and angle of the head are double integrals of the load. These integrals are elementary
 functions for constant, piecewise linear and harmonic loads. An upper bound of the distance that the head moves within a
-time limits the step (conservative advancement). Near a wall, Taylor series are used, with event detection.
+time limits the step (conservative advancement). Near a wall, the motion is computed by Taylor series with event
+detection.
 """
 
 from __future__ import annotations

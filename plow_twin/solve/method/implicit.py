@@ -51,7 +51,7 @@ from plow_twin.solve.support import (
 #: Number s of stages, which is the degree of the polynomials. The order of the method is 2 s - 1.
 STAGES = 9
 #: Ratio of the decay rate of a contact's dampers to the angular frequency of its springs, above which the contact is
-#: overdamped. The same ratio determines at compilation whether a scene may need implicit steps.
+#: overdamped. This ratio determines at compilation whether a scene may need implicit steps.
 OVERDAMPED_RATIO = 20.0
 #: Cost of an implicit step, divided by the cost of an explicit step. An implicit step must be longer than this number
 #: of stable explicit steps.
@@ -436,7 +436,7 @@ def _series_seen(support, h, w, implicit):
 
 @kernel()
 def _frame_terms(p, support, w, implicit, scale):
-    """Return the frame's initial velocity that the series omit, and the size of the last term of its series."""
+    """Return the initial velocity of the frame that its series omits, and the size of the last term of the series."""
     off = size = 0.0
     if support is not None:
         s = implicit.nodes.size
@@ -579,7 +579,7 @@ def _lay_out(p, parts, implicit, ramp, rubbing, slip, stick, support, state, w, 
         return False
     state.implicit_size_before, state.decay_times_before = state.implicit_size, state.decay_times
     state.refused_before = state.refused
-    # the dampers of a support act without contact, too
+    # the dampers of a support act even without contact
     damped = penetrating or support is not None
     w.decay[0] = decay_rate(p, state, slip, stick, support) if damped else 0.0
     if w.decay[0] <= 0.0 or state.touching != 0 or not has_decayed(p, state):
@@ -636,7 +636,7 @@ def _collocate(p, parts, support, state, w, span, decay, implicit, ramp, wear, s
             size = _write_series(p, support, state, h, w, implicit, ramp, wear, stick)
             better = 0.9 * (admissible / max(size, 1e-6 * admissible)) ** (1.0 / (STAGES - 1))
             if size <= admissible:
-                # a sample may have shortened the step; the previous size is then still a good estimate
+                # if a sample has shortened the step, the size of the next step is not reduced
                 longer = h * min(better, 4.0)
                 state.implicit_size = max(longer, state.implicit_size) if h == span else longer
                 state.implicit_steps += 1

@@ -1,4 +1,4 @@
-"""Rest: the decaying vibration of a head that is held by its contacts is omitted once it is small.
+"""Detection of rest. Once the decaying vibration of a head that is held by its contacts is small, it is omitted.
 
 Under constant loads, the sum of kinetic and potential energy cannot increase. If the stiffness is positive definite,
 this sum is an upper bound of the head's distance from its equilibrium for all time. When the bound is far below the
@@ -50,7 +50,7 @@ def slow_enough(p, y) -> bool:
 def _still(p, acts, harmonics, state, w) -> bool:
     """Return whether the motion that is omitted at rest stays within its share of the tolerances for all time.
 
-    If so, `w.rest[0]` contains the equilibrium of the head.
+    If the result is True, `w.rest[0]` contains the equilibrium of the head.
     """
     y, z, rate = state.y, w.rest[0], w.rest[1]
     gyration, speed = _gyration(p), _speed(p, y)

@@ -50,7 +50,7 @@ _rates_of = permutation(VX, VY, VX, VY, OMEGA, COS, SIN, OMEGA)
 
 @kernel(fast=True)
 def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:
-    """Write the series of the harmonic loads (S1 and S2 along two directions, moment M) to `w.load`.
+    """Write the series of the harmonic forces S1 and S2 and of the harmonic moment M to `w.load`.
 
     The coefficients of sine and cosine follow from (k+1) sin_{k+1} = omega (alpha cos_k + beta cos_{k-1}), and from the
     corresponding equation for the cosine.

@@ -1,8 +1,9 @@
-"""Rest under small harmonic loads: proof that the motion of a head in contact stays below the tolerance.
+"""Proof that the motion of a head in contact stays below the tolerance under small harmonic loads.
 
-Near its equilibrium, the head satisfies e'' + C e' + K e = r. Here e is its distance from the linear response to the
-harmonic loads. The third coordinate of e is the angle times the radius of gyration. r is the remainder of the
-linearisation. The linear response is known in closed form, including resonance.
+Near its equilibrium, the head satisfies e'' + C e' + K e = r. K and C are the matrices of stiffness and damping,
+divided by mass and inertia. e is the distance of the head from the linear response to the harmonic loads. The third
+coordinate of e is the angle times the radius of gyration. r is the remainder of the linearisation. The linear response
+is known in closed form, including resonance.
 
 Let s and c be the smallest eigenvalues of K and C, and S the largest eigenvalue of C. Choose eps at most c / 2,
 s / (10 S) and sqrt(s) / 10. The Lyapunov function V and the squared size W of the motion then satisfy

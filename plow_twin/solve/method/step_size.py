@@ -24,7 +24,7 @@ _PARTING_REACH_STICK = 8.0
 _NEWTON_STEPS, _ROOT_FOUND = 6, 1e-9
 #: Largest usable term of a series. Products of larger terms would not be finite.
 _FINITE = 1e300
-#: A shorter step also has a smaller largest term, so a step is shortened repeatedly. `_SHORTER`: largest number of
+#: The largest term decreases when a step is shortened, so a step is shortened repeatedly. `_SHORTER`: largest number of
 #: repetitions. `_SHORT_ENOUGH`: ratio of successive sizes above which the repetition ends.
 _SHORTER, _SHORT_ENOUGH = 20, 0.9
 
@@ -45,8 +45,7 @@ def accurate_step(p, w, order, sigma_limit):
         if size > 0.0:
             least = min(least, math.log(p.threshold[k] / size) / k)
     sigma = min(sigma_limit, math.exp(least))
-    # over a long step, an admissible error of the velocity results in an error of the position that is too large; the
-    # step is then shortened
+    # a long step is shortened, because an admissible error of the velocity results in a large error of the position
     stretch = sigma * p.velocity_tolerance / (p.position_tolerance * (order + 1))
     if stretch > 1.0 and sigma < sigma_limit:
         sigma *= math.exp(-math.log(stretch) / order)
@@ -81,9 +80,9 @@ def before_pushing_again(p, state, w, order, sigma, integer, fraction) -> float:
     """Return `sigma`, or the smaller value up to which the ramped force of CLIPPED pairs has an accurate series.
 
     This force does not act yet and appears only in a guard function, so no other test limits its error. The root test
-    of the motion is applied to the velocity that the force would cause. The test is necessary for two reasons: the
-    active share of C is a cubic, whose series is longer than that of the penetration, and d^n has a branch point where
-    the pair separates. If the series of the motion has ended early, the test uses the available orders.
+    of the motion is applied to the velocity that the force would cause. The test is necessary because the active share
+    of C, a cubic, has a longer series than the penetration. Moreover, d^n has a branch point where the pair separates.
+    If the series of the motion has ended early, the test uses the available orders.
     """
     least, share = np.inf, math.log(p.threshold[p.order] / p.threshold[0]) / order
     for pair in range(PAIR_COUNT):

@@ -19,8 +19,8 @@ from plow_twin.solve.method.step_size import (
 #: the last step size.
 TOUCH_REACH = 2.5
 #: Longest step in the square root of the time since the touch, divided by its value at the start of the step. The
-#: series of the force has the rounding error of 1 / sqrt(t), which grows by this factor with each order, to 1e18 at
-#: order 30. The motion does not have this error, because the factor dt / dsigma cancels it.
+#: series of the force has the rounding error of 1 / sqrt(t), which grows by this factor with each order. The motion
+#: does not have this error, because the factor dt / dsigma cancels it.
 FURTHEST = 4.0
 
 
