@@ -1,6 +1,6 @@
 """A local socket through which a twin without ROS offers the services of the node.
 
-A request is a single datagram, and so is its answer. A slow client can therefore not block the twin.
+A request is a single datagram, and the answer is a single datagram. A slow client can therefore not block the twin.
 """
 
 from __future__ import annotations

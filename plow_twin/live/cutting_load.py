@@ -1,8 +1,9 @@
 """Random cutting load along the face, with a Gamma distribution and a spatial correlation.
 
 A new random process is drawn for each pass. The process is a function of the position along the face, so that it does
-not depend on the sampling rate or the speed. It is a translation process: a Gaussian process with exponential
-correlation is transformed to the Gamma distribution by the quantiles of the two distributions.
+not depend on the sampling rate or the speed. The process is a translation process. It is computed from a Gaussian
+process with exponential correlation, which is transformed to the Gamma distribution by the quantiles of the two
+distributions.
 
 References
 ----------
@@ -54,7 +55,8 @@ _SCHEMA: Final[Schema] = {
 class Face:
     """The face, and the motion of the plough along it.
 
-    The plough travels along the face with the speed `speed_m_s` [m/s] and then returns. A reversal takes `turn_s` [s].
+    The plough travels from one end of the face to the other with the speed `speed_m_s` [m/s], and returns. A reversal
+    takes `turn_s` [s].
     """
 
     length_m: float = 250.0

@@ -236,7 +236,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
 
 
 def failures(runtime: Runtime) -> list[str]:
-    """Return a text about the failed advances of the model and the motion after them, or no text without failures."""
+    """Return a text about the failed advances of the model. If no advance failed, the list is empty."""
     failed = runtime.driver.failed
     if not failed.count:
         return []
@@ -251,7 +251,7 @@ def failures(runtime: Runtime) -> list[str]:
 
 
 class Health:
-    """Creator of the parts of `/diagnostics`. It compares the counters with the counters of the previous report."""
+    """Creator of the parts of `/diagnostics`, which compares the counters with the counters of the previous report."""
 
     def __init__(self) -> None:
         self._before: dict[str, int] = {}
@@ -359,7 +359,7 @@ class Health:
         return (WARN if missed else OK), missed or "publishing", values
 
     def _note_periods(self, runtime: Runtime, values: dict[str, str]) -> str:
-        """Add statistics of the publishing period to `values`; return a warning about missed periods or ""."""
+        """Add statistics of the publishing period to `values`, and return a warning about missed periods or ""."""
         keys = ("periods_missed", "period_mean_ms", "period_deviation_ms", "period_max_ms")
         values |= dict.fromkeys(keys, "")
         if runtime.periods is None:
@@ -414,7 +414,7 @@ class Health:
         return OK, "following", values
 
     def recorder(self, runtime: Runtime) -> Part:
-        """Return the part `recorder` about the recording. Lost data have the level ERROR."""
+        """Return the part `recorder` about the recording. Its level is ERROR if data were lost."""
         values = dict.fromkeys(KEYS["recorder"], "")
         if runtime.recording is None:
             return OK, "not recording", values

@@ -57,7 +57,7 @@ class Estimation:
         #: agreement of the model and of the sensor with the measurements, according to the last estimate
         self.trust = {"model": "", "sensor": ""}
         self.reasons: tuple[str, ...] = ()
-        #: number of estimates, and number of windows that were skipped because a newer window was complete
+        #: number of estimates, and number of windows of measurements that were skipped for a newer window
         self.count = self.skipped = 0
         self.wall_s = 0.0
         self.end_ns: int | None = None
@@ -74,7 +74,7 @@ class Estimation:
 
     @property
     def shortage(self) -> str:
-        """Reason why no estimate was computed before the source ended; empty if there is an estimate."""
+        """Reason why no estimate was computed before the source ended. The text is empty if there is an estimate."""
         return "" if self.count else self.worker.ended or ""
 
     def add(self, entry: Entry) -> None:
@@ -114,7 +114,7 @@ class Estimation:
         """Apply a finished estimate to the session, and return its messages by topic.
 
         Without a finished estimate, the result is an empty dictionary. If the wear of the pads has been set, the
-        messages are empty: they replace the latched messages of the old estimate.
+        messages have no values, and they replace the latched messages of the old estimate.
         """
         found = self.worker.poll()
         stamp_ns, self._set_ns = self._set_ns, None
@@ -146,8 +146,8 @@ class Estimation:
 def entry_of(found: Found, session: Session, before: Estimated | None) -> Estimated:
     """Return the journal entry of an estimate.
 
-    If a clearance is not observable, the shift from the previous estimate `before` is used again. If a clearance is
-    withdrawn, the shift is 0, so that the clearance of the model is used.
+    If a clearance is not observable, its shift is that of the previous estimate `before`. If a clearance is withdrawn,
+    its shift is 0, so that the clearance of the model is used.
     """
     model = session.outputs.modelled(session.wear_depth)
     shift = np.array(before.shift) if before is not None else np.zeros(6)
@@ -180,7 +180,7 @@ def message_of(found: Found, frame_id: str) -> plain.JointState:
 
 
 def forces_message(found: Found, frame_id: str) -> plain.JointState:
-    """Return the message of the contact forces in a window, in the form of `contact_peaks`.
+    """Return the message of the contact forces in a window, in the form of the messages on `contact_peaks`.
 
     If the forces were not computed, the message has no values.
     """
@@ -197,7 +197,10 @@ def forces_message(found: Found, frame_id: str) -> plain.JointState:
 
 
 def forecast_message(found: Found, frame_id: str) -> plain.JointState:
-    """Return the message of a forecast: the time [s], distance [m], passes and shifts until the limit is reached."""
+    """Return the message of a forecast.
+
+    It contains the time [s], the distance [m], the passes and the shifts until the wear limit is reached.
+    """
     forecast = found.also["forecast"] or {}
     names: list[str] = []
     numbers: list[float] = []
@@ -215,7 +218,7 @@ def forecast_message(found: Found, frame_id: str) -> plain.JointState:
 
 
 def asked_of(settings: Settings) -> Asked:
-    """Return the further results that the parameters request in addition to the estimate."""
+    """Return the results that the parameters request in addition to the estimate."""
     horizontal, vertical = settings.forecast_limits
     plan = None
     if horizontal or vertical:

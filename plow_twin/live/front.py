@@ -31,7 +31,7 @@ from plow_twin.stream.outputs import Published
 from plow_twin.stream.topics import TOPICS
 
 NAME: Final = "/plow_twin"
-#: Longest wait for a message [s]. A requested stop is delayed by this time at most.
+#: Longest wait for a message [s], which is the largest delay of a requested stop.
 _POLL_S: Final = 0.1
 _REPORT_S: Final = 1.0
 #: Share of unused samples above which a probable cause is reported.
@@ -67,9 +67,9 @@ class BridgeFront:
     say
         Function that receives the status and the alarms when they change, and the diagnostics once a second.
     on_error
-        Function that receives errors. Other threads may also call this function.
+        Function that receives errors. It may be called from any thread.
     units
-        Units of quantities (fx, ..., or t for the time), which replace the units in the mapping.
+        Units that replace the units in the mapping, by name of the quantity. The name of the time is `t`.
 
     Raises
     ------
@@ -108,13 +108,13 @@ class BridgeFront:
         self.runtime = Runtime(self, settings, prepared)
         self._feeder = Feeder(self.roles, self.runtime, self.send, model if "drive" in self.roles else None)
         self._health = diagnostics.Health()
-        #: further functions to call periodically
+        #: functions that are called periodically in addition to the functions of the runtime
         self.timers: list[Timer] = []
         self._watchers: list[Watcher] = []
         self.more_parts: dict[str, Callable[[], Part]] = {}
 
     def attach(self, watcher: Watcher) -> None:
-        """Add a watcher, which then receives all reports and publications."""
+        """Add a watcher, which receives all reports and publications from the time of the call."""
         self._watchers.append(watcher)
         self.runtime.publishing.watch = self._published
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 TOPICS: Final = ("excitation", "tool_forces", "travel", "head_pose", "gaps")
 #: Inputs that are not the load.
 OPTIONAL: Final = ("travel", "head_pose", "gaps")
-#: Time after its last sample for which a sender that is not followed counts as present [ns].
+#: Time for which a sender that is not followed counts as present after its last sample [ns].
 _OTHER_SENDER_NS: Final = 3_000_000_000
 #: Time without a message after which an optional input counts as silent [ns].
 _SILENT_NS: Final = 10_000_000_000
@@ -35,9 +35,9 @@ class Inputs:
     front
         Interface to the transport.
     source
-        Input that provides the load.
+        Name of the input that provides the load.
     depth
-        Length of the queue of this input [messages].
+        Length of the queue of the input `source` [messages].
     late_span_s
         Largest delay at which a measured pose or gap is used [s].
     journaled
@@ -91,7 +91,7 @@ class Inputs:
         return [topic for topic, heard_ns in self._other_heard_ns.items() if now_ns - heard_ns < _OTHER_SENDER_NS]
 
     def silent(self) -> list[str]:
-        """Return the optional inputs that are silent now, but received messages before."""
+        """Return the optional inputs that have received messages, but none in the last 10 s."""
         if self.ended:
             return []
         now_ns = time.monotonic_ns()
@@ -118,8 +118,10 @@ class Inputs:
             Identifier of the sender.
         number
             Number of the message, counted from 1 for each sender.
-        stamp_ns, values
-            Stamp [ns] and numbers of the message.
+        stamp_ns
+            Stamp of the message [ns].
+        values
+            Numbers of the message.
         fits
             Whether the message can be read as a sample.
         """
@@ -179,7 +181,7 @@ class Inputs:
         if not self._follows("head_pose", stamp_ns, (*pose, *deviation)):
             return False
         missing = [math.isnan(value) for value in pose]
-        # for the check of the limits, the last value replaces a component that was not measured
+        # a component that was not measured is replaced by its last value, so that the limits can be checked
         judged = pose if all(missing) else _filled(pose, self._newest_pose)
         verdict = self._judged("head_pose", self.head_pose, stamp_ns, (*judged, *deviation), self._poses)
         if verdict.used and verdict is not Verdict.WORKED_IN:
@@ -204,7 +206,7 @@ class Inputs:
     def _is_implausible(self, stamp_ns: int, gaps: Mapping[int, float]) -> bool:
         limits = self._gap_limits
         if limits is None or not all(map(math.isfinite, gaps.values())):
-            return False  # the intake refuses NaN and infinity later
+            return False  # the gaps contain NaN or infinity, which the intake will refuse
         for pair, gap in gaps.items():
             before_ns, before = self._newest_gaps.get(pair, (stamp_ns, gap))
             passed_s = (stamp_ns - before_ns) * 1e-9

@@ -1,15 +1,15 @@
 """Compute the load on the head, and its standard deviation, from signals of the drive.
 
-The cutting force Z along the face is determined in two ways:
+The cutting force Z along the face is computed in two ways:
 
-- From the drive: Z = C - idle, where C is the chain force. If C is not measured, C = efficiency P / v with the motor
-  power P and the speed v.
-- From the coal: Z = specific_force * depth * resistance(position).
+- From the drive, the force is Z = C - idle, where C is the chain force. If C is not measured, it is computed from the
+  motor power P and the speed v as C = efficiency P / v.
+- From the coal, the force is Z = specific_force * depth * resistance(position).
 
-If both values are available, Z is their mean, weighted by the inverse variances. The force into the face is
-Fx = push_ratio Z, and the lateral force is Fy = lateral_ratio Z. The point of action (x, y) gives the moment
-M = x Fy - y Fx. Each coefficient has a standard deviation, which propagates to the load. The coefficients must be
-measured at the machine, because the paper does not publish them.
+If both forces can be computed, Z is their mean, weighted by the inverse variances. The force into the face is
+Fx = push_ratio Z, and the lateral force is Fy = lateral_ratio Z. The forces act at the point (x, y), so that the moment
+is M = x Fy - y Fx. The standard deviation of the load is computed from the standard deviations of the coefficients. The
+coefficients must be measured at the machine.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class LoadModel:
         if not opinions:
             return None
         deviations = [max(deviation, 1.0) for _, deviation in opinions]
-        # weights relative to the smallest deviation do not overflow, even for huge numbers, which are refused later
+        # the weights are relative to the smallest deviation, so that they do not overflow for huge numbers
         smallest = min(deviations)
         shares = [smallest / deviation for deviation in deviations]
         total = sum(share * share for share in shares)

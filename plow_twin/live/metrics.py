@@ -29,8 +29,7 @@ class MetricsError(PlowTwinError):
 class Metrics:
     """Context manager that serves the page `http://127.0.0.1:PORT/metrics`, which Prometheus reads.
 
-    Each number in the last report is a gauge with the name `plow_twin_<part>_<key>`. Values that are not numbers are
-    omitted.
+    Each number in the last report is a gauge with the name `plow_twin_<part>_<key>`. Texts in the report are omitted.
 
     Raises
     ------

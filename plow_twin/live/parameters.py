@@ -1,4 +1,4 @@
-"""Table of the parameters of the node, from which the checks, the ROS descriptors and config/twin.yaml are made."""
+"""Table of the parameters of the node. The checks, the ROS descriptors and config/twin.yaml are made from the table."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from plow_twin.live.service_names import SERVICES
 from plow_twin.scene_file.presets import PRESETS
 from plow_twin.stream.topics import Cadence, names_of
 
-#: Topics of the estimate, and of the results that are computed from the estimate.
+#: Names of the topics with the estimate, and of the topics with results that are computed from the estimate.
 ESTIMATES: Final = names_of(Cadence.ESTIMATE)
 
 
@@ -400,7 +400,7 @@ class Settings:
         return self.follow if self.estimate else "off"
 
 
-#: Parameters that change the running model, with the keys of these numbers in the scene file.
+#: Parameters that change the running model. The value is the key of the parameter in the scene file.
 MODEL: Final[Mapping[str, str]] = {
     "clearance_horizontal": "clearance.horizontal_m",
     "clearance_vertical": "clearance.vertical_m",
@@ -414,7 +414,7 @@ FILES: Final = ("scene", "record_path", "wear_state_path")
 SPECS: Final[Mapping[str, Field[Any]]] = {spec.name: spec for spec in fields(Settings)}
 #: Pattern of a number. ROS launch files use YAML 1.1, which reads a number such as 1e-9 as a string.
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-#: Largest length of a text [characters], equal to the largest length of a path on Linux.
+#: Largest length of a text [characters]. A path on Linux has the same limit.
 _LONGEST: Final = 4096
 #: Pattern of a line without control characters, which could change the state of a terminal.
 _ONE_LINE: Final = r"^[^\x00-\x1f\x7f-\x9f]*\Z"
@@ -424,8 +424,8 @@ _FOREIGN: Final = ("use_sim_time", "start_type_description_service")
 def coerce(name: str, value: Any) -> Any:
     """Convert a value to the type of the parameter `name`; return the value unchanged if this is impossible.
 
-    Integers, and strings such as `1e-9`, which YAML 1.1 does not read as numbers, become floats. Sequences become
-    tuples.
+    Integers become floats, and sequences become tuples. A string such as `1e-9` becomes a float, because YAML 1.1 does
+    not read it as a number.
     """
     default = SPECS[name].default
     if isinstance(default, tuple):
@@ -533,7 +533,7 @@ def _swapped_thresholds(given: Settings) -> list[Problem]:
 
 
 def outside(settings: Settings) -> list[Problem]:
-    """Return a problem for each path that is not in the folder `file_root`. Symbolic links are resolved first."""
+    """Return a problem for each path outside the folder `file_root`, after symbolic links have been resolved."""
     if not settings.file_root:
         return []
     root = Path(settings.file_root).resolve()
@@ -546,7 +546,7 @@ def outside(settings: Settings) -> list[Problem]:
 
 
 def refused_changes(before: Settings, after: Settings) -> list[str]:
-    """Return the reasons why paths cannot be changed after the start; a change to a preset is allowed."""
+    """Return the reasons why changes of paths are refused after the start. A change to a preset scene is allowed."""
     if after.file_root:
         return [str(problem) for problem in outside(after)]
     changed = [name for name in FILES if getattr(before, name) != getattr(after, name)]

@@ -1,4 +1,4 @@
-"""Type of a part of `/diagnostics`."""
+"""Type of a part of the messages on `/diagnostics`."""
 
 from __future__ import annotations
 

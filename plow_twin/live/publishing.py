@@ -32,9 +32,9 @@ class Front(Protocol):
     topics : mapping
         Resolved name of each output topic, by base name.
     follows_samples : bool
-        Whether only samples advance the time, as with `/clock` or a file. Time then stops while no samples arrive.
+        Whether only samples advance the time, as with `/clock` or a file. If True, time stops while no samples arrive.
     sends_motion : bool
-        Whether messages of the motion are sent. If not, they are only recorded.
+        Whether messages of the motion are sent. If False, the messages are only recorded.
     """
 
     name: str
@@ -71,7 +71,7 @@ class Publishing:
     """Output of a live twin.
 
     The function `on_alarm` receives a text when an alarm is latched. The function `catch_up` computes the intervals of
-    a publication after the forces have been sent. It is None if the intervals are computed earlier.
+    a publication after the forces have been sent. `catch_up` is None if the intervals are computed with the forces.
     """
 
     def __init__(
@@ -93,9 +93,9 @@ class Publishing:
             self._messages = Messages(*frames, intervals=settings.follows == "full")
         self.latency = DurationHistogram()
         self.age = DurationHistogram()
-        #: number of publications that were sent, and number that were withheld because a number was not finite
+        #: number of publications that were sent, and number of publications that contain NaN or infinity
         self.published = self.withheld = 0
-        #: number of publications without a sample, and number of publications that a late sample corrected
+        #: number of publications at times without a sample, and number of publications that a late sample corrected
         self.held_frames = self.corrected_frames = 0
         #: monotonic time at which the samples of the next publication were received [ns]; 0 without samples
         self.received_ns = 0
@@ -114,9 +114,9 @@ class Publishing:
     def messages(self, published: Published) -> Iterator[Outgoing]:
         """Yield the messages of a publication, which has at most one row.
 
-        If a number is not finite, no message is yielded. The forces are yielded first. The intervals are yielded after
-        the other messages of the motion, because many twins must be advanced to compute the intervals. The publication
-        is then counted and recorded, and the alarms are updated.
+        If a number is not finite, no message is yielded. The forces are yielded first. The intervals are the last
+        messages of the motion that are yielded, because many twins must be advanced to compute the intervals. After the
+        last message, the publication is counted and recorded, and the alarms are updated.
         """
         rows, _ = published
         if not len(rows):

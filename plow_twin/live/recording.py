@@ -31,8 +31,10 @@ class Recording:
 
     Parameters
     ----------
-    settings, scene
-        Parameters and scene of the twin.
+    settings
+        Parameters of the twin.
+    scene
+        Scene of the twin.
     node_name
         Name of the node.
     topics
@@ -83,7 +85,7 @@ class Recording:
         self.recorder = in_free_folder(Path(settings.record_path), make)
 
     def publication(self, published: Published, sent: Mapping[str, bytes]) -> None:
-        """Record a publication. `sent` contains the bytes of its messages by base name, or is empty."""
+        """Record a publication. `sent` contains the bytes of the sent messages by base name, or is empty."""
         wanted = self._decimation.select(published)
         if wanted is not None:
             self.recorder.publication(wanted, sent if wanted is published else {})
@@ -107,7 +109,7 @@ class Recording:
                 self.recorder.publications(wanted, np.array([sequence]))
 
     def message(self, topic: str, stamp_ns: int, message: Message) -> None:
-        """Record any other message on the topic with the base name `topic`."""
+        """Record a message that does not belong to a publication. `topic` is the base name of its topic."""
         self.recorder.output(self._topics[topic], stamp_ns, message)
 
     @property
@@ -116,7 +118,7 @@ class Recording:
         return self.recorder.counters.queued > _QUEUE_SIZE // 2
 
     def renew(self, session: Session) -> bool:
-        """Write a snapshot to the journal if the recorder wants one; return whether it was written."""
+        """Write a snapshot to the journal if the recorder needs a snapshot; return whether a snapshot was written."""
         wanted = self.recorder.snapshot_wanted
         if wanted:
             self.recorder.journal(session.renew())

@@ -1,7 +1,7 @@
 """The live twin without its transport.
 
-A front, which is the ROS node or the command `plow-twin live`, delivers samples and sends messages. Each sample is
-checked by the intake, advances the twin, and causes a publication, which is recorded.
+A *front* delivers samples and sends messages. It is the ROS node or the command `plow-twin live`. The intake checks
+each sample. A valid sample advances the twin and causes a publication, which is recorded.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ _CATCH_UP_S: Final = 0.002
 _LOOK_FOR_CLOCK_HZ: Final = 20.0
 #: Rate at which unused messages are written to the journal [Hz].
 _UNUSED_HZ: Final = 5.0
-#: Twins that follow measurements are too slow if samples wait for longer than `_LONGEST_WAIT_S` [s] in each of
-#: `_WAITING_SECONDS` consecutive seconds.
+#: Limits for twins that follow measurements. They are too slow if samples wait for longer than `_LONGEST_WAIT_S` [s] in
+#: each of `_WAITING_SECONDS` consecutive seconds.
 _LONGEST_WAIT_S, _WAITING_SECONDS = 0.5, 5
 
 
@@ -63,7 +63,7 @@ class Runtime:
     prepared
         Scene and compiled twin, which no other runtime may use.
     kept_wear
-        Wear of earlier runtimes of this process; the key is the result of `scene_identity` for the scene.
+        Wear of earlier runtimes of this process. The key is the result of `scene_identity` for the scene.
 
     Raises
     ------
@@ -148,7 +148,7 @@ class Runtime:
         self._set_limits(settings)
 
     def start(self) -> None:
-        """Open the journal if the time is known; otherwise the journal is opened later."""
+        """Open the journal if the time is known, otherwise wait for the first message on `/clock`."""
         self.waits_for_clock = self.without_clock
         self.inputs.started = not self.waits_for_clock
         self.clock = "waiting" if self.waits_for_clock else "running"
@@ -187,7 +187,10 @@ class Runtime:
 
     @property
     def reads_at_once(self) -> bool:
-        """Whether `step_series` may be used: only samples advance the time, and messages of the motion are not sent."""
+        """Whether `step_series` may be used.
+
+        It may be used if only samples advance the time, and if messages of the motion are not sent.
+        """
         return self._front.follows_samples and not self._front.sends_motion
 
     @property
@@ -311,7 +314,7 @@ class Runtime:
         for intake in (self.driver.intake, self.driver.clock):
             intake.jump_back_s, intake.jump_forward_s = settings.jump_back, settings.jump_forward
         if self.waits_for_clock:
-            return  # the journal is not open; `start` will apply the settings
+            return  # the journal is not open, and `start` will apply the settings
         if name in MODEL:
             self.driver.set_model(self.stamp_ns, model_changes(settings))
             self._front.changed()
@@ -357,7 +360,8 @@ class Runtime:
             Loads [N, N, N m].
         """
         if self.waits_for_clock or self.publishing.watch is not None or self.settings.record_ring:
-            # a watcher receives each publication, and a ring needs the state directly after the sample of an alarm
+            # a watcher must receive each publication, and the ring of the recorder needs the state directly after the
+            # sample of an alarm, so the samples are used one by one
             yield from self.step(list(zip(stamps.tolist(), map(tuple, wrench.tolist()), strict=True)))
             return
         self.publishing.received_ns = now_ns = time.monotonic_ns()
@@ -379,7 +383,7 @@ class Runtime:
             self._front.send(topic, message)
 
     def silence(self) -> float:
-        """Advance without samples if the samples are overdue; return the time until they can be overdue [s]."""
+        """Advance without samples if samples are overdue. Return the time until samples can be overdue [s]."""
         holds, now_ns = self.driver.holds, time.monotonic_ns()
         published = self.driver.silence(now_ns)
         if len(published.rows) or self.driver.holds != holds:
@@ -503,8 +507,8 @@ class Runtime:
         if self.recording and self.recording.recorder.snapshot_wanted:
             self._renew_recording()
         if self._front.follows_samples:
-            # Without a deadline, the twin waits until the recorder and the estimate have caught up. The wait is
-            # limited to `_CATCH_UP_S` per sample.
+            # A twin without a deadline waits until the recorder and the estimate have caught up. It waits for at most
+            # `_CATCH_UP_S` per sample.
             while count and self._behind:
                 time.sleep(_CATCH_UP_S)
                 count -= 1
@@ -522,7 +526,7 @@ class Runtime:
         assert self.recording is not None
         renewed = self.recording.renew(self.driver.session)
         if renewed and self.estimation and self.estimation.entry and self.driver.session.following is None:
-            # the snapshot of a twin that does not follow measurements does not contain the estimate
+            # if the twin does not follow measurements, a snapshot does not contain the estimate
             self.recording.recorder.journal(self.estimation.entry)
 
 

@@ -32,7 +32,10 @@ class Services:
         return done
 
     def mark(self, text: str | None = None) -> tuple[bool, str]:
-        """Write a text, by default the parameter `mark`, to the journal, and the ring of the recorder to the disk."""
+        """Write a text to the journal, and the ring of the recorder (the last seconds of the run) to the disk.
+
+        The default text is the parameter `mark`.
+        """
         return self._runtime.mark((self._runtime.settings.mark or "service") if text is None else text)
 
     def reset(self) -> tuple[bool, str]:
@@ -86,7 +89,7 @@ class Services:
         return True, f"the pads are worn by {list(depth)} m from now on; the motion is reset"
 
     def switch_publisher(self) -> tuple[bool, str]:
-        """Follow the other sender of the load."""
+        """Follow another sender of the load."""
         done = self._runtime.inputs.senders.switch()
         self._changed()
         if done:

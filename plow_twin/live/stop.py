@@ -20,7 +20,7 @@ def stop_signals() -> list[signal.Signals]:
 class StopSignals:
     """Context manager in which a stop signal sets the flag `stopped`.
 
-    While the attribute `interrupt` is true, the signal also raises `StopRequested`.
+    While the attribute `interrupt` is true, the signal raises `StopRequested` in addition.
     """
 
     def __init__(self) -> None:
@@ -38,8 +38,8 @@ class StopSignals:
     def ignore(self) -> None:
         """Ignore further stop signals at the end of a program.
 
-        A terminal and `ros2 launch` may both send a signal. While the interpreter ends, it restores the default
-        handlers, and the second signal would change the exit code.
+        If a program is started by `ros2 launch`, the terminal and `ros2 launch` may both send a signal. The interpreter
+        restores the default handlers when it ends, so that the second signal would change the exit code.
         """
         for number in self._before:
             signal.signal(number, signal.SIG_IGN)

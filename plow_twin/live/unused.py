@@ -8,7 +8,8 @@ from typing import Final
 
 from plow_twin.stream.journal import Unused
 
-#: Largest number of messages whose stamps and values a journal entry contains. Further messages are only counted.
+#: Largest number of messages with stamps and values in a journal entry. If there are more messages, the excess is only
+#: counted.
 _MOST: Final = 500
 
 

@@ -27,7 +27,7 @@ from plow_twin.record.wear_state import (
 class KeptWear:
     """Wear depths [m] at the end of an earlier runtime of this process.
 
-    If the depths could not be saved, `older_files` contains the contents of the wear file that they should have
+    If the depths could not be saved, `older_files` contains the contents of the wear file that the depths should have
     replaced.
     """
 
@@ -38,8 +38,8 @@ class KeptWear:
 class WearKeeper:
     """Storage for the wear of one head in one scene, in a folder.
 
-    Only a file that this object has read or written is replaced. Any other file may have been put there by the user,
-    and may contain wear that no twin has used.
+    Only a file that this object has read or written is replaced. A file that the object has not read may come from the
+    user, and may contain wear that no twin has used.
 
     Raises
     ------
@@ -61,8 +61,8 @@ class WearKeeper:
     def load(self, kept: KeptWear | None = None) -> tuple[float, ...] | None:
         """Return the wear depths [m] with which the twin starts, or None without saved wear.
 
-        These are the depths in the file. If the depths `kept` could not be saved and the file has not changed since,
-        they are returned instead.
+        The depths are read from the file. If the depths `kept` could not be saved and the file has not changed since
+        the failure, the depths `kept` are returned.
         """
         found = read_wear(self.folder)
         if found is not None:

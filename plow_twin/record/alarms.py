@@ -1,4 +1,4 @@
-"""Configure the alarms of a run, write them as messages, and compute them again in a replay."""
+"""Configure the alarms of a run, write them as messages, and compare them with the alarms of a replay."""
 
 from __future__ import annotations
 
@@ -85,10 +85,10 @@ def alarm_texts(values: Mapping[str, str], *, own_start: bool = False, newest: b
 
 
 class AlarmCheck:
-    """Compute the alarms of a run again, and compare each computed message with the recorded message.
+    """Compute the alarms of a run from its journal, and compare each computed message with the recorded message.
 
-    An alarm depends on every publication since the start of the run. After a missing publication, alarms can therefore
-    not be compared.
+    An alarm depends on every publication since the start of the run. Alarms can therefore not be compared after a
+    publication is missing.
     """
 
     def __init__(self, header: RunHeader, possible: bool) -> None:
@@ -159,8 +159,8 @@ class AlarmCheck:
     def differences(self) -> Iterator[Difference]:
         """Yield the differences between recorded and computed messages.
 
-        A recorded message stays in the queue until its computed message exists, and the reverse. A later journal entry
-        may report that one of the two messages was lost.
+        A recorded message stays in a queue until its computed message exists. A computed message stays in a queue until
+        its recorded message exists.
         """
         while self._recorded and self._computed:
             record, (sequence, step, computed) = self._recorded.popleft(), self._computed.popleft()

@@ -22,8 +22,14 @@ _MIN_FREE_BYTES: Final = 64 * 1024 * 1024
 class Topic:
     """A topic with its message type.
 
-    `schema` is the `ros2msg` text of the type, `type_hash` is the REP-2016 hash of the type, and `qos` is the offered
-    QoS in YAML.
+    Attributes
+    ----------
+    schema : str
+        Text of the type in the format `ros2msg`.
+    type_hash : str
+        REP-2016 hash of the type.
+    qos : str
+        Offered QoS in YAML.
     """
 
     name: str
@@ -36,9 +42,9 @@ class Topic:
 class BagWriter:
     """Write messages to an MCAP file in a new folder.
 
-    If the process is killed, the messages since the last `flush` are lost. `lost` counts, for each topic, the messages
-    that did not fit on the disk. `on_trouble` receives a text when the disk becomes full, and a text when writing
-    succeeds again.
+    If the process is killed, the messages since the last `flush` are lost. The attribute `lost` contains, for each
+    topic, the number of messages that did not fit on the disk. The function `on_trouble` receives a text when the disk
+    becomes full, and a text at the first successful write after that.
 
     Raises
     ------
@@ -114,14 +120,15 @@ class BagWriter:
 
 
 def beside_folders(run: Path) -> Sequence[Path]:
-    """Return the subfolders of a run with the recordings of other topics."""
+    """Return the subfolders of a run that contain the recordings of topics that do not belong to the twin."""
     return sorted(path for path in run.glob(f"{BESIDE}*") if path.is_dir() and any(path.glob("*.mcap")))
 
 
 def readable_beside(run: Path, lost: Counter[str]) -> list[Path]:
     """Return the folders of `beside_folders` that contain a readable MCAP file.
 
-    `lost` receives the losses that the recorder counted, and the number of files in folders that cannot be read.
+    The counter `lost` receives the losses that the recorder counted. For each folder that cannot be read, it receives
+    the number of files.
     """
     found = []
     for folder in beside_folders(run):

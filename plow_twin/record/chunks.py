@@ -3,8 +3,9 @@
 A truncated file is read up to its last whole record. Damaged chunks are skipped and counted. For speed, the messages of
 a chunk are stored as arrays of offsets into its bytes.
 
-A *head* is the opcode and the length at the start of a record. A *channel mask* has a bit for each channel of a chunk.
-The mask is known before the chunk is read, so that a chunk without wanted channels can be skipped.
+A *head* is the opcode and the length at the start of a record. A *channel mask* is an integer with one bit for each
+channel of a chunk. The mask is computed before the chunk is read, so that a chunk without wanted channels can be
+skipped.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ _HEAD: Final = struct.Struct("<BQ")
 _HEAD_SIZE: Final = _HEAD.size
 #: Size [B] of the start of an index record: a head and a channel number of two bytes.
 _INDEX_HEAD: Final = _HEAD.size + 2
-#: Limit on the decompressed size of all chunks of a file, as a multiple of the file's size. `RECORD_LIMIT` is added, so
-#: that the limit admits small files.
+#: Limit on the decompressed size of all chunks of a file, as a multiple of the size of the file. `RECORD_LIMIT` is
+#: added to the limit, so that small files are accepted.
 UNPACKED_RATIO: Final = 200
 #: Largest number of schemas and channels that a file may declare.
 _MOST_DECLARED: Final = 10_000
@@ -57,7 +58,7 @@ _MESSAGE_FIELDS: Final = MESSAGE_HEAD - _HEAD_SIZE
 _COLUMNS: Final = 6
 #: Size [B] up to which several chunks are scanned in one call.
 _SMALL: Final = 2**18
-#: The size [B] if `wanted` is given. Larger chunks between small chunks may then be skipped.
+#: Size [B] up to which several chunks are scanned in one call if the argument `wanted` is given.
 _SMALL_ALONE: Final = 2**20
 
 
@@ -110,9 +111,9 @@ class Messages:
 class ChunkReader:
     """Iterate over the chunks of one MCAP file.
 
-    The reader adds each declared channel to `channels`. At the end, `finished` is True if the file is complete.
-    `damaged` is the number of records and chunks that could not be read. `left_out` is the number of damaged chunks
-    that an earlier repair removed; `damaged` includes this number.
+    The reader adds each declared channel to `channels`, and sets `finished` to True if the file is complete. `damaged`
+    is the number of records and chunks that could not be read, plus `left_out`. `left_out` is the number of damaged
+    chunks that an earlier repair removed.
 
     Parameters
     ----------
@@ -124,8 +125,9 @@ class ChunkReader:
         Function that receives the set of channel numbers of a chunk. If it returns False, the chunk is skipped. A chunk
         without a usable index is always read.
     more
-        Function that waits for a file to grow. At the end of the file, the reader yields an empty batch and calls
-        `more` with the stream and the size of the file [B]. If `more` returns True, the reader continues.
+        Function that waits until the file grows. The reader calls it at the end of the file, with the stream and the
+        size of the file [B]. If `more` returns True, the reader continues. Before each call, the reader yields an empty
+        batch.
     """
 
     path: Path
@@ -239,7 +241,7 @@ class ChunkReader:
             )
 
     def _scan(self, contents: list[Bytes], schemas: dict[int, tuple[str, bytes]]) -> Iterator[Messages]:
-        """Yield the messages of several chunks as one batch; if a chunk is damaged, yield a batch for each chunk."""
+        """Yield the messages of several chunks as one batch; if a chunk is damaged, yield one batch for each chunk."""
         if not contents:
             return
         content = contents[0] if len(contents) == 1 else np.concatenate(contents)
@@ -338,7 +340,7 @@ class _Waiting:
 def is_mcap(path: Path) -> bool | None:
     """Return True if a file begins with the magic bytes of MCAP.
 
-    None means that the file ends within the magic bytes: its writer was killed early.
+    The result is None if the file ends within the magic bytes, because its writer was killed early.
     """
     try:
         with path.open("rb") as stream:
@@ -396,8 +398,8 @@ class _Heads:
 def look_ahead(descriptor, size, place, table):  # type: ignore[no-untyped-def]
     """Read record heads, beginning at offset `place`, into the rows of `table`; return the number of rows.
 
-    The columns are offset, opcode, length, end and channel mask. An index record has no row. Its channel is added to
-    the mask of the preceding chunk, and the end of the chunk is moved behind the index record.
+    The columns are offset, opcode, length, end and channel mask. An index record has no row. The channel of an index
+    record is added to the mask of the preceding chunk, and the end of this chunk is moved behind the index record.
     """
     head, count = np.zeros(_INDEX_HEAD, np.uint8), 0
     while True:

@@ -23,7 +23,7 @@ from plow_twin.scene_file.csv_rows import csv_rows, delimiter_of, open_csv
 
 Array = NDArray[np.float64]
 
-#: For each role and quantity, a pattern of column names. The pattern is matched with the result of `_plain`.
+#: Pattern of the column names of each quantity, by role and quantity. It is matched with the result of `_plain`.
 _NAMES: Final = {
     ("excitation", "fx"): r"fx|(force|load|kraft|last)x|x(force|load|kraft)|fhor(izontal)?|horizontalforce",
     ("excitation", "fy"): r"fy|(force|load|kraft|last)y|y(force|load|kraft)|fver(tical)?|verticalforce",
@@ -37,9 +37,9 @@ _TIME: Final = r"t|time|timestamp|stamp|zeit|zeitstempel|date|datetime|datum"
 _UNIT: Final = re.compile(
     r"(.+?)\s*(?:[\[(]\s*([^\])]+?)\s*[\])]|[ _](kN ?m|N ?m|kN|N|mm|cm|m|mrad|rad|deg|ms|us|ns|s))"
 )
-#: Smallest time that is read as a date, for each unit of time. All limits are the same date in 2001.
+#: Smallest time that is read as a date, for each unit of time. The same date in 2001 is written in each unit.
 _DATES: Final = (("ns", 1e18), ("us", 1e15), ("ms", 1e12), ("s", 1e9))
-#: Largest number of cells that are examined. In a file with many columns, fewer rows are therefore examined.
+#: Largest number of table cells that are examined. The more columns a file has, the fewer rows are examined.
 _MOST_CELLS: Final = 2_000_000
 #: The components of the load. A file without a column for each component cannot be used.
 _NEEDED: Final = tuple(("excitation", name) for name in ROLES["excitation"])
@@ -55,12 +55,14 @@ class Guess:
         Column of each quantity, by role and name of the quantity.
     units : dict
         Unit of each quantity that is not in SI.
-    time, time_unit : str
-        Time column and its unit. The unit is empty if the column contains dates.
+    time : str
+        Name of the time column.
+    time_unit : str
+        Unit of the time column, which is empty if the column contains dates.
     because : dict
         How each column was found.
     open : dict
-        For each undecided quantity, the columns or units from which the user must choose. The key of the time is `t`.
+        Columns or units from which the user must choose, for each undecided quantity. The key of the time is `t`.
     """
 
     path: Path
@@ -106,9 +108,18 @@ _ZONE: Final = re.compile(r"([Zz]|:\d\d([.,]\d+)?[+-]\d\d(:?\d\d)?)$")
 def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: Mapping[str, str]) -> Guess:
     """Guess the meanings of the columns of a CSV file.
 
-    At most 20,000 rows and two million cells are examined. The magnitudes of the numbers are compared with the loads
-    and sizes of the scene. `columns` and `units` contain the statements of the user, by name of the quantity (fx, ...,
-    or t for the time).
+    The magnitudes of the numbers are compared with the loads and sizes of the scene.
+
+    Parameters
+    ----------
+    path
+        The file. At most 20,000 rows and two million cells are examined.
+    scene
+        Scene of the machine.
+    columns
+        Columns that the user states, by name of the quantity. The name of the time is `t`.
+    units
+        Units that the user states, by name of the quantity.
 
     Raises
     ------

@@ -27,12 +27,16 @@ class Sent:
 
     Parameters
     ----------
-    sequence, kind : ndarray of int64, shape (n,)
-        Sequence number of the journal entry before each message, in ascending order, and kind of the message.
+    sequence : ndarray of int64, shape (n,)
+        Sequence number of the journal entry before each message, in ascending order.
+    kind : ndarray of int64, shape (n,)
+        Kind of each message.
     done : ndarray of int64, shape (k,)
         Number of advances up to and including each entry of the series.
-    first, advances
-        Sequence number of the first entry of the series, and number of advances in the series.
+    first
+        Sequence number of the first entry of the series.
+    advances
+        Number of advances in the series.
     """
 
     def __init__(self, sequence: Indexes, kind: Indexes, done: Indexes, first: int, advances: int) -> None:
@@ -95,9 +99,13 @@ def _with_whole_rows(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
 def _pieces(numbers: list[list[NDArray[np.float64]]], templates: Templates) -> tuple[Indexes, Indexes]:
     """Return the pieces of all kinds of messages, and the index at which the pieces of each kind end.
 
-    A piece is a series of numbers that is contiguous in the message and also in a row of the publications. Its four
-    values are the offset in the message [B], the count of numbers, the address in the first row, and the distance of
-    rows [B].
+    A piece is a series of numbers that is contiguous in the message and in a row of the publications. Each piece has
+    four values:
+
+    - the offset in the message [B]
+    - the count of numbers
+    - the address in the first row
+    - the distance of rows [B]
     """
     found, ends = [], [0]
     for kind, parts in enumerate(numbers):
@@ -123,17 +131,20 @@ def compare(  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    kinds, after : ndarray of int64, shape (n,)
-        As in `Sent`.
-    publication, slow : ndarray of int64
-        Index of the publication after each advance, and index of the slow part of each publication. An index below 0
-        means that a publication has no slow part.
+    kinds : ndarray of int64, shape (n,)
+        The array `kind` of `Sent`.
+    after : ndarray of int64, shape (n,)
+        The array `after` of `Sent`.
+    publication : ndarray of int64
+        Index of the publication after each advance.
+    slow : ndarray of int64
+        Index of the slow part of each publication. An index below 0 means that a publication has no slow part.
     compared : ndarray of bool
         Whether messages of each kind are compared.
     pieces, piece_ends
-        As in `_pieces`.
+        Results of `_pieces`.
     data, fixed, ends
-        As in `Templates`.
+        Attributes of `Templates`.
     different : ndarray of bool, shape (n,)
         Receives True for each message that differs.
 

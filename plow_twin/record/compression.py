@@ -14,7 +14,8 @@ import numpy as np
 from plow_twin.errors import RecordingError
 from plow_twin.record.template import Bytes
 
-#: Largest size of a record or a chunk [B]. Writers close a chunk at a few MiB, so a larger size is taken as damage.
+#: Largest size of a record or a chunk [B]. A larger size is treated as damage, because writers close a chunk at a few
+#: MiB.
 RECORD_LIMIT: Final = 64 * 1024 * 1024
 _of_thread: Final = threading.local()
 #: Format of an LZ4 frame. The head contains the magic number and flags, and a length precedes each block.

@@ -1,4 +1,7 @@
-"""Select the publications to record, and add the impulses and peaks of omitted publications to the next one."""
+"""Select the publications to record.
+
+The impulses and peaks of an omitted publication are added to the next recorded publication.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ class Decimation:
     """Selection of the publications to record.
 
     The argument `outputs` is `all`, `decimated` or `none`. With `decimated`, the first publication in each period of
-    the rate `rate_hz` [Hz] is recorded, and also each publication with a slow part.
+    the rate `rate_hz` [Hz] is recorded, and every publication with a slow part is recorded.
     """
 
     def __init__(self, outputs: str, rate_hz: float) -> None:
@@ -30,7 +33,8 @@ class Decimation:
     def select(self, published: Published) -> Published | None:
         """Return the publication to record, or None if `published` is omitted.
 
-        `published` has one row. Impulses and peaks of the result cover the omitted publications before it.
+        `published` has one row. The impulses and peaks of the result include the omitted publications since the last
+        recorded publication.
         """
         if self._outputs == "all":
             return published

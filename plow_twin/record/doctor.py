@@ -35,7 +35,8 @@ from plow_twin.record.unused import InputCounts
 from plow_twin.stream.journal import Digest, Failed, Sample, Snapshot
 
 _CHUNK_SIZE: Final = 2**20
-#: Key in `metadata.yaml` of the names of repaired parts. The file has the key with the prefix `plow_twin_`.
+#: Key under which `metadata.yaml` contains the names of repaired parts. In the file, the prefix `plow_twin_` precedes
+#: the key.
 REPAIRED_KEY: Final = "repaired"
 _HASH: Final = "topic_type_hash"
 
@@ -49,7 +50,7 @@ class PartReport:
     finished: bool
     damaged_chunks: int
     messages: dict[str, int]
-    #: number of bytes after the end of the MCAP content; other readers refuse a file with trailing bytes
+    #: number of bytes after the end of the MCAP content; many readers of MCAP refuse a file with trailing bytes
     trailing_bytes: int = 0
     #: number of damaged chunks that an earlier repair removed
     left_out: int = 0
@@ -213,7 +214,7 @@ def _part_problems(part: PartReport) -> list[str]:
 
 
 def _metadata_problems(reader: RunReader) -> list[str]:
-    """Return the problems of `metadata.yaml`, from which other programs read the names of the parts."""
+    """Return the problems of `metadata.yaml`, from which the tools of rosbag2 read the names of the parts."""
     folder = reader.path.parent
     if not (folder / "metadata.yaml").is_file():
         return ["metadata.yaml is missing"]
@@ -238,7 +239,7 @@ def repair(path: Path) -> list[Path]:
     Returns
     -------
     list of Path
-        Files that were rewritten or renamed, including the recordings of other topics in the folder of the run.
+        Files that were rewritten or renamed. Recordings in subfolders of the run are included.
 
     Raises
     ------
@@ -303,8 +304,8 @@ def _list_parts(folder: Path, parts: Sequence[Path], repaired: Sequence[str]) ->
 def _rewrite(part: Path, *, last: bool) -> None:
     """Replace a file by a new file with the readable messages and a note of damage at each gap.
 
-    A part without an end also gets a note of damage, because messages may be missing before the next part. The last
-    part has no next part and gets no note.
+    A truncated part gets a note of damage at its end, because messages may be missing before the next part. The last
+    part of a recording gets no note at its end.
     """
     target = part.with_name(f"{part.name}.partial")
     target.unlink(missing_ok=True)

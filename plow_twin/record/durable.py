@@ -24,8 +24,8 @@ def naming(path: Path) -> Iterator[None]:
 def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
     """Open a stream, and replace the file `path` atomically by the content of the stream when the context ends.
 
-    If an error occurs or the process is killed, an existing file stays unchanged. With `sync`, the new file also
-    survives a loss of power. A pipe or a device cannot be replaced, so the stream writes to it directly.
+    If an error occurs or the process is killed, an existing file stays unchanged. With `sync`, the new file survives a
+    loss of power. If `path` is a pipe or a device, it cannot be replaced, so the stream writes to it directly.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
 
 
 def write_whole(path: Path, content: bytes, *, sync: bool = False) -> None:
-    """Write `content` to a file atomically. The other arguments are described in `whole_file`."""
+    """Write `content` to a file atomically. The arguments `path` and `sync` are described in `whole_file`."""
     with whole_file(path, sync=sync) as stream:
         stream.write(content)
 

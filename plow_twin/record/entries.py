@@ -58,20 +58,26 @@ Record = EntryRecord | OutputRecord
 class Entries:
     """Journal entries in the order in which the twin used them.
 
+    A sample is a load at a time. A digest is a hash of the exact state of the twin.
+
     Attributes
     ----------
-    sequence, log_time_ns : ndarray of int64, shape (n,)
-        Sequence number, without the wrap at 2^32, and receive time of each entry.
+    sequence : ndarray of int64, shape (n,)
+        Sequence number of each entry, without the wrap at 2^32.
+    log_time_ns : ndarray of int64, shape (n,)
+        Receive time of each entry.
     sample : ndarray of bool, shape (n,)
         Whether an entry is a sample of the load.
     stamp_ns : ndarray of int64, shape (n,)
         Stamp of each sample and digest.
     wrench : ndarray, shape (n, 3)
         Load of each sample [N, N, N m].
-    digest_at, digest : ndarray, shape (m,)
-        Index of each digest in the other arrays, and its value.
+    digest_at : ndarray, shape (m,)
+        Index of each digest in the arrays of shape (n,).
+    digest : ndarray, shape (m,)
+        Value of each digest.
     rest : dict
-        All other entries, by index.
+        Entries that are neither samples nor digests, by index.
     """
 
     sequence: Indexes
@@ -193,7 +199,7 @@ class Outputs:
 class Batch:
     """Journal entries, and the outputs that the twin sent after these entries and before the next batch.
 
-    `damaged` is True if a chunk since the previous batch could not be read. Any record of this batch may then be
+    If a chunk since the previous batch could not be read, `damaged` is True, and any record of this batch may be
     missing.
     """
 
@@ -212,7 +218,7 @@ class Batch:
 
 
 class Holes:
-    """Find missing journal entries by their sequence numbers, in one batch after the other."""
+    """Find missing journal entries, batch by batch, by the sequence numbers of the entries."""
 
     def __init__(self) -> None:
         self._next: int | None = None
@@ -233,7 +239,7 @@ class Holes:
 
 
 def parted_at(outputs: Sequence[Outputs], end: int) -> tuple[list[Outputs], list[Outputs]]:
-    """Return the messages with sequence numbers below `end`, and the remaining messages."""
+    """Split messages into those with sequence numbers below `end` and those with higher or equal numbers."""
     before, after = [], []
     for part in outputs:
         place = len(part) if part.newest < end else int((part.sequence >= end).argmax())

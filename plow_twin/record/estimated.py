@@ -30,7 +30,8 @@ from plow_twin.stream.session import wear_in
 class LiveEstimate:
     """An estimate from the journal of a node, with its window of measurements.
 
-    The window is computed again from the journal. If measurements are missing in the journal, the window is None.
+    The journal does not contain the window, so the window is computed from the entries. If measurements are missing in
+    the journal, the window is None.
     """
 
     entry: Estimated

@@ -1,6 +1,6 @@
 """Read a recording that is still being written: check whether the writer still runs, and wait for new content.
 
-A writer locks its file. When the process ends, also by a crash, the operating system releases the lock.
+A writer locks its file. When the process ends, even by a crash, the operating system releases the lock.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def is_claimed(descriptor: int) -> bool:
 
 
 class Tail:
-    """Wait of a reader at the end of a growing file; it ends early when the function `stop` returns True."""
+    """Object with which a reader waits at the end of a growing file. The wait ends if `stop` returns True."""
 
     def __init__(self, stop: Callable[[], bool] = lambda: False) -> None:
         self._stop = stop

@@ -16,8 +16,8 @@ from plow_twin.record.sources import open_source
 class _Seen:
     """Statistics of the messages of one role.
 
-    `used` and `unfit` count the messages that fit and do not fit the role. The other fields are the ranges of the
-    stamps [ns] and of the values [SI units] of the messages that fit.
+    `used` is the number of messages that fit the role, and `unfit` is the number of messages that do not fit it. The
+    ranges of the stamps [ns] and of the values [SI units] refer to the messages that fit.
     """
 
     used: int = 0
@@ -58,9 +58,11 @@ def foreign_facts(path: Path, mapping: Path | None, units: Mapping[str, str]) ->
     Returns
     -------
     facts : dict
-        Types of the topics, counts of losses, and a dictionary for each role. The dictionary contains the topic, and
-        the numbers of messages that fit and do not fit the role. For the messages that fit, it contains the span [s],
-        the rate [Hz], and the range of each quantity [SI units].
+        Types of the topics, counts of losses, and a dictionary for each role. The dictionary contains:
+
+        - the topic
+        - the number of messages that fit the role, and the number of messages that do not fit it
+        - the span [s], the rate [Hz] and the ranges of the quantities [SI units] of the messages that fit
     lossy : bool
         Whether a part of the recording could not be read, or messages do not fit their role.
 

@@ -13,8 +13,8 @@ from plow_twin.errors import RecordingError
 #: Largest length [characters] of a type's text, including the types of its fields but not the comments. Common texts
 #: have about 10,000 characters.
 _LONGEST: Final = 2**18
-#: Largest number of parts of a message. A part is a number, a text or an array of numbers. A sequence counts as a
-#: single item.
+#: Largest number of parts of a message. A part is a number, a text or an array of numbers. A sequence of any length
+#: counts as one item.
 _MOST_PARTS: Final = 1_000
 
 
@@ -24,8 +24,8 @@ def parsed_types(text: str, message_type: str) -> dict[str, Any]:
     Raises
     ------
     RecordingError
-        The text is too long, the type contains itself, or the type has too many parts. For other invalid texts, the
-        parser of rosbags raises its own errors.
+        The text is too long, the type contains itself, or the type has too many parts. For any other fault of the text,
+        the parser of rosbags raises its own errors.
     """
     from rosbags.typesys import get_types_from_msg
 
@@ -45,7 +45,7 @@ def _count(name: str, types: dict[str, Any], counts: dict[str, int]) -> int:
     if name not in types:
         return 1
     if name not in counts:
-        # this value refuses a type that contains itself: the value is read again while the parts are counted
+        # a type that contains itself is refused, because this value is read while its parts are counted
         counts[name] = _MOST_PARTS + 1
         counts[name] = max(1, sum(_parts(field, types, counts) for _, field in types[name][1]))
     if counts[name] > _MOST_PARTS:

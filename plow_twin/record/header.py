@@ -1,4 +1,4 @@
-"""The header of a recording: the scene and the settings that a replay needs in addition to the journal."""
+"""The header of a recording, which contains the scene and the settings that a replay needs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from plow_twin.stream.journal import ParameterValue
 HEADER_RECORD: Final = "plow_twin"
 #: Name of the MCAP metadata record that contains the numbers of lost messages. It is written when the file is closed.
 LOSS_RECORD: Final = "plow_twin_loss"
-#: Key in the loss record under which the reason of an early end is written. All other keys are topics.
+#: Key in the loss record under which the reason of an early end is written. Every key except this key is a topic.
 STOPPED_EARLY_KEY: Final = "stopped_early"
 #: Version of the file layout, which `docs/recording.md` describes.
 LAYOUT_VERSION: Final = 4
@@ -42,7 +42,7 @@ class RunHeader:
     part : int
         Number of this file in the run.
     run_id : str
-        Random identifier that all files of a run have in common.
+        Random identifier of the run, which is the same in all files of the run.
     """
 
     scene_yaml: str
@@ -78,7 +78,7 @@ class RunHeader:
 
     @property
     def entries_topic(self) -> str:
-        """Topic of all other journal entries."""
+        """Topic of the journal entries that are neither samples nor digests."""
         return f"{self.node}/journal/entries"
 
     def topic(self, base_name: str) -> str:
@@ -101,7 +101,7 @@ class RunHeader:
             raise RecordingError(str(error)) from error
 
     def to_record(self) -> dict[str, str]:
-        """Return the content of the MCAP metadata record: strings are unchanged, other values are written as JSON."""
+        """Return the content of the MCAP metadata record, in which values that are not strings are written as JSON."""
         record = {"layout_version": str(LAYOUT_VERSION)}
         for spec in fields(self):
             value = getattr(self, spec.name)

@@ -25,6 +25,8 @@ from plow_twin.stream.steps import Steps
 class Feed:
     """Pass the messages of a recording to walkers in the order of their arrival, after a check of each load sample.
 
+    A walker advances a session of a twin.
+
     The function `measured` receives the role, the stamp [ns] and the values of each message that contains neither a
     load nor a speed.
     """
@@ -33,7 +35,7 @@ class Feed:
     roles: dict[str, Role]
     measured: Callable[[str, int, dict[str, float]], object]
     intake: Intake = field(default_factory=Intake)
-    #: numbers of unused messages, by reason; `intake` counts the unused load samples, too
+    #: numbers of messages that do not fit their role, by reason
     unfit: Counter[str] = field(default_factory=Counter)
     #: whether the first walker writes the measured poses to its journal
     with_poses: bool = False

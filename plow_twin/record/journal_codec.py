@@ -1,6 +1,7 @@
 """Convert journal entries to ROS messages and back, without any loss of precision.
 
-A sample becomes a wrench, a digest becomes two integers, and every other entry becomes a JSON text.
+A sample (a load at a time) becomes a wrench. A digest (a hash of the exact state) becomes two integers. An entry that
+is neither a sample nor a digest becomes a JSON text.
 """
 
 from __future__ import annotations
@@ -74,7 +75,8 @@ _KINDS: Final[dict[str, type[Any]]] = {
     "loss": Loss,
     "dropped": Dropped,
 }
-#: First bytes of a message with a digest: encoding, no dimensions, no offset, count of numbers (2), and padding.
+#: First bytes of a message with a digest. They are the encoding, the number of dimensions (0), the offset (0), the
+#: count of numbers (2), and the padding.
 _DIGEST_HEAD: Final = np.frombuffer(struct.pack("<BBHIII4x", 0, 1, 0, 0, 0, 2), np.uint8)
 _DIGEST_SIZE: Final = len(_DIGEST_HEAD) + 16
 _MASK: Final = 2**64 - 1
@@ -135,15 +137,19 @@ def read_digests(
     ----------
     buffer : ndarray of uint8
         Content of a chunk.
-    start, length : ndarray of int64, shape (n,)
-        Offset and length of each message in the buffer.
+    start : ndarray of int64, shape (n,)
+        Offset of each message in the buffer.
+    length : ndarray of int64, shape (n,)
+        Length of each message.
 
     Returns
     -------
     found : ndarray of bool, shape (n,)
         Whether each message is a digest.
-    stamp_ns, digest : ndarray, shape (m,)
-        Stamp [ns] and value of each digest.
+    stamp_ns : ndarray, shape (m,)
+        Stamp of each digest [ns].
+    digest : ndarray, shape (m,)
+        Value of each digest.
     """
     found = (length == _DIGEST_SIZE) & (start >= 0) & (start + _DIGEST_SIZE <= buffer.size)
     messages = buffer[start[found, None] + np.arange(_DIGEST_SIZE)]
@@ -211,7 +217,7 @@ _READERS: Final[dict[str, Callable[[Any], Any]]] = {
     "tuple[tuple[float, ...], ...]": _rows,
     "ParameterValue": _exactly(bool, int, float, str),
 }
-#: For each kind of entry, the name of each field and the function that reads the value of the field.
+#: Functions that read the fields of each kind of entry, by name of the field.
 _FIELDS: Final = {
     name: [(spec.name, _READERS[str(spec.type)]) for spec in fields(kind)] for name, kind in _KINDS.items()
 }

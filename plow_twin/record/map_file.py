@@ -1,4 +1,8 @@
-"""Read mapping files, which assign roles and units to topics and state the model of the load from drive signals."""
+"""Read mapping files.
+
+A mapping file assigns roles and units to topics. It may also contain a model that computes the load from the signals
+of the drive.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +28,7 @@ ROLES: Final[dict[str, tuple[str, ...]]] = {
 }
 #: Type of a topic whose fields are nodes of an OPC UA server.
 OPCUA: Final = "opcua"
-#: Values of the key `stamp` for OPC UA nodes: the stamp of the data source, or the stamp of the server.
+#: Values of the key `stamp` for OPC UA nodes. They select the stamp of the data source or the stamp of the server.
 SOURCE_STAMP: Final = "source"
 SERVER_STAMP: Final = "server"
 #: Keys that an OPC UA node may have in a mapping file, in addition to its identifier.
@@ -77,7 +81,8 @@ class MapError(InputError, RecordingError):
 def read_map_file(path: Path) -> dict[str, Any]:
     """Return the checked content of a mapping file: the roles, and the load model if the file has one.
 
-    A role may have one scale, offset, unit or limit for all its quantities. In the result, each quantity has its own.
+    A role may state one scale, offset, unit or limit for all its quantities. In the result, the value is repeated for
+    each quantity.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Assign roles to the topics of a recording, by a YAML file or by the names and types of the topics.
 
-The *role* of a topic determines which quantities of the model its messages contain. The roles are `excitation` (the
-load), `head_pose`, `travel`, `forces`, `gaps` and `drive`.
+The *role* of a topic determines which quantities of the model the messages on the topic contain. The roles are
+`excitation` (the load), `head_pose`, `travel`, `forces`, `gaps` and `drive`.
 """
 
 from __future__ import annotations
@@ -65,9 +65,9 @@ _NAMES: Final = {
 class Role:
     """Role of a topic: the field of each quantity in a message, and its conversion to SI units.
 
-    A path consists of names that are separated by dots. In a path, `[3]` selects the array item with the index 3.
-    `[fx]` selects the array item with the index that `fx` has in the field `name` of the message. A path to a
-    quaternion yields the angle about z.
+    A path to a field consists of names that are separated by dots. In a path, `[3]` selects the array item with the
+    index 3, and `[fx]` selects the array item with the index that `fx` has in the field `name` of the message. A path
+    to a quaternion yields the angle about z.
 
     Attributes
     ----------
@@ -78,8 +78,8 @@ class Role:
     limits : dict
         Range of each quantity [SI units]. Values outside the range are not used.
     stamp : str
-        `header` (stamp of the message), `log` (receive time), or the path of the time in a CSV or JSON message. The
-        time is a number in `stamp_unit` or an ISO 8601 text.
+        `header` (stamp of the message), `log` (receive time), or the path of the time in a CSV or JSON message. At the
+        path, the time is a number in the unit `stamp_unit` or an ISO 8601 text.
     clock_offset_ns : int
         Time that is added to each stamp [ns].
     sequence : str
@@ -250,9 +250,14 @@ def _follow(content: Any, path: str) -> float | None:
 def readings(
     messages: Iterable[Arrived], roles: Mapping[str, Role]
 ) -> Iterator[tuple[str, Arrived, tuple[int, dict[str, float]] | None]]:
-    """Yield the name of the role, the message, and the result of `Role.read` for each message and role of its topic.
+    """Read each message with each role of its topic.
 
-    If a topic has several roles, roles whose fields are all empty in a message are omitted.
+    If a topic has several roles, a role is omitted for a message in which all fields of the role are empty.
+
+    Yields
+    ------
+    tuple
+        Name of the role, message, and result of `Role.read`.
     """
     by_topic: dict[str, list[tuple[str, Role]]] = {}
     for name, role in roles.items():
@@ -405,7 +410,7 @@ def _limits(path: Path, key: str, given: float | list[float]) -> tuple[float, fl
 def _check_columns(path: Path, name: str, role: Role) -> None:
     """Raise a `MapError` for a field that names no column.
 
-    A path may also begin with the name of a column: `load.f[0]`.
+    The field may be a column, or a path that begins with the name of a column, such as `load.f[0]`.
     """
     columns = role.message_type
     if not isinstance(columns, Columns):

@@ -1,8 +1,8 @@
 """Write MCAP files.
 
-Compiled functions write many messages at a time into a chunk. Like the compressors, they run without the lock of the
-Python interpreter. Each record is written to the file by a single call, so that the file of a killed process can be
-read up to the last chunk.
+Compiled functions write many messages at a time into a chunk. The compiled functions and the compressors release the
+lock of the Python interpreter. Each record is written to the file by a single call, so that the file of a killed
+process can be read up to the last chunk.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class ChunkBuilder:
 
 @compiled
 def heads(buffer, starts, channel, sequence, log_time, publish_time, length):  # type: ignore[no-untyped-def]
-    """Write the head of each message: opcode, length, channel, sequence number and times."""
+    """Write the head of each message, which consists of opcode, length, channel, sequence number and two times."""
     for n in range(starts.size):
         start, size = starts[n], length[n] + 22
         set_word(buffer, start, 5 | size << 8)
@@ -140,7 +140,7 @@ class McapFile:
     """Writer of an MCAP file to the stream `out`.
 
     Every method raises `OSError` if the disk is full. After a failed call of `chunk`, the messages of the chunk are
-    lost and the file is as before the call. After any other failed call, `out` must be closed.
+    lost, and the file is as before the call. After a failed call of any method except `chunk`, `out` must be closed.
     """
 
     def __init__(self, out: ByteFile, library: str) -> None:

@@ -1,14 +1,15 @@
-"""Read measured loads and motions, which an estimate needs, from a folder of tables, a run, or another recording.
+"""Read measured loads and motions, which an estimate needs.
 
-A folder of tables contains these files:
+The measurements are read from a folder of tables, from a run of the twin, or from a recording of another program. A
+folder of tables contains these files:
 
 - scene.yaml
-- optionally load.csv with the columns t, fx, fy and m
-- pose.csv with the columns t, x, y and theta; it may be missing if gaps.csv exists
-- optionally gaps.csv with the column t and columns that are named after pairs
-- optionally contact_forces.csv with the same columns as gaps.csv
+- load.csv with the columns t, fx, fy and m, which may be missing
+- pose.csv with the columns t, x, y and theta, which may be missing if gaps.csv exists
+- gaps.csv with the column t and columns that are named after pairs of contacts, which may be missing
+- contact_forces.csv with the columns of gaps.csv, which may be missing
 
-Each table may be a Parquet file instead, such as load.parquet.
+Each CSV file may be replaced by a Parquet file, such as load.parquet.
 """
 
 from __future__ import annotations
@@ -50,15 +51,14 @@ FORCES_FILE = "contact_forces.csv"
 _LOAD_COLUMNS: Final = ("t", "fx", "fy", "m")
 _POSE_COLUMNS: Final = ("t", "x", "y", "theta")
 _NOT_STATED: Final = (math.nan,) * 3
-#: Largest number of rows of a table in memory. A load of this length takes 320 MB; at 1 kHz it covers almost three
-#: hours.
+#: Largest number of rows of a table in memory. At 1 kHz, a load with this number of rows covers almost three hours.
 MOST_ROWS: Final = 10_000_000
 #: Key under which the losses contain the number of rows that were dropped because of `MOST_ROWS`.
 OLDER_ROWS: Final = "older_rows"
 
 
 class _Rows:
-    """Table of the newest `MOST_ROWS` rows. Until older rows are dropped, it has up to a quarter more rows."""
+    """Table of the newest `MOST_ROWS` rows. Older rows are dropped when the table has a quarter more rows."""
 
     def __init__(self, columns: int) -> None:
         self._columns, self._values = columns, array("d")
@@ -101,12 +101,14 @@ class Measured:
         t [s] and x, y [m], theta [rad]. An empty cell is NaN.
     unreadable : int
         Number of rows and messages that could not be read or used.
-    pose_deviation, load_deviation : tuple of float
-        Standard deviations from the run: x, y [m] and theta [rad], and Fx, Fy [N] and M [N m]. A missing value is 0.
+    pose_deviation : tuple of float
+        Standard deviations of x, y [m] and theta [rad] that the run contains. A missing value is 0.
+    load_deviation : tuple of float
+        Standard deviations of Fx, Fy [N] and M [N m] that the run contains. A missing value is 0.
     gaps : ndarray, shape (m, 9)
         t [s] and the gaps of the eight pairs [m]. The gap of a pair without a sensor is NaN.
     gaps_deviation : float
-        Standard deviation of the gaps from the run [m]. A missing value is 0.
+        Standard deviation of the gaps that the run contains [m]. A missing value is 0.
     lost : mapping of str to int
         Counts of the losses by reason. The sum of the counts is `unreadable`.
     forces : ndarray, shape (m, 9)
@@ -149,7 +151,7 @@ def read_measured(folder: Path, scene: Path | None = None) -> Measured:
     model = load_scene(scene_path(str(scene)) if scene else folder / SCENE_FILE)
     first = next((table[0, 0] for table in (load, poses, gaps) if len(table)), 0.0)
     if first >= EPOCH_S:
-        # times count from the first sample of the load, or from the first pose or gap without a load
+        # times count from the first sample of the load; if there is no load, they count from the first pose or gap
         for table in (poses, gaps, forces, load):
             table[:, 0] -= first
     return Measured(model, load, poses, lost.total(), gaps=gaps, lost=dict(lost), forces=forces)
@@ -170,9 +172,9 @@ def _table(folder: Path, name: str) -> Path:
 def read_recording(path: Path, scene: Path | None = None, mapping: Path | None = None) -> Measured:
     """Return the measurements in a recording, in which time is counted from the first sample of the load.
 
-    The measurements of a run are read from its journal. If the journal contains no pose, the poses are read from other
-    topics in the folder of the run and its subfolders `beside`, `beside_2`, .... Any other recording is read through
-    the mapping. Without a load, time is counted from the first pose or gap.
+    The measurements of a run are read from the journal of the run. If the journal contains no pose, the poses are read
+    from the topics in the folder of the run and in its subfolders `beside`, `beside_2`, .... A recording of another
+    program is read with the help of the mapping. If there is no load, time is counted from the first pose or gap.
 
     Raises
     ------
@@ -233,8 +235,10 @@ def _journal(reader: RunReader, lost: Counter[str]) -> tuple[Array, list[int], A
         Stamp [ns] and load of each sample.
     begins : list of int
         Rows of `loads` before which samples are missing.
-    poses, gaps : ndarray, shape (k, 4) and (m, 9)
-        Stamp [ns] and values of each measurement.
+    poses : ndarray, shape (k, 4)
+        Stamp [ns] and values of each pose.
+    gaps : ndarray, shape (m, 9)
+        Stamp [ns] and gaps of each measurement of the gaps.
     spread : ndarray, shape (3,)
         Largest standard deviation of the load that the journal contains.
     deviations : ndarray, shape (k, 3)
@@ -270,8 +274,8 @@ def _journal(reader: RunReader, lost: Counter[str]) -> tuple[Array, list[int], A
 def _longest(rows: Array, begins: list[int]) -> Array:
     """Return the longest part of a load without missing samples.
 
-    At the rows `begins`, samples are missing. If the missing time is long, the load in it is unknown, and the load is
-    split there.
+    Samples are missing before each row in `begins`. The load is split at such a row if the time without samples is
+    long.
     """
     if len(rows) < 2:
         return rows

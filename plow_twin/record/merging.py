@@ -12,18 +12,18 @@ T = TypeVar("T")
 #: Function that returns the stamp of a message [ns], or None for a message without a stamp.
 StampOf: TypeAlias = Callable[[T], int | None]
 
-#: Largest delay [ns] of a late message behind the newest stamp. A larger difference means that the clock was set back.
+#: Largest delay [ns] of a late message behind the newest stamp. A larger delay means that the clock was set back.
 _STEP_NS: Final = 1_000_000_000
-#: Largest plausible increase from one stamp to the next [ns]. After a larger increase, the following stamp shows
-#: whether the stamp was wrong.
+#: Largest plausible increase from one stamp to the next [ns]. After a larger increase, the stamp of the next message
+#: shows whether the increased stamp was wrong.
 _JUMP_NS: Final = 10_000_000_000
 
 
 def merged(streams: Iterable[Iterator[T]], stamp_ns: StampOf[T]) -> Iterator[T]:
     """Yield the messages of all streams in the order of their stamps, without a change of order within a stream.
 
-    A message without a stamp, or with a single wrong stamp, follows its predecessor in the stream. When the clock of a
-    stream steps back, the other streams are read up to the same step before this stream continues.
+    A message without a stamp, or with a single wrong stamp, follows its predecessor in the stream. If the clock steps
+    back, all streams are read up to the step before any stream is read beyond the step.
     """
     for _, _, arrived in heapq.merge(*(_placed(stream, stamp_ns) for stream in streams), key=lambda item: item[:2]):
         yield arrived

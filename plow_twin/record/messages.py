@@ -38,8 +38,8 @@ class JointState:
 class Odometry:
     """Pose in the frame `frame_id`, and twist in the frame `child_frame_id`.
 
-    `orientation` is the quaternion (x, y, z, w). A covariance is the row-major 6 x 6 matrix of (x, y, z, rotation about
-    x, y, z); a matrix of zeros means that the covariance is unknown.
+    `orientation` is the quaternion (x, y, z, w). A covariance is a row-major 6 x 6 matrix. Its rows belong to x, y, z
+    and to the rotations about x, y, z. A matrix of zeros means that the covariance is unknown.
     """
 
     TYPE: ClassVar = "nav_msgs/msg/Odometry"

@@ -22,7 +22,7 @@ _LOST: Final = "plow_twin_lost "
 
 @dataclass
 class TopicCount:
-    """A topic of a recording and its number of messages. `bag_metadata` replaces an empty QoS or type hash."""
+    """A topic of a recording with its number of messages. `bag_metadata` replaces an empty QoS or type hash."""
 
     topic: str
     message_type: str
@@ -34,7 +34,7 @@ class TopicCount:
 def qos_profile(base_name: str) -> dict[str, Any]:
     """Return the QoS that the node offers on the topic with this base name.
 
-    For other topics, the QoS is reliable with depth 10.
+    For a topic on which the node does not publish, the QoS is reliable with depth 10.
     """
     for topic in TOPICS:
         if topic.name == base_name:
@@ -166,7 +166,7 @@ def recorded_losses(folder: Path) -> dict[str, int]:
 
 
 def missing_files(folder: Path, without: Collection[str] = ()) -> list[str]:
-    """Return the files in `metadata.yaml` that do not exist or that `without` contains."""
+    """Return the files in `metadata.yaml` that do not exist or that are in the collection `without`."""
     try:
         listed = listed_parts(folder)
     except RecordingError:

@@ -57,7 +57,7 @@ def message(topic: Topic, stamp_ns: int, numbers: Array, frame_id: str, child_fr
 
 
 def template(topic: Topic, frame_id: str, child_frame_id: str) -> Template:
-    """Return the template of the messages on a topic, in which the stamp and the numbers are replaced."""
+    """Return the template of the messages on a topic. To create a message, replace its stamp and its numbers."""
     return Template.of(lambda numbers: message(topic, 0, numbers, frame_id, child_frame_id), topic.count)
 
 

@@ -1,7 +1,8 @@
 """Read a run from front to back, even if it is truncated or has damaged chunks.
 
-A recording consists of one or more files, its *parts*. Only a few chunks are in memory at a time. Journal entries and
-outputs are stored in separate chunks; the reader merges them by their sequence numbers.
+A recording consists of one or more files, which are called *parts*. Only a few chunks are in memory at a time. Journal
+entries and outputs are stored in separate chunks. The reader merges the entries and the outputs by their sequence
+numbers.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from plow_twin.record.metadata_yaml import missing_files
 from plow_twin.record.template import Indexes, Template, read_numbers
 from plow_twin.stream.journal import Entry, Loss, Sample
 
-#: Largest number of journal entries in memory. More entries are yielded even if outputs between them may follow.
+#: Largest number of journal entries in memory. If more entries are read, they are yielded, although outputs that belong
+#: between them may follow in the file.
 _PENDING: Final = 65_536
 #: Smallest number of entries in a batch. A batch may be smaller if the outputs of `_LEAST // 16` chunks are in memory.
 _LEAST: Final = 8192
@@ -61,20 +63,25 @@ class RunReader:
     path
         Folder of the run, or one of its `.mcap` files.
     tail
-        Wait for a run that is still being written. The reader then also reads new parts, and yields an empty batch
-        whenever it reaches the end of the data.
+        Wait for a run that is still being written. With a tail, the reader reads new parts, and yields an empty batch
+        at each end of the data.
 
     Attributes
     ----------
     parts : list of Path
-        Files that are read; `path` is the first file. Parts that are removed during the iteration are skipped.
+        Files that are read, in order. Parts that are removed during the iteration are skipped.
     repeated : dict
         Files that repeat a part, with the file that is read instead.
     foreign : dict
-        Files of another run, with the keys in which their headers differ from the headers of most files.
-    status, damaged_chunks, stop_reason, counts
-        Results of the iteration. A part that is not an MCAP file counts as a damaged chunk. `counts` is the number of
-        records by topic.
+        Files of another run. The value is the keys in which the header of the file differs from most headers.
+    status
+        State of the end of the recording, which is known after the iteration.
+    damaged_chunks
+        Number of damaged chunks that the iteration has found. A part that is not an MCAP file counts as one.
+    stop_reason
+        Reason of an early end of the recording.
+    counts
+        Number of records that the iteration has found, by topic.
     position : float
         Share of the data that has been read, from 0 to 1.
 
@@ -130,7 +137,7 @@ class RunReader:
                 self.repeated[file] = read[self._headers[file].part]
 
     def _of_other_runs(self) -> dict[Path, tuple[str, ...]]:
-        """Return the files whose header differs from that of most files, with the keys that differ."""
+        """Return the files with a header that differs from the header of most files, and the keys that differ."""
         records = {file: header.to_record() for file, header in self._headers.items()}
         for record in records.values():
             del record["part"]
@@ -146,7 +153,7 @@ class RunReader:
 
     @property
     def missing_parts(self) -> int:
-        """Number of missing parts, according to `metadata.yaml` and to the part numbers of the other files."""
+        """Number of missing parts, according to `metadata.yaml` and to the part numbers of the existing files."""
         if not self._place.is_dir():
             return 0
         there = {self.number(file) for file in self.parts}
@@ -160,8 +167,8 @@ class RunReader:
     def lost(self) -> dict[str, int]:
         """Number of lost messages by topic.
 
-        The recorder writes these numbers when it closes the recording. If the recorder was killed, they are the sums of
-        its notes in the journal.
+        The recorder writes the numbers when it closes the recording. If the recorder was killed, the notes about losses
+        in the journal are added up.
         """
         noted: Counter[str] = Counter()
         for entry in self._noted.values():
@@ -243,7 +250,7 @@ class RunReader:
             self.status = FileStatus.COMPLETE if self.stop_reason is None else FileStatus.STOPPED_EARLY
 
     def _parts_to_read(self) -> Iterator[Path]:
-        """Yield the parts in order; with a tail, also parts that the recorder starts during the iteration."""
+        """Yield the parts in order. With a tail, parts that the recorder starts during the iteration are included."""
         done: list[Path] = []
         while left := [part for part in self.parts if part not in done]:
             done.append(left[0])

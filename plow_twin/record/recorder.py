@@ -1,8 +1,8 @@
 """The recorder of a live node.
 
 Callers put journal entries and publications in a queue, and never wait for the disk. A thread empties the queue every
-50 ms and writes the file. If the thread is too slow, items that do not fit in the queue are dropped. Dropped items are
-counted by topic, and a note in the file marks the place of each loss.
+50 ms and writes the items to the file. If the thread is too slow, items that do not fit in the queue are dropped.
+Dropped items are counted by topic, and a note in the file marks the place of each loss.
 
 A *ring* is a recording of the last seconds of a run in memory. The method `Recorder.mark` writes the ring to the disk.
 """
@@ -43,7 +43,7 @@ JOURNAL: Final = "journal"
 _POLL_S: Final = 0.05
 #: Error numbers of a full disk. These errors only pause the recording, because space may become free.
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
-#: Number of items after which the thread sleeps for a moment. Other threads can then acquire the interpreter lock.
+#: Number of items after which the thread sleeps for a moment, so that the twin can acquire the interpreter lock.
 _BURST: Final = 128
 
 
@@ -53,14 +53,18 @@ class RecorderCounters:
 
     Attributes
     ----------
-    written, queued : int
-        Numbers of items that were written, and that are in the queue.
+    written : int
+        Number of items that were written.
+    queued : int
+        Number of items in the queue.
     lost : dict
         Number of lost messages by topic. The key of lost journal entries is `journal`.
     error : str or None
         Reason why recording stopped, or why the last ring was not written.
-    marks, marks_lost : int
-        Number of rings that were written, and number of rings that could not be written.
+    marks : int
+        Number of rings that were written. A ring contains the last seconds of a run.
+    marks_lost : int
+        Number of rings that could not be written.
     """
 
     written: int
@@ -109,14 +113,16 @@ class Recorder:
     queue_size
         Largest number of items in the queue. The last quarter of the queue is reserved for journal entries.
     flush_period_s
-        Interval between writes to the file [s]. If the process is killed, the journal entries of up to one interval and
-        the messages of up to two intervals are lost.
+        Interval between writes to the file [s]. If the process is killed, journal entries of up to one interval are
+        lost, and messages of up to two intervals are lost.
     chunk_size
         Size at which a chunk is written to the file [B].
     min_free_bytes
         Free space on the disk below which recording pauses [B].
-    part_bytes, part_s
-        Size [B] and duration [s] after which a new part (file) is started. With 0, the parts have no limit.
+    part_bytes
+        Size after which a new part (file) is started [B]. With 0, the size of a part is not limited.
+    part_s
+        Duration after which a new part is started [s]. With 0, the duration of a part is not limited.
     keep_bytes
         Total size of the completed parts above which the oldest parts are removed [B]. With 0, no part is removed.
     ring_s
@@ -172,7 +178,7 @@ class Recorder:
         )
         if header.follow == "full":
             each += tuple(map(header.topic, names_of(Cadence.FOLLOWED)))
-        #: topics of a publication, by a pair: whether the publication has a slow part, and whether it is marked
+        #: topics of a publication; the key states whether the publication has a slow part, and whether it is marked
         self._topics_of = {
             (False, False): each, (True, False): each + slow, (False, True): each + marked,
             (True, True): each + slow + marked,
@@ -181,7 +187,7 @@ class Recorder:
         self._split_due = False
         self._part_since = time.monotonic()
         self._queue: deque[_Item] = deque()
-        #: number of entries and publications in the queue beyond one per item, because an item may contain several
+        #: number of entries and publications in the queue minus the number of items in the queue
         self._more = 0
         self._queue_size = queue_size
         self._flush_period_s = flush_period_s
@@ -243,7 +249,8 @@ class Recorder:
     def journal(self, entry: Entry) -> bool:
         """Add a journal entry to the queue; return False if the entry is lost.
 
-        After a loss, all entries are refused until a `Snapshot` arrives. A replay can continue only from a snapshot.
+        After a loss, all entries are refused until a `Snapshot` arrives, because a replay can continue only from a
+        snapshot.
         """
         now = self._now_ns()
         with self._lock:
@@ -257,7 +264,7 @@ class Recorder:
                 if self._journal_gap:
                     self._push_entry(now, Loss(self._journal_gap))
                     self._journal_gap = 0
-                # the notes of losses precede the snapshot: a replay can compare all messages after the snapshot
+                # notes of losses are written before the snapshot, so that a replay can compare all later messages
                 if snapshot:
                     self._push_notes(now)
                 self._push_entry(now, entry)
@@ -293,13 +300,13 @@ class Recorder:
         return fits
 
     def series(self, series: Series) -> NDArray[np.int64]:
-        """Add all samples and digests of a series to the queue as journal entries; if they do not fit, all are lost.
+        """Add the samples and digests of a series to the queue as journal entries. The queue accepts all or none.
 
         Returns
         -------
         ndarray of int64, shape (n,)
-            For each sample, the sequence number that its publication needs. This number belongs to the sample or, if a
-            digest follows the sample, to the digest.
+            Sequence number for the publication after each sample. It is the number of the sample or, if a digest
+            follows the sample, the number of the digest.
         """
         now, samples = self._now_ns(), len(series.stamps)
         count = samples + len(series.digests)
@@ -332,7 +339,8 @@ class Recorder:
     def _admitted(self, now: int, items: int, topics: Iterable[str]) -> bool:
         """Return whether the queue has space for messages on `topics`.
 
-        If it has space, notes about earlier losses on these topics are queued. Otherwise the messages count as lost.
+        If the queue has space, notes about earlier losses on the topics are queued. If it has no space, the messages
+        are counted as lost.
         """
         if not self._room(items, self._queue_size * 3 // 4):
             self._snapshot_due = True
@@ -365,7 +373,7 @@ class Recorder:
         self._output_gaps.clear()
 
     def close(self, timeout_s: float = 5.0) -> LossReport:
-        """Write the queued items, close the file and return the losses. A second call only returns the losses.
+        """Write the queued items, close the file and return the losses. Any further call only returns the losses.
 
         If the thread writes no item within `timeout_s` [s], the method returns although the file is not closed.
         """
@@ -417,7 +425,7 @@ class Recorder:
                 lost = dict(self._lost)
             self._writer.close(lost, reason or self._paused)
             self._closed = True
-        except Exception as error:  # the twin continues without a recorder, whatever the error is
+        except Exception as error:  # the twin continues without a recorder after any error
             self._give_up(str(error), self._unflushed)
             self._writer.abandon()
 
@@ -437,7 +445,7 @@ class Recorder:
                 time.sleep(1e-6)
 
     def _write(self, items: list[_Item]) -> None:
-        """Write items, consecutive items of one kind in one call.
+        """Write items. Consecutive items of one kind are written in one call.
 
         The order of the journal entries and the order of the outputs are preserved.
         """
@@ -584,7 +592,7 @@ class _SeriesItem(NamedTuple):
 class _PublicationsItem(NamedTuple):
     """Publications to write. `sequence` is the number of the journal entry before each publication.
 
-    The attribute `keys` of every kind of item contains the topics whose messages are lost if the item is lost.
+    Every kind of item has the attribute `keys`. It contains the topics of the messages that are lost with the item.
     """
 
     sequence: NDArray[np.int64]

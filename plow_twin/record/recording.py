@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 Indexes = NDArray[np.int64]
 
 _POSE: Final = ("x", "y", "theta")
-#: Quantities whose name in the tables differs from the name of the field in the record.
+#: Name in the tables of each quantity that has another name in the record.
 _NAMES: Final = {"makes": "touches"}
 
 
@@ -46,7 +46,7 @@ def _columns_of(topic: Topic) -> tuple[str, ...]:
     return tuple(f"{name}/{_NAMES.get(quantity, quantity)}" for quantity in quantities for name in topic.names)
 
 
-#: Columns of each table. The first two tables contain inputs of the twin, and all other tables contain its outputs.
+#: Columns of each table. The first two tables contain inputs of the twin. All tables after the second contain outputs.
 COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "excitation": ("fx", "fy", "m"),
     "head_pose": _POSE,

@@ -1,10 +1,14 @@
-"""Replay a recording: move the model by the journal alone, and compare its messages with the recorded messages.
+"""Replay a recording.
+
+A replay advances the model by the entries of the journal, and compares the messages that it computes with the recorded
+messages.
 
 Terms of this module:
 
 - The replay is *synced* while its state must equal the state of the live session. After a missing journal entry, the
-  replay is not synced until the next snapshot, from which it takes the state. Other snapshots are compared.
-- A *cumulative* message contains, for example, the peak since the previous message.
+  replay is not synced until the next snapshot, from which it restores the state. A synced replay compares its state
+  with the state in a snapshot.
+- A *cumulative* message contains a quantity of the time since the previous message, for example the peak.
 - The *output window* is the motion since the previous publication. Cumulative messages can be compared only if the
   replay has computed the whole output window.
 - A *run* of entries is a series of samples and digests without a missing entry. A run is applied in one call.
@@ -91,10 +95,10 @@ def replay(
     on_progress
         Function that receives the share of the recording that has been replayed, from 0 to 1.
     digests_only
-        Compare only the digests. Chunks without journal entries are then skipped.
+        Compare only the digests, which are hashes of the state, and skip chunks without journal entries.
     write
-        Folder of a new recording, which contains the journal and all outputs after each advance. Only digests are then
-        compared.
+        Folder of a new recording, which contains the journal and all outputs after each advance. If a folder is given,
+        only digests are compared.
 
     Raises
     ------
@@ -159,7 +163,7 @@ class _Replay:
             _warm_up(scene, header.tol, self.templates, rows=not digests_only)
         self.sink: RunWriter | None = None
         self.rows = np.zeros(0, ROW)
-        # publications of the last run of entries; further messages of the last publication may follow in the recording
+        # publications of the last run of entries; the recording may continue with messages of the last publication
         self.published: Published | None = None
         self.session = Session(
             twin, header.origin_ns, rollback_span_s=float(header.parameters.get("rollback_span", 0.0))
@@ -180,7 +184,7 @@ class _Replay:
         self.alarms = AlarmCheck(header, self.all_outputs)
 
     def batch(self, batch: Batch) -> None:
-        """Apply and compare a batch. Each run is applied in one call, and all other entries are applied singly."""
+        """Apply and compare a batch. Each run, and each entry outside a run, is applied in one call."""
         self.outputs_whole = not batch.damaged
         self.outputs_synced = self.outputs_synced and self.outputs_whole
         if batch.damaged:
@@ -210,7 +214,7 @@ class _Replay:
     def _run_ends(self, entries: Entries) -> Indexes:
         """Return the indexes at which runs end, in ascending order. The last index is the number of entries.
 
-        A run ends at a missing entry. It also ends before and after each entry that must be applied singly:
+        A run ends at a missing entry. A run ends before and after each entry that must be applied in a call of its own:
 
         - a late sample
         - an entry that changes the motion
@@ -252,8 +256,8 @@ class _Replay:
             self._note(Divergence(*difference))
 
     def _messages(self, sent: SentMessages, begin: int, end: int) -> None:
-        # With a sink, messages that a replay cannot compute are copied to the sink. Without a sink, messages that a
-        # replay can compute are compared.
+        # If there is a sink, the messages that a replay cannot compute are copied to the sink. If there is no sink, the
+        # messages that a replay can compute are compared.
         chosen = (sent.kind[begin:end] >= 0) == (self.sink is None)
         for index in (begin + np.flatnonzero(chosen)).tolist():
             self.output(sent.record(index))
@@ -336,7 +340,7 @@ class _Replay:
         assert self.sink is not None
         entry = record.entry
         if isinstance(entry, Snapshot) and self.synced:
-            # the recorded snapshot refers to the recorded publications, and this one to the publications in the sink
+            # the recorded snapshot does not fit the publications in the sink, which are more than the recorded ones
             entry = self.session.snapshot()
         self.sink.write_entry(record.sequence, record.log_time_ns, entry)
         published = self.session.outputs.pop() if self.synced and isinstance(entry, Sample | Hold | Unload) else NOTHING
@@ -443,8 +447,8 @@ class _Replay:
     def _snapshot(self, snapshot: Snapshot) -> None:
         if self.synced and self.outputs_synced:
             self.report.snapshots_compared += 1
-            # The live session discarded its earlier states when it took the snapshot. `renew` also takes a snapshot and
-            # discards the earlier states. Late samples then have the same effect in the replay as in the live session.
+            # The live session discarded its earlier states when it took the snapshot. `renew` takes a snapshot and
+            # discards the earlier states of the replay, so that late samples have the same effect in both sessions.
             computed = self.session.renew().data
             self._compare("snapshot", snapshot.stamp_ns, "state", _hash(snapshot.data), _hash(computed))
             return
@@ -453,7 +457,7 @@ class _Replay:
             self.session.apply(snapshot)
         except (ValueError, struct.error) as error:
             raise RecordingError(f"{self.report.path}: snapshot at {snapshot.stamp_ns} ns: {error}") from error
-        # messages were lost, but no entry, so that only the motion can be compared
+        # messages were lost, but no entry was lost, so that only the motion can be compared
         if before is not None:
             self._compare("snapshot", snapshot.stamp_ns, "state", self.session.twin.digest(), before)
         self.synced = self.resumed = True
@@ -462,7 +466,7 @@ class _Replay:
     def output(self, record: OutputRecord) -> None:
         """Compare a recorded message with the message that the replay computes after the same journal entry.
 
-        With a sink, copy the message to the sink instead.
+        If there is a sink, copy the message to the sink, and compare nothing.
         """
         if self.sink is not None:
             place = (record.topic, record.sequence, record.log_time_ns, record.publish_time_ns)

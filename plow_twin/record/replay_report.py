@@ -33,14 +33,18 @@ class ReplayReport:
 
     Attributes
     ----------
-    refused, repeated : int
-        Number of entries that the session refused, and number of entries that occurred before.
-    compared, not_compared : Counter
-        Numbers of messages that were compared, and that could not be compared, by base name of the topic.
+    refused : int
+        Number of entries that the session refused.
+    repeated : int
+        Number of entries that repeat an earlier entry.
+    compared : Counter
+        Number of messages that were compared, by base name of the topic.
+    not_compared : Counter
+        Number of messages that could not be compared, by base name of the topic.
     repeated_parts : dict
-        Files that repeat a part, with the file that was read instead.
+        Files that repeat a part. The value is the file that was read in place of the key.
     foreign_parts : dict
-        Files of another run, with the keys of the header that differ.
+        Files of another run. The value is the keys of the header that differ.
     inputs : dict
         Number of received messages, by input and by outcome.
     """

@@ -22,8 +22,9 @@ PARTS: Final = 8
 class RingWriter(RunWriter):
     """Recording in memory that drops its oldest parts.
 
-    The ring contains at least the last `ring_s` seconds, and up to an eighth more. The folder is not created; it only
-    gives the recording its name. With `sync_dumps`, the method `dump` waits until the data are on the disk.
+    The ring contains at least the last `ring_s` seconds, and at most an eighth more. The argument `folder` gives the
+    recording its name, and the folder is not created. With `sync_dumps`, the method `dump` waits until the data are on
+    the disk.
     """
 
     def __init__(

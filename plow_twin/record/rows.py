@@ -52,9 +52,8 @@ def rows_by_topic(
 ) -> dict[str, Rows]:
     """Return the numbers of all messages on each topic that has messages.
 
-    `topics` maps each topic to its base name, and `templates` maps each base name to its template. A message that does
-    not match the template, because a string in it differs, is decoded. A message with another number of values is
-    omitted.
+    `topics` maps each topic to its base name, and `templates` maps each base name to its template. A message with a
+    string that differs from the template is decoded. A message with more or fewer values than the template is omitted.
     """
     found: dict[str, list[Rows]] = {}
     for part in outputs:

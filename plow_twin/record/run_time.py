@@ -1,4 +1,4 @@
-"""Determine the duration of a run, and its intervals without samples (silences), from the journal."""
+"""Determine the duration and the silences of a run from the journal. A silence is an interval without samples."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _TIMEOUT = "excitation_timeout"
 class RunTime:
     """Duration and silences of a run, from its journal entries in order.
 
-    Of the node's parameters, `excitation_timeout` is used: a longer interval without samples is a silence.
+    An interval without samples is a silence if it is longer than the parameter `excitation_timeout` of the node.
     """
 
     def __init__(self, parameters: Mapping[str, Any]) -> None:
@@ -66,7 +66,7 @@ class RunTime:
             case Reset() | SetWear() | Restore():
                 self._reached_ns = None
                 self.silences.restart()
-            case Loss():  # some of the lost entries may be samples
+            case Loss():  # a sample may be among the lost entries
                 self.silences.restart()
             case Parameter(name, value) if name == _TIMEOUT:
                 self.silences.timeout_s = float(value)

@@ -29,8 +29,8 @@ def find_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False
 def running_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False) -> Path | None:
     """Return the recording that is being written to the folder `path`, or to `<path>_2`, `<path>_3`, ....
 
-    If no recording is being written, the function waits for a recording. After `wait_s` [s], or when `stop` returns
-    True, the function returns None.
+    If no recording is being written, the function waits until one is written. The function returns None after `wait_s`
+    [s], or when `stop` returns True.
     """
     deadline = time.monotonic() + wait_s
     while True:

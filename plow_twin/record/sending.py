@@ -21,8 +21,8 @@ _WORD: Final = 8
 class Messages:
     """Encoder that writes the messages of each publication to the same memory.
 
-    `frame_id` and `child_frame_id` are the frames in the messages. With `intervals`, there are also messages that
-    contain the intervals from 5 % to 95 % of the forces.
+    `frame_id` and `child_frame_id` are the frames in the messages. With `intervals`, the encoder has additional
+    messages that contain the intervals from the 5 % to the 95 % quantile of the forces.
     """
 
     def __init__(self, frame_id: str, child_frame_id: str, *, intervals: bool = False) -> None:
@@ -37,8 +37,7 @@ class Messages:
     def write(self, published: Published) -> tuple[tuple[str, memoryview], ...]:
         """Return the messages of a publication that has one row, in the order of sending.
 
-        Messages with intervals are not included; the method `intervals` returns them. The next call overwrites the
-        bytes.
+        The method `intervals` returns the messages with intervals. The next call of `write` overwrites the bytes.
 
         Returns
         -------

@@ -23,10 +23,11 @@ class SentMessages:
     parts : list of Outputs
         Messages of each chunk.
     begins : ndarray of int64, shape (k + 1,)
-        Index of the first message of each part in the whole sequence, and the number of all messages.
-    sequence, kind : ndarray of int64, shape (n,)
-        Sequence number of each message, and index of its topic in `PUBLICATION_TOPICS`. The index is -1 for any other
-        topic.
+        Index of the first message of each part in the whole sequence. The last element is the number of all messages.
+    sequence : ndarray of int64, shape (n,)
+        Sequence number of each message.
+    kind : ndarray of int64, shape (n,)
+        Index of the topic of each message in `PUBLICATION_TOPICS`, or -1 if the topic is not in `PUBLICATION_TOPICS`.
     """
 
     parts: list[Outputs]
@@ -37,13 +38,13 @@ class SentMessages:
     @classmethod
     def of(cls, outputs: list[Outputs], topics: Mapping[str, str]) -> Self:
         """Collect messages; `topics` maps the topics that a replay can compute to their base names."""
-        # the tables are created once for each dictionary of topics, which many parts have in common
+        # many parts have the same dictionary of topics, so one table is created for each dictionary
         tables = {id(part.topics): _kinds(part.topics, topics) for part in outputs}
         sequence = _joined(part.sequence for part in outputs)
         kind = _joined(tables[id(part.topics)][part.messages.channel] for part in outputs)
         begins = np.cumsum([0, *map(len, outputs)])
         if (sequence[1:] < sequence[:-1]).any():
-            # another program wrote the file; with a part for each message, the parts can be sorted
+            # the messages are not in order, because another program wrote the file; a part of one message can be sorted
             order = np.argsort(sequence, kind="stable")
             owner = np.searchsorted(begins, order, side="right") - 1
             places = zip(owner.tolist(), (order - begins[owner]).tolist(), strict=True)
@@ -66,7 +67,8 @@ class SentMessages:
     def pieces(self, begin: int, end: int) -> Iterator[tuple[Messages, int, int]]:
         """Yield the messages with the indexes `begin` to `end - 1`, chunk by chunk.
 
-        The two integers are the index of the first message of a piece, and the index after its last message.
+        The first integer is the index of the first message of a piece. The second integer is the index of the last
+        message plus one.
         """
         first = int(np.searchsorted(self.begins, begin, side="right")) - 1
         while begin < end:

@@ -1,4 +1,4 @@
-"""Read the messages of any recording: MCAP or sqlite3 of rosbag2 (a file, or a folder of parts), CSV, or Parquet.
+"""Read the messages of a recording in the format MCAP, sqlite3 (of rosbag2), CSV or Parquet.
 
 Messages are read in the order in which they were written, and only a few chunks are in memory at a time. Messages that
 cannot be decoded are counted and skipped. A truncated file is read as far as possible.
@@ -33,8 +33,8 @@ _SQLITE_MAGIC: Final = b"SQLite format 3\0"
 _ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 #: Largest size of a decompressed message [B].
 _LARGEST_MESSAGE: Final = 2**26
-#: Query for views, virtual tables and computed columns. A file that contains them is refused, because reading a
-#: computed table may never end.
+#: Query for views, virtual tables and computed columns. A file that contains one is refused, because reading a computed
+#: table may never end.
 _COMPUTED: Final = """
     SELECT 1 FROM sqlite_master
     WHERE name COLLATE NOCASE IN ('topics', 'messages') AND (type != 'table' OR rootpage = 0)
@@ -42,7 +42,7 @@ _COMPUTED: Final = """
     UNION ALL SELECT 1 FROM pragma_table_xinfo('topics') WHERE hidden LIMIT 1
 """
 _MESSAGES: Final = "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
-#: Errors that sqlite3 raises for a damaged file, for text that is not UTF-8, and for cells with an invalid length.
+#: Errors that sqlite3 raises for a damaged file, for text that is not UTF-8, and for table cells of invalid length.
 _SQLITE_ERRORS: Final = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 
@@ -88,7 +88,7 @@ class Arrived:
 
 @dataclass
 class Losses:
-    """Numbers of unused messages of a recording by reason, and the topics whose type is unknown."""
+    """Numbers of unused messages of a recording by reason, and the topics that have an unknown message type."""
 
     counts: Counter[str] = field(default_factory=Counter)
     unknown_types: dict[str, str] = field(default_factory=dict)
@@ -105,7 +105,8 @@ class Source(Protocol):
     def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf[Arrived] | None = None) -> Iterator[Arrived]:
         """Yield the messages on the topics for which `wanted` returns True.
 
-        If each topic has a file, the messages of several files are merged by their stamps, which `stamp_ns` returns.
+        If the recording has a file for each topic, the messages of the files are merged by the stamps that `stamp_ns`
+        returns.
         """
 
 
@@ -148,7 +149,7 @@ def open_source(path: Path) -> Source:
 
 
 def packed(path: Path) -> str:
-    """Return a hint if rosbag2 has compressed a whole file, which cannot be read; otherwise an empty string."""
+    """Return a hint if a file cannot be read because rosbag2 has compressed it as a whole, or an empty string."""
     files = sorted(path.glob("*.zstd")) if path.is_dir() else [path] if path.suffix == ".zstd" else []
     return f" ({files[0].name} is compressed as a whole: unpack it with zstd -d)" if files else ""
 
@@ -165,7 +166,7 @@ def _decompressed(data: bytes) -> bytes:
 
 
 class Decoder:
-    """Decoder of CDR messages for the types of ROS 2 Jazzy, and for types whose schema the recording contains."""
+    """Decoder of CDR messages. It reads the types of ROS 2 Jazzy, and types that have a schema in the recording."""
 
     def __init__(self, losses: Losses) -> None:
         from rosbags.typesys import Stores, get_typestore
@@ -373,7 +374,7 @@ class SqliteSource:
 class CsvSource:
     """A recording in CSV files with a header row, or in Parquet files.
 
-    Each file is a topic, whose name is the file name without extension.
+    Each file is a topic. The name of the topic is the file name without extension.
     """
 
     def __init__(self, parts: list[Path]) -> None:
@@ -423,7 +424,7 @@ def read_table(path: Path) -> tuple[Columns, Iterator[list[str]]]:
     Raises
     ------
     RecordingError
-        The file cannot be read, or two columns have the same name. The iterator raises the error, too.
+        The file cannot be read, or two columns have the same name. The function or the iterator raises the error.
     """
     rows = _table_rows(path)
     names = tuple(name.strip() for name in next(rows, ()))
@@ -479,5 +480,5 @@ def _log_time_ns(arrived: Arrived) -> int | None:
 
 
 def _row_time_ns(cell: str) -> int:
-    """Return the time in a cell [ns]. A number that is too large for seconds is read in a smaller unit."""
+    """Return the time in a table cell [ns]. A number that is too large for seconds is read in a smaller unit."""
     return next((found for unit in STAMP_UNITS if (found := time_ns(cell, unit)) is not None), NO_TIME)

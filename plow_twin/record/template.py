@@ -1,4 +1,4 @@
-"""Templates, with which many messages of the same length are written or read in one compiled call.
+"""Templates with which one compiled call writes or reads many messages of the same length.
 
 If all strings of two messages are equal, the messages differ only in the stamp and in float64 numbers. A template
 contains the bytes that are equal, and the offsets of the numbers. The offsets are found by encoding a message with
@@ -86,7 +86,7 @@ class Template:
 
 @compiled
 def _fits(buffer: Bytes, start: int, length: int, data: Bytes, fixed: Bytes) -> bool:
-    """Return whether the message at offset `start` matches a template, whatever its stamp and numbers are."""
+    """Return whether the message at offset `start` matches a template. The stamp and the numbers are not compared."""
     if length != data.size or start < 0 or start + length > buffer.size:
         return False
     last = length - 8  # the last word may overlap the word before it, because the length may be no multiple of 8
@@ -98,7 +98,7 @@ def _fits(buffer: Bytes, start: int, length: int, data: Bytes, fixed: Bytes) -> 
 
 @compiled
 def stamp_word(stamp_ns: int) -> int:
-    """Return the 64-bit word that represents a stamp in a message: seconds and nanoseconds."""
+    """Return the 64-bit word that represents a stamp in a message. It consists of the seconds and the nanoseconds."""
     seconds = stamp_ns // _SECOND_NS
     return (seconds & 0xFFFFFFFF) | ((stamp_ns - seconds * _SECOND_NS) << 32)
 
@@ -125,8 +125,8 @@ def read_numbers(buffer, starts, lengths, data, fixed, places, stamps, values, g
 class Templates:
     """Several templates in common arrays, so that messages of different kinds can be compared in one call.
 
-    The kind of a message is the index `k` of its template. The template consists of the bytes
-    `data[ends[k] : ends[k + 1]]` and the offsets `places[place_ends[k] : place_ends[k + 1]]`.
+    The kind of a message is the index `k` of its template. Template `k` consists of the bytes
+    `data[ends[k] : ends[k + 1]]` and of the offsets `places[place_ends[k] : place_ends[k + 1]]`.
     """
 
     data: Bytes

@@ -19,8 +19,8 @@ NO_TIME: Final = -1
 NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|inf|nan)", re.IGNORECASE)
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _NANOSECONDS: Final = re.compile(r"[.,]\d{6}(\d{1,3})")
-#: Smallest time that is read as a date [s]. A smaller time counts from an unknown start; `START_NS` is added to it,
-#: because a stamp of 0 means that the stamp is missing.
+#: Smallest time that is read as a date [s]. A smaller time counts from an unknown start. `START_NS` is added to a time
+#: from an unknown start, because a stamp of 0 means that the stamp is missing.
 EPOCH_S: Final = 1e9
 #: Stamp of the time 0 [ns].
 START_NS: Final = 1_000_000_000
@@ -70,7 +70,7 @@ def times_ns(texts: Sequence[bytes], unit: str) -> NDArray[np.int64] | None:
     stamps: NDArray[np.int64] = np.rint(numbers).astype(np.int64)
     stamps[stamps < EPOCH_S * 1e9] += START_NS
     for place, text in enumerate(texts):
-        if b"." not in text:  # unlike the float, an integer is exact to the nanosecond
+        if b"." not in text:  # an integer is exact to the nanosecond, and a float is not
             stamp_ns = time_ns(text.decode(), unit)
             if stamp_ns is None:
                 return None
@@ -81,7 +81,7 @@ def times_ns(texts: Sequence[bytes], unit: str) -> NDArray[np.int64] | None:
 def time_text(stamp_ns: int, *, own_start: bool = False) -> str:
     """Return a stamp as a date or, if it is below `EPOCH_S`, as a number of seconds.
 
-    With `own_start`, the number of seconds is as before the addition of `START_NS` in `time_ns`.
+    With `own_start`, `START_NS` is subtracted from the number of seconds, because `time_ns` has added it.
     """
     if stamp_ns < EPOCH_S * 1e9:
         return f"{(stamp_ns - (START_NS if own_start else 0)) * 1e-9:.3f} s"

@@ -1,4 +1,4 @@
-"""Detect wrong units of measured data, by the magnitude and the rate of the numbers, if a mapping states no unit."""
+"""Detect wrong units of measured data by the magnitude of the numbers, if a mapping states no unit."""
 
 from __future__ import annotations
 
@@ -23,13 +23,14 @@ from plow_twin.stream.limits import excitation_limits, largest_displacement
 Array = NDArray[np.float64]
 _START_S: Final = START_NS * 1e-9
 
-#: Number of messages that are checked. At 1 kHz, this number covers 20 s and several periods of a load.
+#: Number of messages that are checked. At 1 kHz, the checked messages cover several periods of a load.
 CHECKED: Final = 20_000
-#: Smallest plausible ratio of the measured forces to the largest force of the scene; an idling machine exceeds it.
+#: Smallest plausible ratio of the measured forces to the largest force of the scene. An idling machine exceeds this
+#: ratio.
 _IDLE_SHARE: Final = 1e-2
 #: Smallest ratio at which forces are taken for numbers in kN. Smaller forces may be the noise of an idle sensor.
 _BROKEN_SHARE: Final = 1e-4
-#: Units in which too small forces may be, with the factor by which the two ratios are multiplied for the unit.
+#: Units in which too small forces may be. The value is the factor for `_IDLE_SHARE` and `_BROKEN_SHARE` in this unit.
 _SMALLER: Final = {"kN": 1.0, "MN": 1e-3}
 #: Largest angle of the model [rad], 45 degrees.
 _LARGEST_ANGLE_RAD: Final = 0.25 * np.pi
@@ -44,8 +45,8 @@ _SLOW_S: Final = 0.5
 _SMOOTH: Final = 0.05
 #: Largest plausible speed of a plough [m/s]. The fastest ploughs travel at 3.6 m/s (Caterpillar GH1600).
 _FASTEST_M_S: Final = 5.0
-#: Shares of descending stamps. Above the first share, the column is not a time; above the second share, the rows are
-#: in reverse order.
+#: Shares of descending stamps. If the first share is exceeded, the column is not a time. If the second share is
+#: exceeded, the rows are in reverse order.
 _FALLING, _REVERSED = 0.2, 0.9
 _TIMES: Final = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: Range of the dates of this century in a spreadsheet, which counts days from 1900.
@@ -69,14 +70,16 @@ class UnitDoubt:
     ----------
     names : tuple of str
         Quantities that are in doubt. The name `t` means the stamps of the load.
-    found, expected : str
-        Found and expected magnitude of the numbers.
+    found : str
+        Magnitude of the numbers.
+    expected : str
+        Magnitude that is expected in SI units.
     likely : str
         Unit that the numbers seem to have.
     is_impossible : bool
         Whether no head can move as the numbers state.
     advice : str
-        Advice to the user if a statement of the unit does not help.
+        Advice to the user if the doubt cannot be removed by stating a unit.
     """
 
     role: str
@@ -92,7 +95,7 @@ class UnitDoubt:
 
     @property
     def remedy(self) -> str:
-        """Advice to the user, by default how to state the unit."""
+        """Advice to the user. The default advice explains how to state the unit."""
         return self.advice or "state the unit: " + " ".join(
             f"--unit {name}={self.likely.replace(' ', '')}" for name in self.names
         )
@@ -227,8 +230,8 @@ def _usual_magnitude(values: Array, percent: float = 99.0) -> float:
 def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[UnitDoubt]:
     """Return doubts about the forces and the moment.
 
-    The larger force is checked, because the other force may be small in any unit. The expected moment is proportional
-    to the forces.
+    Only the larger of the two forces is checked, because the smaller force may be small in any unit. The expected
+    moment is proportional to the forces.
     """
     found = [magnitudes[key] for key in (("excitation", "fx"), ("excitation", "fy")) if key in magnitudes]
     usual = _largest_force(scene)
@@ -251,7 +254,7 @@ def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
 
 
 def _angle(theta: Array, scene: Scene) -> list[UnitDoubt]:
-    """Return a doubt if an angle exceeds the range of the model, or if the swing exceeds what the clearance allows."""
+    """Return a doubt if an angle exceeds the range of the model, or if the swing is too large for the clearance."""
     largest = _usual_magnitude(theta)
     if scene.head.carries == "corners" or not 0.0 < largest < np.degrees(_LARGEST_ANGLE_RAD):
         return []
@@ -292,7 +295,7 @@ def _largest_force(scene: Scene) -> float:
 
 
 def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
-    """Return a doubt if stamps descend, or if they are too far apart for the smoothness of the load."""
+    """Return a doubt if stamps descend, or if consecutive stamps of a smooth load are too far apart."""
     if len(stamps_s) < _FEW:
         return []
     steps = np.diff(stamps_s)

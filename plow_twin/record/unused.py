@@ -18,8 +18,8 @@ from plow_twin.stream.journal import Entry, Gaps, PartOfPose, Pose, Sample, Trav
 class InputCounts:
     """Number of input messages, by input and by outcome.
 
-    The outcome is `used`, or the reason in an entry of the type `Unused`. For the input `source`, the sum of all counts
-    except `not_followed` is the number of messages that the publisher sent.
+    The outcome is `used`, or the reason in an entry of the type `Unused`. The counts of the input `source`, without
+    `not_followed`, add up to the number of messages that the publisher sent.
     """
 
     source: str
@@ -57,8 +57,8 @@ class InputCounts:
 def unused_messages(path: Path) -> Iterator[dict[str, Any]]:
     """Yield a row for each unused message in the journal of a run: input, sender, reason, stamp and values.
 
-    The journal stores only the number of some messages. These messages have one common row with their number `count`
-    and without a stamp.
+    For some messages, the journal contains only their number. These messages have one common row, which contains the
+    number as `count` and has no stamp.
 
     Raises
     ------

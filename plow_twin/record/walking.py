@@ -41,9 +41,9 @@ if TYPE_CHECKING:
 
 #: Largest number of samples by which a session advances in one call.
 BATCH: Final = 4096
-#: Types of entries that change the session. The samples between two of these entries are sorted by their stamps.
+#: Types of entries that change the session. Samples between two entries of these types are sorted by their stamps.
 _ACTING: Final = (Travel, Reset, Loss, Restore, Snapshot, SetModel, SetWear)
-#: Further types of entries that change the session if its motion follows measurements.
+#: Types of entries that change the session only if the motion of the session follows measurements.
 _FOLLOWED: Final = (Pose, PartOfPose, Estimated, Parameter)
 #: Number of consecutive failed advances after which the model is reset.
 _FAILURE_LIMIT: Final = 10
@@ -160,26 +160,30 @@ class Walker:
 class JournalWalk:
     """Pass the journal of a run to walkers.
 
-    After missing entries, the motion of all walkers is reset. A late sample is inserted at its stamp. If the walkers
-    have already reached this stamp, the sample is not used.
+    After missing entries, the motion of all walkers is reset. A late sample is inserted at its stamp. A late sample is
+    not used if the walkers have already reached its stamp.
 
     Parameters
     ----------
     own
         Walkers that restore the first snapshot after a loss, and that apply settings of the wear.
     others
-        Walkers of other scenes, which never restore a state from the journal.
+        Walkers that never restore a state from the journal, because their scenes differ from the scene of the run.
     whole
-        Whether the journal begins with the first entry of the run. If not, the walkers `own` restore the first
+        Whether the journal begins with the first entry of the run. If it does not, the walkers `own` restore the first
         snapshot.
     same_scene
-        Whether the walkers `own` have the scene of the run. These walkers then also apply changes of the model and
-        restored motions. If their twin follows measurements, they apply the measurements, too.
+        Whether the walkers `own` have the scene of the run. Walkers with the scene of the run apply changes of the
+        model and restored motions. If the twin of a walker follows measurements, the walker applies the measurements.
 
     Attributes
     ----------
-    used, late, missing : int
-        Numbers of used samples, of late samples that were not used, and of missing entries.
+    used : int
+        Number of used samples.
+    late : int
+        Number of late samples that were not used.
+    missing : int
+        Number of missing entries.
     """
 
     def __init__(

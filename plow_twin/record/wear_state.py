@@ -1,4 +1,4 @@
-"""Read and write the file that stores the wear of a head's pads, so that the next process can continue with it."""
+"""Read and write the wear file of a head, from which the next process restores the wear of the pads."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class WearStateError(PlowTwinError, ValueError):
 def scene_identity(scene: Scene) -> str:
     """Return a hash of the numbers that identify a set of pads: frame, clearance, head and initial wear depths.
 
-    Loads, contact parameters and the wear coefficient are not included, because they may change for the same pads.
+    Loads, contact parameters and the wear coefficient are not included, because they may change while the pads stay.
     """
     numbers = (
         *(scene.frame.width_m, scene.frame.height_m),
@@ -94,7 +94,7 @@ def parse_wear(content: bytes, path: Path, head: str, scene: Scene) -> tuple[flo
 
 
 def claim_folder(folder: Path) -> int:
-    """Create and lock a folder for the wear file of one twin, until the returned descriptor is closed.
+    """Create a folder for the wear file of one twin, and lock it until the returned descriptor is closed.
 
     Raises
     ------
@@ -141,7 +141,7 @@ def wear_content(head: str, scene: str, depth_m: Sequence[float]) -> bytes:
 
 
 def save_wear(folder: Path, content: bytes) -> None:
-    """Replace the wear file atomically: after a crash, the complete old file or the complete new file exists.
+    """Replace the wear file atomically. After a crash, either the complete old file or the complete new file exists.
 
     Raises
     ------

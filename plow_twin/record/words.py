@@ -1,4 +1,4 @@
-"""Functions with which compiled code reads and writes eight bytes at any offset of an array as one integer.
+"""Functions with which compiled code reads or writes eight bytes of an array as one integer.
 
 The integers are little-endian, like the numbers in MCAP files and in CDR messages.
 """

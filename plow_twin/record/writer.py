@@ -32,7 +32,7 @@ from plow_twin.stream.journal import Digest, Entry, Sample
 from plow_twin.stream.outputs import Published
 from plow_twin.stream.topics import TOPICS, Cadence, topics_of
 
-#: Subfolder of a run for recordings of other topics. If it exists, `beside_2`, `beside_3`, ... are used.
+#: Subfolder of a run for recordings of topics of other nodes. If it exists, `beside_2`, `beside_3`, ... are used.
 BESIDE: Final = "beside"
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
 Made = TypeVar("Made")
@@ -61,8 +61,9 @@ class RunWriter:
     Journal entries and outputs are written to separate chunks. A chunk of entries precedes the chunk of the outputs
     that were sent after these entries.
 
-    Every method raises `OSError` if the disk is full. After a failed write or `flush`, the file contains all data of
-    the previous flush, and further data can be written. After any other failed call, only `abandon` may be called.
+    Every method raises `OSError` if the disk is full. After a failed write or `flush`, the file contains all data up to
+    the previous flush, and more data can be written. After a failed call of any method except a write or `flush`, only
+    `abandon` may be called.
     """
 
     def __init__(
@@ -221,7 +222,7 @@ class RunWriter:
     def _write(
         self, chunk: ChunkBuilder, topic: str, sequence: int, log_time_ns: int, stamp_ns: int, message: Message
     ) -> None:
-        # times in MCAP are unsigned, so a negative stamp becomes 0; the message itself contains the exact stamp
+        # times in MCAP are unsigned, so a negative stamp is replaced by 0; the message contains the exact stamp
         log_time_ns, stamp_ns = max(0, log_time_ns), max(0, stamp_ns)
         channel = self._channel(topic, message.TYPE)
         chunk.add(channel, sequence & _SEQUENCE_MASK, log_time_ns, stamp_ns, encode(message))
@@ -247,7 +248,7 @@ class RunWriter:
             self._part.file.chunk(self._journal)
             self._part.file.chunk(self._outputs)
         except OSError:
-            self._outputs.clear()  # a replay cannot compare outputs without the journal entries before them
+            self._outputs.clear()  # a replay cannot compare outputs if the preceding journal entries are missing
             raise
 
     def flush(self) -> None:
@@ -318,7 +319,7 @@ def shortage(folder: Path, min_free_bytes: int) -> str | None:
 
 
 def _is_free(folder: Path) -> bool:
-    """Return whether a folder can receive a recording; it may already contain recordings of other topics."""
+    """Return whether a folder can receive a recording. Subfolders with names that begin with `BESIDE` are allowed."""
     if not folder.exists():
         return True
     return folder.is_dir() and all(item.name.startswith(BESIDE) and item.is_dir() for item in folder.iterdir())
@@ -334,7 +335,7 @@ def free_folder(folder: Path) -> Path:
 
 
 def in_free_folder(folder: Path, make: Callable[[Path], Made]) -> Made:
-    """Call `make` with a free folder, and repeat the call if another process uses the folder first."""
+    """Call `make` with a free folder. If another process uses the folder first, call `make` with the next folder."""
     while True:
         try:
             return make(free_folder(folder))

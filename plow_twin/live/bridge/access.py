@@ -28,15 +28,21 @@ class Access:
     Attributes
     ----------
     url : str
-        `SCHEME://HOST:PORT`. Without a host, this machine is meant.
-    user, password : str
-        Name and password of the user.
+        Address `SCHEME://HOST:PORT`. If the host is missing, the address refers to this machine.
+    user : str
+        Name of the user.
+    password : str
+        Password of the user.
     ca : Path
         Certificate of a trusted authority, or certificate of the broker or server.
-    certificate, key : Path
-        Certificate and private key of the twin.
-    user_certificate, user_key : Path
-        Certificate and private key of the user, which replace the name and the password.
+    certificate : Path
+        Certificate of the twin.
+    key : Path
+        Private key of the twin.
+    user_certificate : Path
+        Certificate of the user, which replaces the name and the password.
+    user_key : Path
+        Private key of the user.
     plain : bool
         Whether an unencrypted connection to another machine is allowed.
     client_id : str
@@ -77,9 +83,10 @@ def host_and_port(access: Access, ports: Mapping[str, int], *, has_path: bool = 
 
 
 def password(path: Path | None, source: str) -> str:
-    """Return the password: the first line of a file or, if `path` is None, the value of an environment variable.
+    """Return the password for a source.
 
-    For the source `OPCUA`, the variable is `PLOW_TWIN_OPCUA_PASSWORD`.
+    The password is the first line of a file or, if `path` is None, the value of an environment variable. For the source
+    `OPCUA`, the variable is `PLOW_TWIN_OPCUA_PASSWORD`.
     """
     return os.environ.get(f"PLOW_TWIN_{source}_PASSWORD", "") if path is None else read_secret(path)
 
@@ -87,7 +94,7 @@ def password(path: Path | None, source: str) -> str:
 def read_access(url: str, path: Path | None) -> Access:
     """Return the address of an OPC UA server with the credentials from a YAML file.
 
-    The paths in the file are relative to its folder.
+    The paths in the file are relative to the folder of the file.
     """
     if path is None:
         return Access(url, password=password(None, "OPCUA"))

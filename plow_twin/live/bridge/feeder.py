@@ -27,12 +27,13 @@ from plow_twin.record.sources import Arrived
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
 
-#: Largest jump of the message number within a sequence. After a larger jump that the next number confirms, the sender
-#: has restarted.
+#: Largest jump of the message number within a sequence. If the message after a larger jump has the next number, the
+#: sender has restarted.
 _RESTART = 1000
-#: Largest number of samples that count as lost between two messages: a day at 10 kHz.
+#: Largest number of samples that count as lost between two messages. At 10 kHz, the number corresponds to a day.
 _MOST_LOST = 10**9
-#: Number of messages after which the number 0 or 1 means a restart of the sender. Before, it may be a late message.
+#: Number of messages after which the number 0 or 1 means a restart of the sender. In the first messages, the number 0
+#: or 1 may belong to a late message.
 _FIRST = 10
 #: Relative change of the standard deviation of the load above which the new deviation is written to the journal.
 _NOTABLE = 0.02
@@ -66,7 +67,7 @@ class Feeder:
         self._by_topic: dict[str, list[tuple[str, Role]]] = {}
         for name, role in roles.items():
             self._by_topic.setdefault(role.topic, []).append((name, role))
-        #: newest stamp [ns], without a single stamp far ahead of all other stamps
+        #: newest stamp [ns]; a single stamp far ahead is not used
         self.newest_ns = 0
         self._far_ahead_ns: int | None = None
         #: reason why the first invalid load was refused
@@ -74,7 +75,7 @@ class Feeder:
         self._number = 0
         #: count of messages without a number since the last message with a number
         self._assumed = 0
-        #: count of assigned numbers that the sender used afterwards for other messages
+        #: count of assigned numbers that the sender has used for later messages
         self._unnumbered = 0
         #: number of the last message if it does not continue the earlier numbers, otherwise None
         self._odd: int | None = None
@@ -163,7 +164,7 @@ class Feeder:
             self._follow_time(stamp_ns)
 
     def _follow_time(self, stamp_ns: int) -> None:
-        """Advance the time of the source. A stamp far ahead counts only if the next stamp is far ahead, too."""
+        """Advance the time of the source. A stamp far ahead is used only if the next stamp confirms it."""
         jump_ns = round(self._runtime.settings.jump_forward * 1e9)
         far_ns, self._far_ahead_ns = self._far_ahead_ns, None
         if far_ns is not None and stamp_ns >= far_ns - jump_ns:
@@ -214,7 +215,7 @@ class Feeder:
     def _numbered(self, role: Role, arrived: Arrived) -> tuple[bytes, int, bool]:
         number = role.number(arrived) if role.sequence else None
         if number is None:
-            # the next message with a number will show whether the sender has counted this message
+            # the number of the next numbered message will show whether the sender has counted this message
             self._assumed += 1
             self._number += 1
             return self._name, self._number + self._unnumbered, False
@@ -239,7 +240,7 @@ class Feeder:
     def _goes_on(self, number: int) -> bool:
         """Return whether a number continues a sequence of numbers.
 
-        The sequence is the earlier numbers, or a new sequence that begins with the last number, `_odd`.
+        The sequence is either the sequence of all earlier numbers, or a new sequence that begins with `_odd`.
         """
         odd, before = self._odd, self._number
         if odd is not None and abs(number - odd) < abs(number - before):

@@ -34,7 +34,7 @@ STDIN_TOPIC: Final = "stdin"
 
 @dataclass
 class _Tail:
-    """A file that is read while it grows. If it is truncated or replaced, it is read from its beginning again."""
+    """A file that is read while it grows. If the file is truncated or replaced, it is read from its beginning."""
 
     path: Path
     #: topic of the rows; by default the file name without extension
@@ -53,7 +53,7 @@ class _Tail:
     def columns(self, *, grows: bool) -> list[str] | None:
         """Return the columns in the first line, or None without a first line.
 
-        If the file `grows`, a line without an end is incomplete and does not count.
+        If `grows` is True, a last line without a newline character is incomplete and is not used.
         """
         rows = Rows()
         try:
@@ -90,7 +90,7 @@ class _Tail:
             self.close()
             self._file, self._newest = file, b""
             self.rows = self.rows.of_another_file()
-            # the incomplete last line of the old file is not used, because its last number may be truncated
+            # the incomplete last line of the old file is not used, because the last number in it may be truncated
             self.left += self.lines.begun
             self.lines = Lines()
         return self._read()
@@ -102,7 +102,7 @@ class _Tail:
         return data
 
     def _is_anew(self) -> bool:
-        """Return whether the file was rewritten, even if it is now longer than before."""
+        """Return whether the file was rewritten. The rewritten file may be longer than the old file."""
         begin = self._file.tell() - len(self._newest)
         return os.pread(self._file.fileno(), len(self._newest), begin) != self._newest
 
@@ -139,10 +139,10 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 class _Dated:
-    """Files whose names match a pattern, as one topic.
+    """Files with names that match a pattern. All files are one topic.
 
     When files are followed, reading begins with the newest file and continues with each new file. The second newest
-    file is read, too, because it may still grow.
+    file is still read while the newest file is read, because it may still grow.
     """
 
     def __init__(self, pattern: Path) -> None:
@@ -194,15 +194,15 @@ def _changed_ns(path: Path) -> tuple[int, Any]:
 
 
 def _numbered(path: Path) -> list[tuple[int, str]]:
-    """Return a sort key that puts load_9 before load_10, by the numbers in the names."""
+    """Return a sort key that compares the numbers in names as numbers, so that load_9 precedes load_10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
 class Files(Bridge):
     """Files as topics. The name of a topic is the file name, or the pattern such as `load_*.csv`, without extension.
 
-    With `follow`, files are read while they grow, and may be created later. Without `follow`, the messages of several
-    files are merged by their stamps.
+    With `follow`, files are read while they grow, and files that do not exist are awaited. Without `follow`, the
+    messages of several files are merged by the stamps of the messages.
 
     Raises
     ------
@@ -222,7 +222,7 @@ class Files(Bridge):
                 raise BridgeError(f"{tail.path.parent}: no such folder")
         self._merged: Iterator[Arrived] | None = None
         self._tables: Iterator[Messages] | None = None
-        #: total size of the files without `follow`, and number of bytes that have been read
+        #: total size of the files, and number of bytes that have been read; with `follow`, the total size is 0
         self._size = self._done = 0
 
     def topics(self) -> dict[str, TopicType]:

@@ -21,9 +21,9 @@ from plow_twin.live.bridge.source import LONGEST, Bridge, BridgeError, read_json
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived
 
-#: Largest number of messages in the queue. Further messages are counted as lost.
+#: Largest number of messages in the queue. If the queue is full, new messages are counted as lost.
 _QUEUE: Final = 100_000
-#: Largest total size of the messages in the queue [B]. Further messages are counted as lost.
+#: Largest total size of the messages in the queue [B]. If the size is reached, new messages are counted as lost.
 _QUEUED_BYTES: Final = 2**26
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
 
@@ -107,7 +107,7 @@ class Mqtt(Bridge):
             self.trouble = f"refused: {refused}"
             self._answer.set()
             return
-        # in a resumed session, messages that the broker stored for the session may have the flag `retain`, too
+        # in a resumed session, a message that the broker stored for the session may have the flag `retain`
         resumed = is_resumed(flags)
         self._from_before = not resumed
         if self._subscribed and resumed:
@@ -127,7 +127,7 @@ class Mqtt(Bridge):
         self.trouble = self.trouble or f"the connection broke: {end_of(*facts)}; reconnecting"
 
     def _on_message(self, client: Any, data: Any, message: Any) -> None:
-        # the empty payload, which replaces a payload that is too long, is counted as an invalid message later
+        # a payload that is too long is replaced by an empty payload, which is counted as an invalid message
         payload = message.payload if len(message.payload) <= LONGEST else b""
         if len(self._queue) >= _QUEUE or self._came - self._left + len(payload) > _QUEUED_BYTES:
             self.lost += 1

@@ -35,14 +35,14 @@ class Bridge(ABC):
     """Source of messages."""
 
     def __init__(self, *, ends: bool = False, connected: bool = False) -> None:
-        #: whether the source has an end, like a file that is read once, so that stamps replace the system time
+        #: whether the source has an end; if it has one, the stamps of its messages replace the system time
         self.ends = ends
         #: whether the source has ended
         self.finished = False
         self.connected = connected
         #: number of messages that were dropped before they were read
         self.lost = 0
-        #: reason why no messages can arrive now; empty if messages can arrive
+        #: reason why no messages can arrive at present, or an empty text if messages can arrive
         self.trouble = ""
 
     @abstractmethod
@@ -114,7 +114,7 @@ class Lines:
 
 
 class Rows:
-    """Parser of lines. The first line determines whether the lines are JSON objects, or CSV with a header."""
+    """Parser of lines. The first line determines whether the lines are JSON objects or rows of a CSV table."""
 
     def __init__(self) -> None:
         #: names of the columns, or keys of the first JSON object; None before the first line
@@ -134,7 +134,7 @@ class Rows:
         return columns_of(source, self.columns or ())
 
     def of_another_file(self) -> Rows:
-        """Return a parser for the next file. If the next file has no header, it has the columns of this file."""
+        """Return a parser for the next file. If the next file has no header, the columns of this file are used."""
         rows = Rows()
         rows._before = self.columns
         return rows
@@ -166,7 +166,7 @@ class Rows:
             return False  # the line repeats the header
         if len(cells) != len(self.columns):
             return None
-        if self.delimiter != ",":  # with another delimiter, a comma is a decimal sign
+        if self.delimiter != ",":  # if the delimiter is not a comma, a comma is a decimal sign
             cells = [cell.replace(",", ".") for cell in cells]
         return dict(zip(self.columns, cells, strict=True))
 

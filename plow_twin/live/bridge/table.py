@@ -41,8 +41,8 @@ class Table:
         values : ndarray, shape (n, k)
             Numbers of the fields of the role.
 
-        None is returned if a line is not a row, or if a number is missing or not a decimal number. The lines must then
-        be read as messages.
+        None is returned if a line is not a row, or if a number is missing or not a decimal number. If None is returned,
+        the lines must be read as messages.
         """
         names = self._rows.columns or []
         stamp = next((name for name in TIMES if name in names), None) if role.stamp == "header" else role.stamp
@@ -54,7 +54,7 @@ class Table:
         found = [number for number in numbers if number is not None]
         if stamps is None or len(found) < len(numbers):
             return None
-        with np.errstate(all="ignore"):  # a number that overflows becomes infinite, and the intake drops its sample
+        with np.errstate(all="ignore"):  # a number that overflows becomes infinite, and the intake drops the sample
             values = np.stack([role.in_si(name, number) for name, number in zip(role.fields, found, strict=True)], 1)
         return stamps + role.clock_offset_ns, values
 
@@ -76,7 +76,7 @@ class Table:
         return self._cells
 
     def _numbers(self, cells: Sequence[bytes]) -> NDArray[np.float64] | None:
-        if self._rows.delimiter != ",":  # with another delimiter, a comma is a decimal sign
+        if self._rows.delimiter != ",":  # if the delimiter is not a comma, a comma is a decimal sign
             cells = b"\n".join(cells).replace(b",", b".").split(b"\n")
         if b"".join(cells).translate(None, OF_NUMBERS):
             return None

@@ -31,17 +31,18 @@ from plow_twin.record.mapping import Role
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived, TopicType
 
-#: Largest number of samples in the queue. Further samples are counted as lost. Reading of the history waits instead.
+#: Largest number of samples in the queue. If the queue is full, new samples are counted as lost, and samples from the
+#: history wait.
 _QUEUE: Final = 100_000
 _PORTS: Final = {"opc.tcp": 4840}
-#: Longest wait for all values with the same stamp [s]. The values arrive in one or two messages. The wait is five
-#: publishing intervals, which includes a margin.
+#: Longest wait for all values with the same stamp [s]. The wait is five publishing intervals. It has a margin, because
+#: the values arrive in one or two messages.
 _WAIT_S: Final = 5e-3 * PUBLISHING_MS
 #: Time span of the history that is read at a time [ns].
 _PIECE_NS: Final = 10_000_000_000
 #: Largest assumed delay of the values of a node behind the values of another node [ns].
 _OVERLAP_NS: Final = 1_000_000_000
-#: Largest plausible lead of a stamp ahead of the system time [ns]. Other values are not used to find gaps.
+#: Largest plausible lead of a stamp ahead of the system time [ns]. Values with a larger lead are not used to find gaps.
 _AHEAD_NS: Final = 86_400_000_000_000
 #: Largest assumed delay until a sent value is available in the history [s].
 _HISTORY_LAG_S: Final = 5.0
@@ -74,7 +75,7 @@ class OpcUa(Bridge):
     Raises
     ------
     BridgeError
-        The address, the identifier of a node or the set of certificates is invalid, or the connection is not encrypted.
+        The address, a node identifier or the set of certificates is invalid, or the connection is not encrypted.
     """
 
     def __init__(
@@ -117,12 +118,12 @@ class OpcUa(Bridge):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._task: asyncio.Task[None] | None = None
         self._link: Link | None = None
-        #: values that arrived while the history was read, and for each list, whether earlier values were lost; None if
-        #: values are used immediately
+        #: lists of values that arrived while the history was read, and for each list, whether values before the list
+        #: were lost; None if values are used immediately
         self._held_back: list[tuple[list[tuple[int, Any]], bool]] | None = None
         #: monotonic time at which the connection broke [s], or None while it exists
         self._broken_s: float | None = None
-        #: reason why the history cannot be read; empty if it can be read
+        #: reason why the history cannot be read, or an empty text if it can be read
         self._no_history = ""
         logging.getLogger("asyncua").addHandler(logging.NullHandler())
 
@@ -232,7 +233,7 @@ class OpcUa(Bridge):
         self._held_back = None
 
     async def _take(self, values: list[tuple[int, Any]], lost: bool) -> None:
-        """Use values from the server. If earlier values were lost, the history is read first."""
+        """Use values from the server. If values before these values were lost, read the history first."""
         if self._held_back is not None:
             self._held_back.append((values, lost))
             return
@@ -260,7 +261,7 @@ class OpcUa(Bridge):
     def _is_known(self, number: int, value: Any) -> bool:
         """Return whether a value has already been read from the history.
 
-        A much older value is new, because it means that the clock of the server was set back.
+        A value with a much older stamp counts as new, because the clock of the server must have been set back.
         """
         stamp_ns = self._stamp_ns(number, value)
         return stamp_ns > 0 and 0 <= self._newest_ns(number) - stamp_ns < _PIECE_NS

@@ -19,11 +19,12 @@ from plow_twin.live.bridge.opcua.readings import Counts, date_of
 from plow_twin.live.bridge.opcua.security import identify, secure
 from plow_twin.live.bridge.source import BridgeError
 
-#: Publishing interval that is requested from the server [ms]: two thirds of the allowed age of a sample.
+#: Publishing interval that is requested from the server [ms]. It is two thirds of the largest allowed age of a sample.
 PUBLISHING_MS: Final = 10.0
-#: Length of the queue that is requested for each node [values]: 1 s at 10 kHz.
+#: Length of the queue that is requested for each node [values]. At 10 kHz, the queue covers 1 s.
 _QUEUE: Final = 10_000
-#: Interval between messages of a server without new values [s]. After three silent intervals, the connection is broken.
+#: Interval at which a server without new values sends a message [s]. After three intervals without a message, the
+#: connection is broken.
 _KEEPALIVE_S: Final = 2.0
 #: Time after which the server deletes the subscription of a client that has disappeared [s].
 _LIFETIME_S: Final = 60.0
@@ -33,12 +34,13 @@ _CLOSE_S: Final = 2.0
 _LARGEST_MESSAGE: Final = 64 << 20
 #: Largest size of a chunk of a message [B]. By the OPC UA standard, a client must accept chunks of 8 KiB.
 _LARGEST_PART: Final = 1 << 20
-#: Largest number of values that are read from the history at a time: 10 s of ten nodes at 10 kHz.
+#: Largest number of values that are read from the history at a time. Ten nodes at 10 kHz fill it in 10 s.
 _MOST_HISTORY: Final = 1_000_000
 #: Largest sequence number of a message. The next number is 1.
 _LAST_NUMBER: Final = 2**32 - 1
 
-#: Function that receives pairs of node number and value, and whether values before these pairs were lost.
+#: Function that receives pairs of node number and value. The second argument is True if values before the pairs were
+#: lost.
 Take = Callable[[list[tuple[int, Any]], bool], Awaitable[None]]
 
 
@@ -64,12 +66,14 @@ class Link:
 
     Parameters
     ----------
-    access, host
+    access
         Address of the server, and credentials.
+    host
+        Host name of the server.
     nodes
-        Identifiers of the nodes, whose namespace numbers are indexes of `uris`.
+        Identifiers of the nodes. The namespace number in an identifier is an index of `uris`.
     uris
-        Namespaces at the first connection. If it is empty, the current namespaces of the server are used.
+        Namespaces at the first connection. If `uris` is empty, the current namespaces of the server are used.
     sampling_ms
         Requested sampling interval [ms]. With 0, the fastest sampling of the server is requested.
     take
@@ -92,7 +96,7 @@ class Link:
         #: namespaces of the server, by number
         self.uris = list(uris)
         self._sampling_ms, self._take, self._counts = sampling_ms, take, counts
-        # a single late answer is not a broken connection, so the watchdog waits for three intervals
+        # the watchdog waits for three intervals, because a single late answer does not mean a broken connection
         self._client = Client(access.url, timeout=_ANSWER_S, watchdog_intervall=3.0 * _KEEPALIVE_S)
         _bound(self._client)
         if access.user:
@@ -146,7 +150,7 @@ class Link:
 
     @property
     def trouble(self) -> str:
-        """Reason why no value can arrive; empty while the server answers."""
+        """Reason why no value can arrive. The text is empty while the server answers."""
         if self._ended:
             return self._ended
         if not self._client.uaclient.has_transport:
@@ -204,7 +208,7 @@ class Link:
         granted = await self._client.uaclient.create_subscription(asked, self._on_publish)
         self._subscription = granted.SubscriptionId
         self._keepalive_s = granted.RevisedPublishingInterval * granted.RevisedMaxKeepAliveCount * 1e-3
-        # values with a new stamp are requested even if the value has not changed, because each stamp is a sample
+        # each stamp is a sample, so a node with a new stamp must be sent even if its value has not changed
         by_stamp = ua.DataChangeFilter(Trigger=ua.DataChangeTrigger.StatusValueTimestamp)
         results = await self._monitor(range(len(self._nodes)), by_stamp)
         refused = [

@@ -14,7 +14,7 @@ _FARTHEST_NS: Final = 4_000_000_000_000_000_000
 _MICROSECOND: Final = timedelta(microseconds=1)
 _SEVERITY: Final = 0xC0000000
 _UNCERTAIN: Final = 0x40000000
-#: Bits of a status that mean that the queue of the server dropped values before this value.
+#: Bits of the status of a value. They mean that the queue of the server dropped values before the value.
 _OVERFLOW: Final = 0x00000480
 
 
@@ -27,7 +27,7 @@ class Counts:
     uncertain: int = 0
     not_numbers: int = 0
     unstamped: int = 0
-    #: messages that are missing according to the sequence numbers and that the server could not repeat
+    #: messages that are missing by their sequence numbers, and that the server could not repeat
     notifications_lost: int = 0
     #: values before which the queue of the server overflowed
     overflows: int = 0
@@ -48,8 +48,9 @@ def overflowed(value: Any) -> bool:
 def reading(data: Any, by_server: bool, counts: Counts) -> tuple[int, Value] | None:
     """Return the stamp [ns] and the value of a `DataValue`, or None if it has no stamp.
 
-    With `by_server`, the stamp is the timestamp of the server, which also replaces a missing source timestamp. If the
-    value is not a number, or its status is Bad or Uncertain, the result contains `NOT_MEASURED`.
+    With `by_server`, the stamp is the timestamp of the server. Without `by_server`, the stamp is the source timestamp
+    or, if it is missing, the timestamp of the server. If the value is not a number, or if its status is Bad or
+    Uncertain, the value in the result is `NOT_MEASURED`.
     """
     counts.values += 1
     stamp_ns = None if by_server else _stamp_ns(data.SourceTimestamp, data.SourcePicoseconds)
@@ -73,7 +74,7 @@ def reading(data: Any, by_server: bool, counts: Counts) -> tuple[int, Value] | N
 def _stamp_ns(time: datetime | None, picoseconds: int | None) -> int | None:
     """Return a time as a stamp [ns], or None if the time is missing or invalid.
 
-    `picoseconds` is the remainder below the resolution of OPC UA, which is 100 ns.
+    `picoseconds` is the remainder of the time below 100 ns, which is the resolution of times in OPC UA.
     """
     if time is None:
         return None

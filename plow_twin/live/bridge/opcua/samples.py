@@ -16,14 +16,14 @@ class Samples:
     """Samples of a role. A sample consists of the values of all nodes of the role at one stamp.
 
     A server does not send a value that has not changed, so the last value of a node replaces a missing value. A sample
-    is complete when each node has a value at its stamp or at a later stamp. After `wait_s` [s], an incomplete sample is
-    returned, too.
+    is complete when each node has a value at the stamp of the sample or at a later stamp. An incomplete sample is
+    returned after `wait_s` [s].
     """
 
     def __init__(self, nodes: Sequence[str], wait_s: float) -> None:
         self._wait_s = wait_s
         self._stamps_ns: list[int] = []
-        #: for each stamp, the arrival time of its first value [s], and the values by node
+        #: arrival time of the first value at each stamp [s], and the values at the stamp by node
         self._waiting: dict[int, tuple[float, dict[str, Value]]] = {}
         self.newest_ns = dict.fromkeys(nodes, 0)
         self._held: dict[str, Value] = {}
@@ -39,7 +39,7 @@ class Samples:
         """Add a value. A second value of the same node with the same stamp is ignored."""
         if stamp_ns == self.newest_ns[node]:
             return
-        # the first stamp after the start of a server may be wrong, so that the following stamps are older
+        # the first stamp after the start of a server may be wrong, so an older stamp replaces it
         self.newest_ns[node] = stamp_ns if node in self._begun else max(stamp_ns, self.newest_ns[node])
         self._begun.discard(node)
         if stamp_ns not in self._waiting:
@@ -48,17 +48,17 @@ class Samples:
         self._waiting[stamp_ns][1].setdefault(node, value)
 
     def add_stray(self, node: str, stamp_ns: int, value: Value, now_s: float) -> None:
-        """Add a value with an impossible stamp. It forms a separate sample, which the intake refuses and counts."""
+        """Add a value with an impossible stamp as a separate sample, which the intake will refuse."""
         self._strays.setdefault(stamp_ns, (now_s, {}))[1].setdefault(node, value)
 
     def begin(self, node: str, stamp_ns: int, value: Value) -> None:
-        """Store the value of a node before the first sample. It replaces a missing value in later samples."""
+        """Store the value of a node before the first sample. The value replaces missing values in later samples."""
         self.newest_ns[node] = stamp_ns
         self._begun.add(node)
         self._held[node] = value
 
     def take(self, now_s: float) -> list[tuple[int, dict[str, Value]]]:
-        """Return the samples that are complete or have waited long enough at the time `now_s` [s], in order.
+        """Return the samples that are complete at the time `now_s` [s], or that have waited for `wait_s` [s], in order.
 
         A sample is a stamp [ns] and the values of all nodes.
         """
