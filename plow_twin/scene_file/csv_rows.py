@@ -1,4 +1,4 @@
-"""Rows of CSV files in the formats of spreadsheets in many countries, and rows of Parquet files."""
+"""Reader of rows from CSV files, with the delimiters and decimal marks of many countries, and from Parquet files."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def delimiter_of(header: str) -> str:
 def csv_rows(stream: IO[str], comment: str = "") -> Iterator[tuple[int, list[str]]]:
     """Yield the line number and the cells of each row that is not empty, beginning with the header.
 
-    The delimiter is that of the header. With semicolons or tabs, decimal commas are converted to points. Lines that
+    The delimiter is found in the header. With semicolons or tabs, decimal commas are converted to points. Lines that
     begin with `comment` are skipped.
 
     Raises

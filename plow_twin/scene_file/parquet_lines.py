@@ -1,4 +1,4 @@
-"""Parquet files as lines of CSV, so that each reader of CSV files can read Parquet files too."""
+"""Conversion of Parquet files to lines of CSV, so that every reader of CSV files can read Parquet files."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ def is_parquet(path: Path) -> bool:
 class ParquetLines(io.RawIOBase):
     """A Parquet file, read as UTF-8 text: a line with the names of the columns, then a line for each row.
 
-    Numbers are written without loss of digits. Times are written in UTC, and times without a zone unchanged. A missing
-    value gives an empty cell. Columns of lists, structures or bytes are omitted.
+    Numbers are written without loss of digits. Times with a zone are written in UTC. Times without a zone are written
+    unchanged. A missing value gives an empty cell. Columns of lists, structures or bytes are omitted.
 
     Raises
     ------
     OSError
         The file cannot be opened.
     csv.Error
-        The file is not a Parquet file, or is damaged. Read methods raise this error too.
+        The file is not a Parquet file, or is damaged. The read methods can raise the same error.
     ExcessError
         The unpacked file would exceed a limit of this module.
     """
@@ -148,7 +148,7 @@ def _is_plain(kind: pa.DataType) -> bool:
 
 
 def _as_text(batch: pa.RecordBatch) -> pa.RecordBatch:
-    """Convert columns for CSV: instants to UTC and durations to seconds. Numbers are unchanged."""
+    """Convert instants to UTC and durations to seconds, for CSV. Numbers are unchanged."""
     import pyarrow as pa
 
     columns = []

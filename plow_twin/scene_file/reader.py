@@ -31,7 +31,8 @@ from plow_twin.scene_file.validation import Schema, validate
 from plow_twin.scene_file.yaml_text import load_yaml, read_yaml
 
 _SECTIONS: Final = "the sections of a scene"
-#: Valid parts that replace parts with problems. A `Scene` can then be built to find conflicts between the other parts.
+#: Valid parts that replace parts with problems, so that a `Scene` can be built. The `Scene` finds conflicts between the
+#: parts without problems.
 _SOUND: Final[Mapping[str, Any]] = MappingProxyType(
     {
         "head": Head(1.0, 1.0),
@@ -186,7 +187,7 @@ def _problems_across(parts: Mapping[str, Any]) -> tuple[Problem, ...]:
 
 
 def _as_written(problem: Problem, raw: Mapping[str, Any]) -> Problem:
-    """Return the problem with the key as it is in the file, where the kind of a load precedes its numbers."""
+    """Return the problem with the key as it stands in the file, which has the kind of a load before its numbers."""
     head, _, rest = problem.key.partition("].")
     index = head.removeprefix("loads[")
     if index == head or not index.isdigit() or rest.startswith(("name", "at_m")):

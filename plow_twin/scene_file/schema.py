@@ -1,6 +1,7 @@
 """JSON Schema of the scene file, made from the dataclasses of `plow_twin.model.scene`.
 
-A number or a list of numbers may be replaced by a mapping `{value, mark, source}`. The samples of a table cannot.
+A number or a list of numbers may be replaced by a mapping `{value, mark, source}`. The samples of a table cannot be
+replaced by a mapping.
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ def _validator(schema: Schema) -> Validator:
 
 @cache
 def _validator_class() -> Callable[[Schema], Validator]:
-    """Return a validator that rejects NaN, infinity and integers beyond float64 as numbers, and 1.0 as integer."""
+    """Return a validator for which NaN, infinity and integers beyond float64 are no numbers, and 1.0 is no integer."""
     checker = Draft202012Validator.TYPE_CHECKER.redefine_many(
         {
             "number": lambda _, value: is_number(value),
@@ -118,7 +118,7 @@ def _explain(error: ValidationError, whole: str) -> Iterator[Problem]:
 def _closest_branch(key: str, error: ValidationError, whole: str) -> Iterator[Problem]:
     """Yield the problems of the `anyOf` branch for the type of the value.
 
-    If there is none, yield one problem of the key.
+    Without such a branch, yield one problem of the key.
     """
     branches: dict[Any, list[ValidationError]] = {}
     for inner in error.context or ():
@@ -132,7 +132,7 @@ def _closest_branch(key: str, error: ValidationError, whole: str) -> Iterator[Pr
 
 
 def _is_misfit(error: ValidationError) -> bool:
-    """Return whether an error shows that an `anyOf` branch is for values of another type, or with other keys."""
+    """Return whether an error shows that the type or the keys of a value do not fit an `anyOf` branch."""
     keys_alone = error.validator == "required" and "properties" not in cast(Schema, error.schema)
     return keys_alone or error.validator in ("type", "const", "enum")
 

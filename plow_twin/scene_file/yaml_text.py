@@ -1,7 +1,8 @@
 """Reader and writer of YAML. The reader limits size and nesting, because files may be malicious.
 
-Scalars follow the YAML 1.2 core schema. The limits are checked on the events of the parser, before a document is built:
-libyaml recurses in C for nested collections, and a few lines with aliases can expand to any number of values.
+Scalars follow the YAML 1.2 core schema. The limits are checked on the events of the parser, before a document is built.
+The reason is that libyaml recurses in C for nested collections, and that a few lines with aliases can expand to any
+number of values.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ SceneDumper.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.01
 def read_yaml(path: Path, name: str, sections: str) -> tuple[Any, list[Problem]]:
     """Read a YAML file of at most `LARGEST_FILE` bytes and `MOST_VALUES` values. Return its document and its problems.
 
-    The remaining arguments are those of `load_yaml`.
+    The arguments after the path are those of `load_yaml`.
     """
     try:
         with path.open("rb") as stream:
@@ -188,7 +189,7 @@ def dump_yaml(data: Any, *, flow: bool = True) -> str:
 
 def _repeated_keys(node: yaml.Node, path: str) -> Iterator[Problem]:
     if isinstance(node, yaml.SequenceNode):
-        # scalars have no keys; the search in long tables is fast because it skips them
+        # scalars are skipped, because they have no keys; the search in long tables is therefore fast
         for index, item in enumerate(node.value):
             if not isinstance(item, yaml.ScalarNode):
                 yield from _repeated_keys(item, f"{path}[{index}]")

@@ -1,4 +1,4 @@
-"""Buffers of rows for rerun, which logs 20,000 rows in one call as fast as a single row."""
+"""Buffers of rows for rerun. One call of rerun logs 20,000 rows as fast as a single row."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class TimeAxis:
 class Curves:
     """Curves with common times. Each curve is a rerun entity of its own.
 
-    With `span_ns`, only the least and the largest value of each curve in each span of stamps are sent, so that no peak
+    With `span_ns`, only two values of each curve are sent for each span of stamps: the least and the largest. No peak
     is lost. `rows` counts the rows added, and `sent` counts the values sent for the first curve.
     """
 
@@ -50,7 +50,7 @@ class Curves:
         self.span_ns = span_ns
         self.entities = tuple(entities)
         self._parts: list[tuple[Indexes, Indexes, Array]] = []
-        self._ends: list[NDArray[np.bool_]] = []  # for each row of a part: whether all lines end at this row
+        self._ends: list[NDArray[np.bool_]] = []  # True for each row of a part at which all lines end
         self._last: tuple[Indexes, Indexes] | None = None
         self._waiting = self.rows = self.sent = 0
 
@@ -70,7 +70,7 @@ class Curves:
             self.flush()
 
     def end(self) -> None:
-        """End the lines. The next row begins new lines."""
+        """End the line of each curve. The next row begins a new line of each curve."""
         if self._last is not None:
             self._append(*self._last, np.zeros((1, len(self.entities))), ends=True)
         self._last = None

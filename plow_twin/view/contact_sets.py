@@ -38,7 +38,7 @@ def masks_of(force: Array) -> Indexes:
 class ContactSets:
     """Writer of the changes of the contact set.
 
-    In a thinned run, it writes the first change and the last set of each span.
+    In a thinned run, the writer sends the first change and the last set of each span.
     """
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis, labels: tuple[str, ...], span_ns: int) -> None:
@@ -68,7 +68,7 @@ class ContactSets:
     def name(self, mask: int) -> str:
         """Return the name of a set of pairs.
 
-        The name contains the corners that stop a ccw rotation, then the corners that stop a cw rotation.
+        The name contains the corners that stop a ccw rotation, followed by the corners that stop a cw rotation.
         """
         parts = []
         for word, bits in (("ccw", mask & _CCW_BITS), ("cw", mask & ~_CCW_BITS)):
@@ -109,7 +109,7 @@ class ContactSets:
             self._end_span((self._at + 1) * self._span_ns)
 
     def end(self) -> None:
-        """End the curve. From here on, the set is unknown."""
+        """End the curve. After this call, the set is unknown."""
         if self._last is not None:
             self._states.add(*self._last, state=[])
         self._before = self._at = self._last = self._left = None

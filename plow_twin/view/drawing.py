@@ -55,10 +55,10 @@ Sink = Callable[[rr.RecordingStream, rrb.Blueprint], object]
 
 
 class Drawing:
-    """Drawing of the batches of a recording into a rerun stream.
+    """Drawing of a recording into a rerun stream, one batch of records at a time.
 
     `sink` receives the stream and its blueprint before anything is drawn. In each span of `span_ns`, only the least and
-    the largest value of a curve are drawn; with 0, all rows are drawn. The other arguments are those of `to_rrd`.
+    the largest value of a curve are drawn; with 0, all rows are drawn. The remaining arguments are those of `to_rrd`.
     """
 
     def __init__(
@@ -326,7 +326,7 @@ class Drawing:
     def _color_bands(self, stamps: Indexes, steps: Indexes) -> None:
         """Set the colours of the bands.
 
-        The first stroke is opaque, because the legend shows its colour; all others are faint.
+        The first stroke is opaque, because the legend shows its colour. All later strokes are faint.
         """
         behind = int(np.searchsorted(stamps, stamps[0] + 2 * self.band.span_ns))
         changes = [0, min(max(1, behind), len(stamps) - 1)]

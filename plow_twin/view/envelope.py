@@ -1,4 +1,4 @@
-"""Curves of any length for a picture: all rows, or the extremes in bins of equal width."""
+"""Storage of curves of any length for a picture, as all rows or as extremes in bins of equal width."""
 
 from __future__ import annotations
 

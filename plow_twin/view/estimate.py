@@ -1,4 +1,4 @@
-"""Picture of an estimate: the fitted motion, and each quantity with its interval and its prior."""
+"""Picture of an estimate. It shows the fitted motion, and each quantity with its interval and its prior."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ class FaceChart:
             here = self._passes[-1]
 
     def restart(self) -> None:
-        """Continue after a reset. Stamps may step back, so speeds that wait for their stamp are applied at once."""
+        """Continue after a reset. A reset can decrease the stamps, so the waiting speeds are applied at once."""
         for travel in self._coming:
             self._set_speed(travel.speed_m_s)
         self._coming, self._reached_ns = [], None

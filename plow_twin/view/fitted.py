@@ -27,9 +27,9 @@ _FARTHEST: Final = 2.0
 
 @dataclass(frozen=True)
 class FittedValue:
-    """A fitted value and its prior. Each is a triple (middle, low, high) in the unit of the label.
+    """A fitted value and its prior. Value and prior are triples (middle, low, high) in the unit of the label.
 
-    `note` is the state of the value, or another short remark. `is_log` selects a logarithmic scale.
+    `note` is the state of the value, or a short remark. `is_log` selects a logarithmic scale.
     """
 
     label: str

@@ -1,4 +1,4 @@
-"""Picture of a forecast: the clearances over time, and the probability that a limit has been reached."""
+"""Picture of a forecast. It shows the clearances over time, and the probability that a limit has been reached."""
 
 from __future__ import annotations
 

@@ -32,8 +32,8 @@ AGE: Final = ("quality/sample_age_ms",)
 INTERVAL: Final = ("quality/sample_interval_ms",)
 TOTAL: Final = tuple(f"clearance/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
 GROWTH: Final = tuple(f"growth/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
-#: Areas between the bounds of a clearance. Their names sort before the names of the clearances, so that the curves are
-#: drawn on top.
+#: Areas between the bounds of a clearance. The names of the areas sort before the names of the clearances, so that the
+#: curves are drawn on top of the areas.
 BAND: Final = tuple(f"{group}/band/{way}" for group in ("clearance", "growth") for way in ("horizontal", "vertical"))
 RESIDUAL: Final = ("residual/x", "residual/y", "residual/theta")
 WEAR: Final = tuple(f"wear/{name}" for name in CLEARANCE_NAMES if name.startswith("pad_"))
@@ -100,7 +100,7 @@ def blueprint(
         active_tab=0,
     )
     curves = rrb.Vertical(
-        # a narrower view would cut off its title
+        # with a smaller share, the view would cut off its title
         _plot("force", f"Largest contact force [kN]{title and '; '}{title}"),
         rrb.StateTimelineView(origin=ENTITY, name="Corners that carry force"),
         _plot("load", "Load on the head"),
@@ -168,7 +168,7 @@ def style_curves(stream: rr.RecordingStream) -> None:
 
 
 def band_colors(entity: str) -> list[tuple[int, ...]]:
-    """Return two colours of a band: of the opaque first stroke, which the legend shows, and of the other strokes."""
+    """Return two colours of a band: the colour of the first, opaque stroke, and the colour of the faint strokes."""
     color = _CLEARANCE_COLORS[entity.rpartition("/")[2]]
     return [(*(part // 2 for part in color), 255), (*color, _BAND_ALPHA)]
 

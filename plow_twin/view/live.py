@@ -1,4 +1,4 @@
-"""Live view of a run. A separate process follows the file of the run, so that the node is independent of the view."""
+"""Live view of a run. A separate process reads the growing file of the run, so the node does not depend on the view."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from plow_twin.record.reader import RunReader
 from plow_twin.view.drawing import Drawing, Sink
 from plow_twin.view.rrd import ViewSummary
 
-#: Rate of spans [Hz]; two values of each curve are drawn per span. One hour of all curves then takes some 200 MB in the
-#: viewer.
+#: Rate of spans [Hz]; two values of each curve are drawn per span. At this rate, one hour of all curves takes some 200
+#: MB in the viewer.
 CURVE_HZ: Final = 25.0
 SECTION_HZ: Final = 20.0
 #: Rate of the cross-section [Hz] in the part of the run before the view started.
@@ -36,7 +36,7 @@ def follow(
     for batch in reader.batches():
         if len(batch.entries) or batch.outputs:
             drawing.add(batch)
-        else:  # all recorded data have been drawn: the view is live from here on
+        else:  # all recorded data have been drawn, so the view is live
             drawing.section_hz = SECTION_HZ
             drawing.flush()
             drawing.stream.flush()

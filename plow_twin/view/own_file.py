@@ -1,4 +1,4 @@
-"""Picture of the first seconds of a user's file, as it is read through the mapping."""
+"""Picture of the first seconds of a user's file. The mapping of signals to columns determines how the file is read."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ _STATES: Final = {
 def to_png(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], int]:
     """Draw a recording as PNG. Return its status, its losses, and the number of failed advances.
 
-    Lines are interrupted at missing journal entries and at resets. Of a long run, the envelope of the curves is drawn.
+    Lines are interrupted at missing journal entries and at resets. For a long run, the envelope of the curves is drawn.
     """
     reader = RunReader(path)
     curves = RunCurves.of(reader)
@@ -184,8 +184,8 @@ def _curves(
 ) -> None:
     """Draw curves. If the rows are in bins, draw the band from the least to the largest value of each bin.
 
-    `only_largest` omits the bands, for forces whose least value is nearly always zero. Lines are interrupted at the
-    `gaps` (start and end [s]).
+    `only_largest` omits the bands, for forces, because their least value is nearly always zero. Lines are interrupted
+    at the `gaps` (start and end [s]).
     """
     axis.set_ylabel(label)
     if not rows:

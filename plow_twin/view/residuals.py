@@ -1,4 +1,4 @@
-"""Residuals: measured poses of the journal minus poses of the model at the same stamps."""
+"""Residuals of a run, which are the measured poses in the journal minus the poses of the model at the same stamps."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Residuals:
     def compare(self, poses: Sequence[tuple[int, Pose]], steps: Indexes, head: Rows) -> tuple[Indexes, Indexes, Array]:
         """Return stamps [ns], steps and residuals x, y [mm], theta [mrad], shape (n, 3).
 
-        Each item of `poses` is the index of a journal entry and its pose; `steps` are those of the journal entries.
-        `head` has rows of `head_state`. A pose beyond the last row of `head` is compared at a later call.
+        Each item of `poses` is the index of a journal entry and its pose; `steps` contains the step of each journal
+        entry. `head` has rows of `head_state`. A pose beyond the last row of `head` is compared at a later call.
         """
         self._waiting += [(pose.stamp_ns, max(int(steps[place]), 0), pose.pose) for place, pose in poses]
         predicted = np.column_stack((head.numbers[:, :2], 2.0 * np.arctan2(head.numbers[:, 2], head.numbers[:, 3])))

@@ -80,11 +80,10 @@ def to_rrd(
     exaggerate
         Factor by which the second cross-section widens the clearance. With None, the factor follows from the clearance.
     most_rows
-        Largest number of rows of a curve. The number of cross-sections is limited to a twentieth of this number. Of a
-        longer run, only the least and the largest value of each curve in each span are written, so that no peak is
-        lost.
+        Largest number of rows of a curve. The number of cross-sections is limited to a twentieth of this number. For a
+        longer run, only two values of each curve are written for each span: the least and the largest. No peak is lost.
     others
-        Other scenes, by name. Their forces under the load of the run are drawn too.
+        Scenes by name. The forces of these scenes under the load of the run are drawn beside the forces of the run.
     on_progress
         Callback that receives the share of the work done, 0..1.
 
@@ -116,6 +115,6 @@ def to_rrd(
 
 
 def _span_ns(reader: RunReader, duration_s: float, most_rows: int) -> int:
-    """Return the length [ns] of a span, of which two rows are written, or 0 if all rows are written."""
+    """Return the length [ns] of a span, or 0 if all rows are written. Two rows are written for each span."""
     rows = reader.size() / _BYTES_PER_ROW
     return 0 if rows <= most_rows else max(1, round(2e9 * duration_s / most_rows))

@@ -20,8 +20,8 @@ _CHUNK: Final = 1 << 20
 class RrdFile:
     """Writer of a stream to a file through a pipe, as a context manager. An incomplete file is removed.
 
-    The file sink of rerun 0.41 waits forever if the disk is full. Here, `check` and the end of the context raise
-    `RecordingError`.
+    The file sink of rerun 0.41 waits forever if the disk is full. With this writer, `check` and the end of the context
+    raise `RecordingError` instead.
     """
 
     def __init__(self, path: Path) -> None:

@@ -47,9 +47,9 @@ class Instant(NamedTuple):
 class RunCurves:
     """Largest forces [kN], load [kN, kN m] and clearances [mm] over time, and the state at the largest force.
 
-    Times [s] are counted from the first stamp `first_ns`. `held_s` contains the intervals without samples, in which the
-    load is held or interpolated linearly. `failed_s` contains the intervals of failed advances, and `failed` their
-    number. `changes` contains each change of the clearance that is not due to wear, with its reason.
+    Times [s] are counted from the first stamp `first_ns`. `held_s` contains the intervals without samples. In these
+    intervals, the load is held or interpolated linearly. `failed_s` contains the intervals of failed advances, and
+    `failed` their number. `changes` contains each change of the clearance that is not due to wear, with its reason.
     """
 
     first_ns: int | None = None
@@ -221,7 +221,7 @@ class RunCurves:
 
 
 def _largest(contact: Rows, head: Rows) -> Iterator[Instant]:
-    """Yield the state at the largest force, among the stamps for which a pose was published too."""
+    """Yield the state at the largest force, among the stamps for which a pose and forces were published."""
     at = np.minimum(np.searchsorted(contact.sequence, head.sequence), len(contact) - 1)
     both = np.flatnonzero(contact.stamp_ns[at] == head.stamp_ns)
     if not both.size:

@@ -29,7 +29,8 @@ _PAD_MM: Final = 60.0
 #: Distance of a label below its point [mm].
 LABEL_MM: Final = 16.0
 
-#: Hues of the corners. The pair at a vertical wall has a lighter colour than the other pair (palette of Okabe and Ito).
+#: Hues of the corners. At each corner, the pair at the vertical wall has a lighter colour than the pair at the
+#: horizontal wall (palette of Okabe and Ito).
 _HUES: Final = ((0, 114, 178), (230, 159, 0), (213, 94, 0), (0, 158, 115))
 _LIGHTER: Final = ((86, 180, 233), (240, 228, 66), (255, 158, 105), (110, 220, 185))
 PAIR_COLORS: Final = tuple(color for pair in zip(_HUES, _LIGHTER, strict=True) for color in pair)
@@ -81,8 +82,8 @@ class Section:
     def corners(self, pose: Iterable[float] = (0.0, 0.0, 0.0)) -> Array:
         """Corners of the frame, or of a block at a pose, in the order of `CORNER_NAMES`, shape (4, 2).
 
-        The corners of a block are named by their present place. A block that has turned by more than 45 degrees
-        therefore has other names at its corners.
+        The corners of a block are named by their present place. The names at the corners of a block therefore change
+        when it has turned by more than 45 degrees.
         """
         # distance of the middle of a rounded corner from the intersection of its sides, along each axis
         within = self.radius * (1.0 - math.sqrt(0.5))
@@ -126,7 +127,7 @@ class Section:
         along = _SIGNS - _OUTWARDS
         depth = np.minimum(PAD_MM_PER_MM * wear_depth_mm, 0.25 * self.frame.min())[:, None]
         middles = (corners - 0.5 * depth * _OUTWARDS - (0.5 * _PAD_MM + 12.0) * along) * _FLIP
-        # of the two labels at a corner, the label of the vertical wall is closer to the centre
+        # the label of the vertical wall is closer to the centre than the label of the horizontal wall
         inwards = np.stack((np.full(PAIR_COUNT, 0.5), np.where(np.abs(_OUTWARDS[:, 0]) > 0.5, 0.26, 0.64)), axis=1)
         labels = corners * inwards * _FLIP - [0.0, LABEL_MM]
         return middles, 0.5 * (depth * np.abs(_OUTWARDS) + _PAD_MM * np.abs(along)), labels

@@ -19,7 +19,7 @@ import rerun.blueprint as rrb
 from plow_twin.errors import RecordingError
 
 LOOPBACK: Final = "127.0.0.1"
-#: Memory limits of viewer and server. Above these limits, the oldest data are discarded.
+#: Memory limits of viewer and server. Beyond their limits, viewer and server discard the oldest data.
 _MEMORY: Final = "2GB"
 _START_S: Final = 60.0
 
@@ -27,7 +27,7 @@ _START_S: Final = 60.0
 def viewer_program() -> str:
     """Return the path of the rerun program, or raise `RecordingError` if it is not installed.
 
-    The wrapper script `rerun` is avoided if possible, because its child process would outlive it.
+    The wrapper script `rerun` is avoided if possible, because the end of the script would not end its child process.
     """
     found = find_spec("rerun_cli")
     beside = Path(found.origin).with_name("rerun") if found is not None and found.origin is not None else None
@@ -84,7 +84,7 @@ def _address(port: int) -> str:
 
 
 def page_address(web_port: int, port: int) -> str:
-    """Return the address of the web page, in the dark theme, in which the names in the cross-section are legible."""
+    """Return the address of the web page in the dark theme, which makes the names in the cross-section legible."""
     return f"http://{LOOPBACK}:{web_port}/?url={quote(_address(port), safe='')}&theme=dark"
 
 

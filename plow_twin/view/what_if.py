@@ -1,4 +1,4 @@
-"""Largest contact forces of other scenes under the load of a run, beside the forces of the run."""
+"""Curves of the largest contact forces of different scenes under the load of a run, beside the forces of the run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from plow_twin.view.columns import Array, Curves, Indexes, TimeAxis
 
 
 class WhatIf:
-    """Simulation of other scenes with the journal of a run, and curves of their forces.
+    """Simulation of different scenes with the journal of a run, and curves of their forces.
 
     Without scenes, nothing is drawn.
 

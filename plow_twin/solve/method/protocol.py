@@ -20,8 +20,8 @@
    A method without series writes the data that `dense_output.evaluate` needs instead.
 4. Before `lay_out` returns False, it may change only the fields of rule 3, fields of the method, and scratch space.
 5. `lay_out` does not change the head's position, time, modes or totals, because an event may shorten the step, and
-   because `loop.lay_out_again` repeats the step after a snapshot is restored. The method for rest is an exception: it moves the
-   head by a distance that is less than a thousandth of the tolerance.
+   because `loop.lay_out_again` repeats the step after a snapshot is restored. The method for rest is an
+   exception. It moves the head by less than a thousandth of the tolerance.
 6. `lay_out` adds its evaluations of the equations of motion to `state.evaluations`.
 7. Code that a scene does not need is not compiled. To this end, `own` returns None, or a tuple that contains None.
    Numba omits branches on an argument that is None.
