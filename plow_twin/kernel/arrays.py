@@ -1,7 +1,7 @@
 """Helpers for arrays and records in kernels: views without a reference count, copies, searches and checks.
 
-These helpers compile faster than numba's own code. For example, numba's assignment to a slice also compiles the
-formatting of an error message, which takes 2 s in each process that compiles a twin.
+These helpers compile faster than numba's own code. For example, the compilation of numba's assignment to a slice
+includes the formatting of an error message. This formatting takes 2 s in each process that compiles a twin.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ copy_record = cast("Callable[[Any, Any], None]", intrinsic(_copy_record))
 
 
 def _copy_part(typingctx: Any, target: Any, source: Any, first: Any, last: Any) -> Any:
-    """Copy the bytes `first` to `last` - 1 of a record to the same offsets in a record of another type."""
+    """Copy the bytes `first` to `last` - 1 of a record to the same offsets in a record of a different type."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         begin, end = (context.cast(builder, arguments[i], signature.args[i], types.intp) for i in (2, 3))

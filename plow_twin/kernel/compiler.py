@@ -32,8 +32,9 @@ _said: list[str] = []
 def _load_numba() -> None:
     """Load numba's tables of types and of code without importing SciPy's linear algebra.
 
-    The import of SciPy's linear algebra takes 0.15 s, a third of the start time. Numba imports it here only to check
-    whether there is a BLAS. Compiled functions that call BLAS import SciPy's linear algebra themselves.
+    The import of SciPy's linear algebra takes 0.15 s, a third of the start time. Numba would import SciPy's linear
+    algebra only to check that BLAS is available. Compiled functions that call BLAS import SciPy's linear algebra
+    themselves.
     """
     found = linalg.ensure_blas
     linalg.ensure_blas = lambda: None
@@ -154,9 +155,9 @@ def share(cache_file: Any) -> None:
     Numba names the files of machine code by numbers from the index, and writes the index first. If two processes
     compile different signatures, the code of one signature could therefore be stored under the other signature.
 
-    This function makes the name of a file a hash of its content, and the file is written before the index. Two
-    processes that write at the same time can still lose an entry of the index. The signature of this entry is then
-    compiled again.
+    This function makes the name of a file a hash of its content, and the file is written before the index. If two
+    processes write at the same time, an entry of the index can be lost. The signature of a lost entry is compiled a
+    second time.
 
     Parameters
     ----------
@@ -199,7 +200,8 @@ def _save_or_warn(cache: Any) -> None:
 
 
 def for_arguments(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
-    """Return the kernel compiled for the types of these arguments. The result does not check the types of arguments.
+    """Return the kernel compiled for the types of the given arguments. The result does not check the types of its
+    arguments.
 
     Numba's check of nested tuples and records takes longer than the computation of one sample by a twin.
     """

@@ -1,9 +1,9 @@
 """Two compilers for numba: one for kernels that only kernels call, and one for kernels that Python calls.
 
-LLVM optimises a kernel together with every kernel that it calls. By default, numba would also optimise each called
-kernel alone and generate its machine code, which takes a quarter of the compile time. The first compiler omits these
-steps and returns LLVM code that callers can link. Both compilers use numba's extension point (numba's manual,
-"Customizing the Compiler"). Each compiler has its own class of code library.
+LLVM optimises a kernel together with every kernel that it calls. By default, numba would in addition optimise each
+called kernel alone and generate machine code for it, which takes a quarter of the compile time. The first compiler
+omits these steps and returns LLVM code that callers can link. Both compilers use numba's extension point (numba's
+manual, "Customizing the Compiler"). Each compiler has its own class of code library.
 """
 
 from __future__ import annotations
@@ -181,7 +181,8 @@ def keep_from_python(dispatcher: Any) -> None:
 def for_any_value(dispatcher: Any) -> None:
     """Make numba ignore the values of arguments, so that it compiles a kernel once for their types.
 
-    By default, numba also compiles a kernel for each constant that a caller passes, even if this code is never called.
+    By default, numba compiles a kernel once more for each constant that a caller passes, even if the code is never
+    called.
     """
     fold = dispatcher._compiler.fold_argument_types
 

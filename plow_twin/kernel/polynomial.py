@@ -50,7 +50,7 @@ def sum_to_bernstein(b: Array, n: int) -> None:
 
 @kernel(inline="code")
 def _halve(left: Array, right: Array, n: int) -> None:
-    """Halve an interval: write the left half's coefficients over those in `left`, and the right half's to `right`."""
+    """Halve an interval with the coefficients `left`. Write its left half to `left`, and its right half to `right`."""
     for r in range(n + 1):
         right[n - r] = left[n]
         for j in range(n, r, -1):

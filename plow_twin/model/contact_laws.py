@@ -2,7 +2,7 @@
 
 Most laws have the form F = K d^n (1 + lambda d'), where d is the penetration and its rate d' is positive inward. These
 laws differ in the damping number D = lambda v0 that they derive from the restitution e. v0 is the speed at first touch.
-The additive laws add C d' to K d^n, either from the first touch (Kelvin-Voigt) or over a ramp.
+The additive laws add C d' to K d^n. C acts fully from the first touch (Kelvin-Voigt), or increases over a ramp.
 
 A new law is an entry of `_LAWS`, or a call of `add_law` from outside the package. The solver reads only the damping
 number and the options of a law.

@@ -31,9 +31,9 @@ def painleve_coefficients(scene: Scene) -> NDArray[np.float64]:
     """Return the friction coefficient mu of each pair, shape (8,), above which Painleve's case is possible.
 
     The value is inf for a pair where Painleve's case is impossible. In Painleve's case, a sliding corner is pressed
-    into the wall by its own friction: in d'' = -p N, the factor p = 1/m + a^2/I - mu |a b|/I is negative. Here a and b
-    are the arms of N and of T about the centre of mass at q = 0. The equations of motion of rigid bodies then have no
-    solution or several solutions.
+    into the wall by its own friction: in d'' = -p N, the factor p = 1/m + a^2/I - mu |a b|/I is negative. The lengths a
+    and b are the arms of N and of T about the centre of mass at q = 0. With p < 0, the equations of motion of rigid
+    bodies have no solution or several solutions.
 
     Compliant contact has exactly one solution: N grows with the rate sqrt(-p K) until the slip stops. This growth is
     called impact without collision. Source: Genot and Brogliato, Eur. J. Mech. A 18 (1999) 653.

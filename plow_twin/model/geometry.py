@@ -39,7 +39,8 @@ if TYPE_CHECKING:
 
 #: Number of components of the state: X, Y, VX, VY, omega, c, s, theta.
 STATE_SIZE = 8
-#: 1 for the pairs whose wall has its normal along x (first array) or along y (second array), else 0; shape (8,) each.
+#: Two arrays, shape (8,) each. The first array is 1 for pairs with a wall normal along x, and 0 for all other pairs.
+#: The second array is 1 for pairs with a wall normal along y.
 _ALONG_X, _ALONG_Y = np.abs(NORMAL_X), np.abs(NORMAL_Y)
 
 
@@ -240,7 +241,7 @@ def largest_angle(scene: Scene) -> float:
 def length_scale(scene: Scene) -> float:
     """Return the reference length in m for tolerances: the smallest clearance that is not negligible.
 
-    A clearance below 1e-4 of the frame's diagonal is negligible. If both clearances are negligible, the reference
+    A clearance below 1e-4 of the frame's diagonal is negligible. Without any clearance above this limit, the reference
     length is 1e-4 of the diagonal.
     """
     floor = 1e-4 * math.hypot(scene.frame.width_m, scene.frame.height_m)

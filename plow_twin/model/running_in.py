@@ -8,7 +8,7 @@ Then
 After running-in, h exceeds z by h0 ln r. Under a constant force F, z grows with the sliding distance s as z = k_s F s /
 A. The coefficient approaches k_s as exp(-s / s0) with s0 = h0 A / (k_s F), the exponential transient of Queener, Smith
 and Mitchell, Wear 8 (1965) 391. The coefficient depends only on the depth. Running-in therefore continues from a saved
-depth and starts again with new pads.
+depth, and starts from zero with new pads.
 """
 
 from __future__ import annotations

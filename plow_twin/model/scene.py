@@ -117,7 +117,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Clearance:
-    """The cavity's size minus the frame's size. A negative clearance presses the frame against both opposite walls."""
+    """The cavity's size minus the frame's size. A negative clearance presses the frame against two opposite walls."""
 
     horizontal_m: float = _quantity("m", "cavity width minus frame width")
     vertical_m: float = _quantity("m", "cavity height minus frame height")
@@ -188,9 +188,9 @@ class Friction:
     """Tangential friction of all pairs, by one of two laws.
 
     Without `stick_stiffness_n_m`, friction is regularised Coulomb friction: T = mu N tanh(slip rate / regularisation
-    speed). A corner then creeps under a small load instead of sticking. With `stick_stiffness_n_m`, a spring and a
-    damper connect a corner to the wall until their force exceeds the `static_coefficient` times N. The corner then
-    slips with T = mu N.
+    speed). Under a small load, a corner creeps instead of sticking. With `stick_stiffness_n_m`, a spring and a damper
+    connect a corner to the wall until their force exceeds the `static_coefficient` times N. Beyond this force, the
+    corner slips with T = mu N.
 
     References
     ----------

@@ -84,8 +84,8 @@ class TwinBatch:
 
     Notes
     -----
-    A call raises `LimitError` after `max_wall_s`, and `RunInterrupted` after Ctrl-C. All twins then have the state
-    before the call.
+    A call raises `LimitError` after `max_wall_s`, and `RunInterrupted` after Ctrl-C. After such an error, all twins
+    have the state before the call.
 
     Each SIMD vector advances eight twins if no scene has a ramp, wear, friction, a support, locks, an offset centre of
     mass or overdamped contact. The bits of such a twin's results do not depend on the other twins of the batch. The

@@ -151,7 +151,7 @@ _SHARES = 4
 
 
 class _Run:
-    """Run of an ensemble: the data that its threads share."""
+    """Data that the threads of an ensemble's run share."""
 
     def __init__(
         self,
@@ -169,7 +169,7 @@ class _Run:
         self.stopped, self.done = threading.Event(), 0
 
     def tasks(self, threads: int) -> tuple[list[Callable[[], None]], list[Callable[[], None]]]:
-        """Return the tasks that run first, one after another, and the tasks that the threads then share."""
+        """Return two lists of tasks: tasks to run first, one after another, and tasks that the threads share."""
         groups: dict[object, list[int]] = {}
         alone: list[Callable[[], None]] = []
         for index, one in enumerate(self._compiled):

@@ -113,7 +113,7 @@ class Sensitivity:
 def sensitivity_parameters(scene: Scene) -> dict[str, float]:
     """Return the parameters with respect to which a motion can be differentiated.
 
-    These parameters are stiffness, damping or restitution, both clearances, and a scale factor for each load.
+    The parameters are the stiffness, the damping or restitution, the two clearances, and a scale factor for each load.
 
     Parameters
     ----------

@@ -79,8 +79,8 @@ class Twin:
 
     Notes
     -----
-    A call raises `LimitError` after `max_wall_s`, and `RunInterrupted` after Ctrl-C. The twin then has the state after
-    the last complete advance. The attribute `result` of the error contains the rows up to this advance.
+    A call raises `LimitError` after `max_wall_s`, and `RunInterrupted` after Ctrl-C. After such an error, the twin has
+    the state after the last complete advance. The attribute `result` of the error contains the rows up to this advance.
 
     The motion does not depend on the output times. However, each sample ends a step of the solver, so only equal
     samples give bit-identical results.
@@ -137,7 +137,7 @@ class Twin:
         return (*(part is not None for part in there), *options(self.scene))
 
     def like(self, scene: Scene) -> Twin:
-        """Return a twin of another scene with the same tolerance, excitation and limits.
+        """Return a new twin of the given scene, with the tolerance, excitation and limits of this twin.
 
         Parameters
         ----------
@@ -240,9 +240,10 @@ class Twin:
         wrench : ndarray, shape (n, 3)
             Fx, Fy [N] and M [N m] about the cavity's centre at each time. Ignored for `excitation="scene"`.
         rows : ndarray of `ROW`, shape (n,), or None
-            Array for one output row per time. None saves the computation of forces for output; the motion is the same.
+            Array for one output row per time. None saves the computation of forces for output, and does not change the
+            motion.
         digest_after : ndarray of int64, shape (m,)
-            Increasing numbers from 1 to n. A digest of the state is computed after each of these numbers of advances.
+            Increasing numbers from 1 to n. A digest of the state is computed when this number of advances is complete.
 
         Returns
         -------
@@ -292,7 +293,7 @@ class Twin:
         wear_depth: ArrayLike | None = None,
         pose: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> None:
-        """Restart at model time `t` from the initial state of the scene or from another state.
+        """Restart at model time `t` from the initial state of the scene or from a given state.
 
         Parameters
         ----------

@@ -53,8 +53,8 @@ class TwinSensitivity:
     Attributes
     ----------
     t : float
-        Model time in s of the other attributes: the end of the last complete stretch. This time is some 0.1 s before
-        the time of the twin, and up to 0.5 s during a contact.
+        Model time in s at the end of the last complete stretch, to which the attributes below refer. This time is some
+        0.1 s before the time of the twin, and up to 0.5 s during a contact.
     from_start : ndarray, shape (k, k)
         Derivatives of the state at `t` with respect to the twin's state when this object was created. A state contains
         the coordinates of the k / 2 free degrees of freedom, followed by their rates.

@@ -31,5 +31,5 @@ def config_folder() -> Path:
 
 
 def scene_path(name: str | Path) -> Path:
-    """Return the file of a preset (`PRESETS`), or any other path unchanged."""
+    """Return the file of a preset (`PRESETS`). Return a path that is no preset unchanged."""
     return config_folder() / f"{name}.yaml" if str(name) in PRESETS else Path(name)

@@ -54,7 +54,7 @@ class SceneLoader(_Loader):
 
 
 class SceneDumper(_Dumper):
-    """Safe dumper that quotes each text that YAML 1.1 or 1.2 would read as another type."""
+    """Safe dumper that quotes each text that YAML 1.1 or 1.2 would not read as text."""
 
     def ignore_aliases(self, data: Any) -> bool:
         """Return True, so that no aliases are written."""

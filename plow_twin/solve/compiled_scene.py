@@ -105,7 +105,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
     tol : float
         Tolerance of the pose relative to `geometry.length_scale`, 1e-13 .. 1e-1.
     sampled : bool
-        Whether the load is given as samples. The loads of the scene are then omitted.
+        Whether the load is given as samples. If True, the loads of the scene are omitted.
 
     Raises
     ------
@@ -259,7 +259,7 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
     loads, acceleration, start_speed, harmonics, terms, unchanged = shared.of(
         _unchanged, scene.head, scene.frame, scene.contact, scene.gravity, scene.loads, scene.initial, scene.locked,
         scene.pairs, scene.wear, scene.friction, scene.support, sampled,
-        # the results depend on the clearance only if the head starts off centre, because it may then touch a wall
+        # the results depend on the clearance only if the head starts off centre, where it may touch a wall
         scene.clearance if any(scene.initial.q) else None,
         given=(scene, sampled, shared),
     )  # fmt: skip

@@ -54,8 +54,8 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
     for pair in range(PAIR_COUNT):
         first = max(guard[0, pair], 0.0)
         if state.mode[pair] == ON:
-            # a pair becomes RELEASED at a quarter of the depth at which it becomes ON again, so that it cannot
-            # alternate between these modes
+            # a pair becomes RELEASED at a quarter of the depth at which a RELEASED pair becomes ON, so that it cannot
+            # alternate between the two modes
             first -= min(LET_GO * p.release, 0.5 * first)
         elif state.mode[pair] == RELEASED and first <= ON_THE_WALL * p.release:
             # a RELEASED pair that rests on its wall separates at the depth -LET_GO * release, so its guard function is

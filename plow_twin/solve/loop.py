@@ -67,7 +67,7 @@ def _present(p, harmonics, flight, support, state, w, y) -> None:
 def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
     """Advance the motion to `target`, and return a `Status`. Steps may extend beyond `target`, up to `stop_time`.
 
-    If `totals` is None, impulses, peaks and times are not computed. The motion is the same.
+    If `totals` is None, impulses, peaks and times are not computed. The motion does not depend on `totals`.
     """
     while True:
         t0 = state.step_start
@@ -294,7 +294,7 @@ def interrupt_step(p, parts, state, w, totals) -> None:
 
 @kernel(entry=True)
 def lay_out_again(p, parts, state, w) -> None:
-    """Compute the current step again after a snapshot was restored, because snapshots do not contain the step's series.
+    """Repeat the computation of the current step after a snapshot was restored. Snapshots do not contain its series.
 
     A snapshot can be within a step only under the scene's own loads. Steps under these loads have no stop time.
     """

@@ -277,7 +277,8 @@ WORK: Final = np.dtype(
         ("grip", "f8", (3, PAIR_COUNT)),  # friction with stick: factors of normal force, position and slip rate
         ("per_pair", "f8", (9, PAIR_COUNT)),  # masks and sums of the eight pairs
         ("moved", "f8", (STATE_SIZE,)),
-        # the following fields have the types of the state's fields, so that kernels are compiled once for both records
+        # the following fields have the types of the state's fields, so that one compiled kernel accepts state and
+        # scratch space
         ("saved_y", "f8", (STATE_SIZE,)),  # body coordinates and wear depth at the start of an advance
         ("saved_wear", "f8", (PAIR_COUNT,)),
         ("read_y", "f8", (STATE_SIZE,)),  # body coordinates, rates and wear depths at an output time
@@ -359,7 +360,7 @@ ROW: Final = np.dtype(
         # the time since the previous publication.
         ("followed", "i8"),  # `FOLLOWED` if only the clearances are filled, `WITH_INTERVALS` if all fields are filled
         *((f"{name}_{end}", "f8", (PAIR_COUNT,)) for name in ("force", "peak", "impulse") for end in ("low", "high")),
-        ("known_clearance", "f8", (6,)),  # horizontal, then vertical clearance, each followed by its quantiles
+        ("known_clearance", "f8", (6,)),  # horizontal clearance and its two quantiles, the same of the vertical clearance
     ]
 )
 

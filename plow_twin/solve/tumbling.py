@@ -70,7 +70,7 @@ def turn_corners(p, state, stick, totals, log) -> None:
 
 @kernel()
 def _hand_over(p, state, stick, totals, log, old, new) -> None:
-    """Copy the state of the pair `old` to the pair `new` of the same wall, unless `new` cannot touch."""
+    """Copy the state of the pair `old` to the pair `new` at the same wall, unless the pair `new` cannot touch."""
     mode = state.mode[old] if p.enabled[new] == 1 else OFF
     if log is not None:
         rate = penetration_and_rate(p, state, old)[1]

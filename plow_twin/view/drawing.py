@@ -179,7 +179,7 @@ class Drawing:
     def _hole(self, count: int, after: Batch) -> None:
         self._sample_ns, self._wrench = None, np.full(3, np.nan)
         self.events.forget()
-        if not isinstance(after.entries.others.get(0), Loss):  # a `Loss` in the journal is drawn as an event of its own
+        if not isinstance(after.entries.others.get(0), Loss):  # a `Loss` in the journal is drawn as a separate event
             text = f"{count} journal entries are missing after this"
             self.events.add(self.stamp_ns, max(self.step, 0), text, "ERROR")
 

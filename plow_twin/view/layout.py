@@ -68,8 +68,8 @@ def blueprint(
 ) -> rrb.Blueprint:
     """Return the arrangement of the views.
 
-    With `what_if`, the view of other scenes is the active tab. With `followed`, a view shows the forces with their 90 %
-    intervals. `title` is appended to the name of the view of the forces.
+    With `what_if`, the view that compares scenes is the active tab. With `followed`, a view shows the forces with their
+    90 % intervals. `title` is appended to the name of the view of the forces.
     """
     half_x, half_y = (float(half) for half in section.half_view)
     picture = rrb.Spatial2DView(

@@ -28,7 +28,7 @@ def follow(
     exaggerate: float | None = None,
     others: Mapping[str, Scene] | None = None,
 ) -> ViewSummary:
-    """Show a recording until its recorder ends or `stop` returns True. See `to_rrd` for the other arguments."""
+    """Show a recording until its recorder ends or `stop` returns True. See `to_rrd` for the remaining arguments."""
     reader = RunReader(path, Tail(stop))
     drawing = Drawing(
         reader, sink, section_hz=_SECTION_HZ_BEFORE, exaggerate=exaggerate, span_ns=round(1e9 / CURVE_HZ), others=others

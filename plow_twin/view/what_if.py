@@ -51,11 +51,11 @@ class WhatIf:
 
     @property
     def lost(self) -> dict[str, int]:
-        """Number of samples that came too late for the other scenes."""
+        """Number of samples that came too late for the simulated scenes."""
         return {"samples_too_late": self._walk.late} if self._walk.late else {}
 
     def add(self, entries: Entries, stamps: Indexes, steps: Indexes) -> None:
-        """Advance the other scenes by entries of the journal."""
+        """Advance the simulated scenes by entries of the journal."""
         if self._curves:
             order = np.argsort(stamps[entries.sample], kind="stable")
             self._stamps, self._steps = stamps[entries.sample][order], steps[entries.sample][order]

@@ -272,7 +272,8 @@ def _shift(lanes, guard, order, again, fraction) -> None:
             set_row(guard, j, after)
     first = zero
     if fraction is not None:
-        # a RELEASED pair may separate slightly outside its wall (`LET_GO`); its guard function -d then begins above 0
+        # a RELEASED pair may separate slightly outside its wall (`LET_GO`); in this case its guard function -d begins
+        # above 0
         first = choose(below(zero, exact_row(guard, 0)), exact_row(guard, 0), zero)
     set_row(guard, 0, choose(again, first, exact_row(guard, 0)))
 

@@ -1,7 +1,7 @@
-"""Record of eight scenes that run together: series and constants whose rows contain one number for each scene.
+"""Record of eight scenes that run together. Each row of its series and constants contains one number for each scene.
 
-The position of a scene in these rows is its lane. The acting pairs of each lane are assigned to slots 0, 1, ..., so
-that one vector operation processes one acting pair of every lane. The pairs in a slot may differ between lanes.
+The position of a scene in a row is its lane. The acting pairs of each lane are assigned to slots 0, 1, ..., so that one
+vector operation processes one acting pair of every lane. The pairs in a slot may differ between lanes.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Taylor series of eight scenes with fixed contact modes. `method.series` contains the equations.
 
 If the contact force is linear in penetration and rate, the sum over a scene's acting pairs is one affine map of the
-state. An order then needs twelve Cauchy products, for any number of acting pairs. A force with the damping lambda d'
-needs more products for each slot of acting pairs (`record`). The force K d (1 + lambda d') = K (d + lambda / 2 (d^2)')
-adds half a product for each slot. The force K d^n (1 + lambda d') adds three products for each slot.
+state. With this map, an order needs twelve Cauchy products for any number of acting pairs. A force with the damping
+lambda d' needs more products for each slot of acting pairs (`record`). The force K d (1 + lambda d') = K (d + lambda /
+2 (d^2)') adds half a product for each slot. The force K d^n (1 + lambda d') adds three products for each slot.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ def add_step(totals, lanes, w, order, full, viscous, hysteretic, power, fraction
     """
     last = order - 1
     if totals is None and hysteretic is None and power is None:
-        # under sampled loads, the series of a lane can end before those of other lanes, and then has one more term
+        # under sampled loads, the series of a lane that ends before the series of other lanes has one more term
         last = order
     for slot in range(PAIR_COUNT):
         taken = lanes.taken[slot]

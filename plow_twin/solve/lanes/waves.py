@@ -20,7 +20,7 @@ from plow_twin.kernel.simd import (
 
 #: Largest angle for which the product of the number of quarter turns and the first part of pi / 2 is exact.
 _LARGEST = 1e5
-#: Number that rounds a double to an integer, if it is added to the double and then subtracted.
+#: Number that rounds a double to an integer, if the number is added to the double and subtracted from the sum.
 _ROUNDS = 6755399441055744.0
 #: 2 / pi, and pi / 2 in three parts, the first two of 33 bits (fdlibm, e_rem_pio2.c).
 _QUARTERS = (0.6366197723675814, 1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)

@@ -1,9 +1,9 @@
 """Implicit steps for overdamped contact: collocation at Radau points with fixed contact modes.
 
-In overdamped contact, the damper stops a pair much faster than the spring moves it. Stability then limits the steps of
-an explicit series to a few decay times, even if the motion is smooth. Radau IIA collocation (Hairer and Wanner, Solving
-ODEs II, sec. IV.5) is stable for longer steps. The solution is a polynomial in time. The polynomial is written as a
-series, so that events, outputs and totals are computed as for an explicit step.
+In overdamped contact, the damper stops a pair much faster than the spring moves it. For this reason, stability limits
+the steps of an explicit series to a few decay times, even if the motion is smooth. Radau IIA collocation (Hairer and
+Wanner, Solving ODEs II, sec. IV.5) is stable for longer steps. The solution is a polynomial in time. The polynomial is
+written as a series, so that events, outputs and totals are computed as for an explicit step.
 """
 
 from __future__ import annotations
@@ -542,7 +542,7 @@ def _write_ramp(p, h, w, implicit) -> float:
     """Write the force of a ramped law as K times an elastic part plus C times a remainder. Return the last term's size.
 
     The elastic part is d for the exponent 1, and 0 otherwise. The size is a velocity per h^(STAGES - 1). The force of a
-    CLIPPED pair does not act on the head, but determines the time at which the pair pushes again.
+    CLIPPED pair does not act on the head, but determines the time at which the pair starts to push.
     """
     s, largest = implicit.nodes.size, 0.0
     _interpolate(implicit.pairs[1], implicit.from_stages, h, w.damped)

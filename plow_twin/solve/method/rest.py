@@ -63,7 +63,7 @@ def _still(p, acts, harmonics, state, w) -> bool:
     without_harmonics(p, harmonics, state.step_start, rate, w.rest[3, 3:])
     if not stiffer_than(w.hessian, 0.0):
         return False
-    # the energy bounds the speed; with the smallest stiffness, it also bounds the distance from the equilibrium
+    # the energy bounds the speed; energy and smallest stiffness bound the distance from the equilibrium
     energy = speed * speed + to_equilibrium(w.hessian, rate, z, gyration)
     if not (2.0 * energy < fast * fast and stiffer_than(w.hessian, 2.0 * energy / (way * way))):
         return False

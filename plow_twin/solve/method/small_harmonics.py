@@ -6,12 +6,12 @@ coordinate of e is the angle times the radius of gyration. r is the remainder of
 is known in closed form, including resonance.
 
 Let s and c be the smallest eigenvalues of K and C, and S the largest eigenvalue of C. Choose eps at most c / 2,
-s / (10 S) and sqrt(s) / 10. The Lyapunov function V and the squared size W of the motion then satisfy
+s / (10 S) and sqrt(s) / 10. For such an eps, the Lyapunov function V and the squared size W of the motion satisfy
 
     V = (e'e' + e K e) / 2 + eps (e e' + e C e / 2),  V' <= -eps W + r (1 + eps / sqrt(s)) sqrt(W),  W = e'e' + e K e
 
 and V is between 0.45 W and 0.55 W. Therefore sqrt(W) always stays below the larger of 1.2 times its current value and
-1.4 r / eps, and e stays below sqrt(W / s). Without damping (c = 0) there is no such bound.
+1.4 r / eps, and e stays below sqrt(W / s). Without damping (c = 0), e is not bounded.
 """
 
 from __future__ import annotations

@@ -79,10 +79,10 @@ def before_sticking(p, state, w, order, sigma) -> float:
 def before_pushing_again(p, state, w, order, sigma, integer, fraction) -> float:
     """Return `sigma`, or the smaller value up to which the ramped force of CLIPPED pairs has an accurate series.
 
-    This force does not act yet and appears only in a guard function, so no other test limits its error. The root test
-    of the motion is applied to the velocity that the force would cause. The test is necessary because the active share
-    of C, a cubic, has a longer series than the penetration. Moreover, d^n has a branch point where the pair separates.
-    If the series of the motion has ended early, the test uses the available orders.
+    This force does not act yet and appears only in a guard function, so its error is not limited by the test of the
+    motion. The root test of the motion is applied to the velocity that the force would cause. The test is necessary
+    because the active share of C, a cubic, has a longer series than the penetration. Moreover, d^n has a branch point
+    where the pair separates. If the series of the motion has ended early, the test uses the available orders.
     """
     least, share = np.inf, math.log(p.threshold[p.order] / p.threshold[0]) / order
     for pair in range(PAIR_COUNT):
