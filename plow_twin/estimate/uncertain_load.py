@@ -1,13 +1,14 @@
 """Clearances if the measured load does not explain the motion, or if load or theta was not measured.
 
-Motions with random clearances, contacts and load errors are simulated and observed as by the sensor. A regression over
-the simulated motions near the measured motion corrects the result of the module `equation_error`, and gives the
-deviation of the corrected result. The method is approximate Bayesian computation with local-linear adjustment, as in
-the module `bouncing`. If theta was not measured, the range of motion replaces the result of `equation_error`.
+Motions with random clearances, contact parameters and load errors are simulated, and the sensor's noise and gaps are
+applied to them. A regression over the simulated motions near the measured motion corrects the result of the module
+`equation_error`. The residuals of the regression give the deviation of the corrected result. The method is approximate
+Bayesian computation with local-linear adjustment, as in the module `bouncing`. If theta was not measured, the range of
+motion is corrected instead of the result of `equation_error`.
 
-If the load was not measured, each simulated motion has the load that the measured motion would need between the drawn
-walls, averaged over a time that is longer than impacts. Only the right walls then give the measured impacts. The
-sensor's biases of x and y are taken as zero.
+If the load was not measured, a load is computed for each draw. It is the load that would cause the measured motion
+between the drawn walls, averaged over a time that is longer than an impact. With this load, only the true walls give
+the measured impacts. The sensor's biases of x and y are assumed to be zero.
 """
 
 from __future__ import annotations
@@ -30,11 +31,12 @@ from plow_twin.model import geometry
 
 Array = NDArray[np.float64]
 
-#: Interval between the knots of the load's error, derived as a share of the error's shortest correlation time.
+#: Interval between two knots of the load's error, derived as a share of the shortest correlation time of the error.
 _KNOTS = 1.0 / 3.0
 #: Interval [s] between the knots of the load between samples, derived as half the period of a soft contact (20 Hz).
 _KNOT = 0.025
-#: Upper bound on the number of sets of draws; each set after the first is drawn about the result of the previous set.
+#: Upper bound on the number of sets of draws. The second and each further set are drawn about the result of the
+#: previous set.
 _ROUNDS = 3
 #: Lower bound on the number of draws for a regression.
 _FEWEST = 40
@@ -45,10 +47,10 @@ class Compared:
     """Result of the comparison of a measured motion with motions under uncertain loads.
 
     clearance, deviation : (2,) clearances and standard deviations in m
-    touched : (2,) whether the head touched both walls, for the horizontal and for the vertical direction
+    touched : (2,) whether the head touched both horizontal walls, and whether it touched both vertical walls
     ln_depth : mean and deviation of the logarithm of the penetration in m under the reference force
     ln_damping : mean and deviation of the logarithm of the damping
-    distance : distance of the measured motion from nearby drawn motions, relative to the distances among drawn motions
+    distance : distance of the measured motion from nearby drawn motions, divided by the distances between drawn motions
     load_error : error of the load relative to its amplitude
     """
 
@@ -63,10 +65,10 @@ class Compared:
 
 @dataclass
 class _Spread:
-    """Distribution of the draws: mean `centre` (2,) and deviation `about` of the clearances in m, and logarithms.
+    """Distribution of the draws. The clearances in m have the mean `centre`, shape (2,), and the deviation `about`.
 
-    Each logarithm (of penetration in m, damping and relative load error) has a mean and a standard deviation.
-    If `yields` is true, the clearances are the mean minus random penetrations of both walls.
+    The logarithms of penetration [m], damping and relative load error each have a mean and a standard deviation. If
+    `yields` is true, the clearances are the mean minus random penetrations of both walls.
     """
 
     centre: Array
@@ -80,7 +82,8 @@ class _Spread:
 def compare_under_uncertain_load(
     felt: Load | None, unknowns: Unknowns, poses: Poses, period: float, seed: int = 0
 ) -> tuple[Compared | None, int]:
-    """Return the comparison of the measured motion with motions under random errors of the load, and the work.
+    """Return the comparison of the measured motion with motions under random load errors, and the work of the
+    simulations.
 
     Parameters
     ----------
@@ -163,7 +166,9 @@ _Look = tuple[Callable[[Array], Array], _Spread, NDArray[np.bool_]]
 
 
 def _without_load(seen: MotionFeatures, unknowns: Unknowns, poses: Poses) -> _Look:
-    """Return the same as `_with_angle` if the load was not measured: motions are compared by reaches and changes."""
+    """Return the result of `_with_angle` for a load that was not measured; motions are compared by reaches and
+    changes.
+    """
 
     def features(q: Array) -> Array:
         values = seen.features(q)
@@ -183,7 +188,9 @@ def _without_load(seen: MotionFeatures, unknowns: Unknowns, poses: Poses) -> _Lo
 
 
 def _with_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Poses) -> _Look:
-    """Return the function that computes features, the distribution of the first draws, and `touched` of `Compared`."""
+    """Return the function that computes features, the distribution of the first draws, and the field `touched` of
+    `Compared`.
+    """
     about, softness, damping = tuning.UNCERTAIN_SPREAD
     equations = EquationError(unknowns, felt, poses.t)
     first = equations.search(seen.q, range_of_motion(unknowns.scene, poses)[0])
@@ -244,9 +251,9 @@ def _draw(spread: _Spread, rng: np.random.Generator) -> tuple[Array, Array, floa
 
 
 def _with_exponent(unknowns: Unknowns, rng: np.random.Generator) -> Unknowns:
-    """Return the unknowns of a scene whose exponent is increased at random in half of the cases.
+    """Return the unknowns of the scene; in half of the cases, the exponent is increased at random.
 
-    The exponent is never reduced, because no wall is stiffest at its surface.
+    The exponent is never reduced, because with a smaller exponent a wall would be stiffest at its surface.
     """
     step = tuning.UNCERTAIN_EXPONENT * max(0.0, rng.standard_normal())
     contact = unknowns.scene.contact

@@ -34,10 +34,10 @@ class Quantity:
     label, factor, digits : str, float, str
         Printed name with unit, factor for the conversion to this unit, and number format.
     deviation : float
-        Prior standard deviation, in the unit of the unknown.
+        Prior standard deviation in the unit of the number in the vector of unknowns.
     dimension : tuple of 3 int
-        Powers of length, mass and time in the unit of the published value. For stiffness and damping, the powers follow
-        from the contact law instead.
+        Powers of length, mass and time in the unit of the published value. The powers for stiffness and damping are not
+        used, because their units depend on the contact law.
     step : float, optional
         Step of the difference quotient of the motion with respect to the quantity; None if the derivative is known
         exactly.
@@ -58,9 +58,9 @@ class Quantity:
     probe: float = 0.0
 
 
-#: The estimated quantities with their prior deviations, in the order of a vector of unknowns. The unknown of the
-#: stiffness is the softness psi, the unknown of the damping is its logarithm (the logit for a restitution). Quantities
-#: with a `step` change the motion of the head and come first. The other quantities change only the measurement.
+#: The estimated quantities with their prior deviations, in the order of a vector of unknowns. The vector contains the
+#: softness psi for the stiffness, and the logarithm of the damping or the logit of the restitution. Quantities with a
+#: `step` change the motion of the head and come first. Quantities without a `step` change only the measurement.
 QUANTITIES: Final = (
     Quantity("horizontal", "horizontal clearance [mm]", 1e3, ".3f", 8e-3, (1, 0, 0), 2e-4, 1e-5, 5e-5),
     Quantity("vertical", "vertical clearance [mm]", 1e3, ".3f", 8e-3, (1, 0, 0), 2e-4, 1e-5, 5e-5),
@@ -105,11 +105,11 @@ _HARDEST, _SOFTEST = 3e-5, 0.12
 LEAST_CLEARANCE: Final = 5e-4
 
 
-#: Alternative of a contact law, which is tested if the contact is linear (exponent 1).
+#: Alternative law of a contact law. If the contact is linear (exponent 1), the alternative law is tested.
 OTHER_LAW: Final = {"hunt_crossley": "kelvin_voigt"}
 
-#: Lower bound on a prior standard deviation. With this deviation, a number that is stated as exact hardly changes in
-#: the fit.
+#: Lower bound on a prior standard deviation. It is used for a number that is stated as exact, which then hardly changes
+#: in the fit.
 _HELD = 1e-6
 #: Upper bound on the prior deviation of a load gain.
 _MOST_GAIN = 1.0
@@ -142,7 +142,7 @@ class Unknowns:
 
     @staticmethod
     def stated(scene: Scene, load: Load, poses: Poses) -> Unknowns:
-        """Return the prior with the deviations that the scene, the load (for its gains) and the poses state."""
+        """Return the prior with the deviations that the scene, the load and the poses state."""
         unknowns, deviation, contact = Unknowns(scene), _prior(), scene.contact
         deviation[GX] = deviation_of(scene, "clearance.horizontal_m")
         deviation[GY] = deviation_of(scene, "clearance.vertical_m")
@@ -175,8 +175,8 @@ class Unknowns:
         return vector
 
     def deviations(self) -> Array:
-        """Return the prior standard deviations, shape (SIZE,); without damping, its entry is 1e-6, which holds it
-        fixed.
+        """Return the prior standard deviations, shape (SIZE,). Without damping, the deviation of the damping is
+        practically zero.
         """
         deviations = self.deviation.copy()
         if not self.damped:
@@ -206,7 +206,9 @@ class Unknowns:
 
     @property
     def hardest_believed(self) -> float:
-        """Upper end in N/m^n of the published stiffness interval if the motion shows only that the contact is hard."""
+        """Upper end in N/m^n of the stiffness interval for a contact that is too hard for its stiffness to be
+        determined.
+        """
         return float(self.force / (1e-6) ** self.scene.contact.exponent)
 
     def damping_of(self, value: float) -> float:
@@ -243,7 +245,7 @@ class Unknowns:
 
 
 def contact_with(contact: Contact, stiffness: float, damping: float | None) -> Contact:
-    """Return a contact with another stiffness and another damping or restitution; None leaves the damping unchanged."""
+    """Return a contact with the given stiffness and damping or restitution; None leaves the damping unchanged."""
     contact = replace(contact, stiffness=stiffness)
     if damping is None:
         return contact

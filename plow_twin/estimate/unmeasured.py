@@ -1,12 +1,13 @@
 """Fit of poses in which one or two components were never measured.
 
-Without all components the range of motion is unknown, and so are the clearances from which a fit starts. In a soft
-contact, however, the load determines the motion after some periods, independent of its start. The fit has these steps:
+If a component is missing, the range of motion is unknown, so there is no starting point for the clearances in a fit. In
+a soft contact, however, the load alone determines the motion after some periods. The fit has these steps:
 
 1. Vectors of unknowns are drawn from the prior, and their motions are compared with the measured components.
 2. Levenberg-Marquardt steps improve the vectors with the nearest motions.
-3. These motions replace the missing components in the division of the poses into swings.
-4. A fit with linked swings uses the measured values only.
+3. The poses are divided into swings, which begin in flight. The missing components are taken from the motions of step
+2.
+4. A fit with swings that are linked to each other uses only the measured values.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from plow_twin.model import geometry
 
 Array = NDArray[np.float64]
 
-#: Steps of the difference quotients with respect to all unknowns; the steps for bias and delay are 1e-3 m, m, rad, s.
+#: Steps of the difference quotients with respect to all unknowns. The steps for biases and delay are 1e-3 in SI units.
 _STEPS: Final = np.array([one.step or 1e-3 for one in QUANTITIES])
 #: Upper bound on the number of times that a step is shortened.
 _SHORTER: Final = 5
@@ -61,7 +62,7 @@ class _Whole:
         return None if run is None else run.q
 
     def residual(self, vector: Array, rows: int) -> Array | None:
-        """Return measured minus predicted values of the k measured components, shape (n, k); None as in `motion`."""
+        """Return measured minus predicted values of k components, shape (n, k); None if there is no motion."""
         q = self.motion(vector, rows)
         if q is None:
             return None
@@ -113,7 +114,9 @@ class _Whole:
         return None, damping
 
     def _normalised(self, vector: Array, rows: int, scale: Array) -> Array | None:
-        """Return the residuals in units of `scale`, followed by the residuals of the prior; None as in `motion`."""
+        """Return the residuals in units of `scale`, followed by the residuals of the prior; None if there is no
+        motion.
+        """
         error = self.residual(vector, rows)
         prior = ((vector - self.mean) / self.deviation)[self.free]
         return None if error is None else np.concatenate([(error / scale[self.measured]).ravel(), prior])
@@ -208,7 +211,9 @@ def _starts(whole: _Whole, rows: int, rng: np.random.Generator) -> list[Array]:
 
 
 def _like_measured(whole: _Whole) -> Array:
-    """Return the noise of all components in m, m, rad; missing components have the mean noise of the measured ones."""
+    """Return the noise of all components in m, m, rad. A missing component has the mean noise of the measured
+    components.
+    """
     arm = geometry.half_diagonal(whole.unknowns.scene)
     level = float((whole.noise * [1.0, 1.0, arm])[whole.measured].mean())
     return level * np.array([1.0, 1.0, 1.0 / arm])

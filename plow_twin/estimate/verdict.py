@@ -1,4 +1,4 @@
-"""Tests whether the residuals of a fit are noise; if they are not, the model or the sensor is suspect.
+"""Tests whether the residuals of a fit are noise. If the residuals are not noise, the model or the sensor is suspect.
 
 The thresholds were chosen with simulated machines whose seeds are below 1000. The page docs/estimate.md lists faults
 that the tests do not find.
@@ -40,7 +40,7 @@ class Verdict:
     by_scale : whether wrong scale factors are the only fault of the sensor
     broken : whether the sensor has failed or the measurements contradict each other, so that no estimate is possible
     lacking : description of the most significant harmonic that the fit has added to the measured load
-    changed : (2,) change of the clearances within the window in m, or of the bias along x and y
+    changed : (2,) change in m, within the window, of the two clearances or of the biases of x and y
     """
 
     model: list[str] = field(default_factory=list)
@@ -76,7 +76,9 @@ def judge(problem: Problem, fit: Fit, period: float) -> Verdict:
 
 
 def judge_sensor(poses: Poses) -> list[str]:
-    """Return messages about faults of the sensor that the poses alone show: a constant value, or changing noise."""
+    """Return messages about faults of the sensor that the poses alone show, such as a constant value or changing
+    noise.
+    """
     found = []
     for i, name in enumerate(COMPONENTS):
         column = poses.q[np.isfinite(poses.q[:, i]), i]
@@ -107,7 +109,7 @@ def _colour(fit: Fit, verdict: Verdict) -> None:
         if quick <= 0.0 or len(rows) < 50:
             continue
         ratio = float(np.mean(np.minimum(np.abs(rows), 5.0 * quick) ** 2) / quick**2)
-        # the last term allows for the random scatter of `ratio`, a mean square divided by a squared median
+        # `ratio` is a mean square divided by a squared median; the last term of the limit allows for its random scatter
         limit = 1.0 + (tuning.MOST_RATIO - 1.0) + 4.0 * 2.5 / np.sqrt(len(rows))
         verdict.figures[f"colour_{name}"] = ratio
         if ratio > limit and not verdict.sensor:
@@ -222,7 +224,7 @@ def _stuck(problem: Problem, fit: Fit, verdict: Verdict) -> None:
 
 
 def _noise_change(fit: Fit, verdict: Verdict) -> None:
-    if not fit.finished:  # the residuals contain motion, which can differ between parts of the window
+    if not fit.finished:  # the residuals contain motion, which can vary within the window
         return
     for i, name in enumerate(COMPONENTS):
         residual, swing = fit.point.residual[:, i], fit.point.swing
@@ -274,7 +276,8 @@ def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
 def _felt(problem: Problem, fit: Fit) -> bool:
     """Return whether the unknown part of the load has no effect on the residuals.
 
-    The effect is smaller than the noise in short swings. The links between linked swings allow for the effect.
+    If the swings are short, the effect is smaller than the noise. If the swings are linked, the links allow for the
+    effect.
     """
     drift = np.array(problem.forward.load.unknown) / np.asarray(inertias(problem.unknowns.scene)) ** 2
     span = float(np.median(np.diff(problem.window.starts)))
@@ -292,7 +295,7 @@ def _excess(fit: Fit) -> float:
 
 
 def _changes(problem: Problem, fit: Fit, columns: NDArray[np.intp]) -> Iterator[tuple[Array, Array]]:
-    """Yield information and score for a change of the unknowns `columns` at each of several swings.
+    """Yield the information matrix and the score for a change of the unknowns `columns` at each of several swings.
 
     All other unknowns are eliminated.
     """

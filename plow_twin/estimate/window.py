@@ -1,9 +1,9 @@
 """Windows of the sliding estimate, formed from arriving samples and poses.
 
-Each window ends at a multiple of the interval between windows. A window is formed as soon as a load sample is newer
-than its end by the waiting time for late data. The order of arrival within the waiting time has no effect, so a replay
-of the journal gives the same windows as the live node. If no load has arrived for half of a window, poses take the
-place of its samples, and the window has no load.
+Each window ends at a multiple of the interval between windows. A window is formed as soon as a load sample arrives with
+a stamp later than the end of the window plus the waiting time for late data. The order of arrival within the waiting
+time has no effect, so a replay of the journal gives the same windows as the live node. If no load has arrived for half
+of a window's length, the stamps of poses determine when a window is formed, and the window contains no load.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from plow_twin.model.pairs import PAIR_COUNT
 Array = NDArray[np.float64]
 #: A stamp in ns and the measured values.
 Row = tuple[int, tuple[float, ...]]
-#: A stamp in ns, the measured pose, and its deviations if known.
+#: A stamp in ns, the measured pose, and the standard deviations of the pose, or an empty tuple.
 _Pose = tuple[int, tuple[float, ...], tuple[float, ...]]
 
-#: Upper bound on the number of stored poses, and on stored rows of gaps. More rows arrive only if the load has stopped
-#: or a clock is ahead by hours.
+#: Upper bound on the number of stored poses and on the number of stored rows of gaps. The bound is reached only if the
+#: load has stopped, or if a clock is ahead by hours.
 MOST_KEPT = 600_000
 
 
@@ -42,7 +42,7 @@ MOST_KEPT = 600_000
 class Window:
     """Measurements in the window [start_ns, end_ns), with times in s after `start_ns`.
 
-    samples, poses : numbers of received load samples, and of received poses and rows of gaps
+    samples, poses : number of received load samples, and number of received poses plus received rows of gaps
     lost : number of rows that are left out
     gaps : measured gaps; None without gaps
     """
@@ -63,7 +63,8 @@ class Windows:
     Parameters
     ----------
     length_s, interval_s, wait_s : float
-        Full length of a window, interval between the ends of successive windows, and waiting time for late data, in s.
+        Three times in s: the full length of a window, the interval between the ends of successive windows, and the
+        waiting time for late data.
     poses : tuple of 3 float
         Lower limit of the standard deviation of the poses.
     load : tuple of 3 float
@@ -71,8 +72,8 @@ class Windows:
     gaps : float
         Standard deviation of a gap sensor in m.
     early : bool
-        Whether shorter windows are formed at first, from the share `tuning.WINDOW_SHARES[1]` of the full length on. A
-        short window is left out if the share of new motion in it is less than `tuning.NEW_MOTION`.
+        Whether shorter windows are formed at the beginning. The shortest window has the share `tuning.WINDOW_SHARES[1]`
+        of the full length. A short window is left out if its share of new motion is less than `tuning.NEW_MOTION`.
     """
 
     def __init__(
@@ -96,7 +97,8 @@ class Windows:
         self._loads: list[Row] = []
         self._poses: deque[_Pose] = deque(maxlen=MOST_KEPT)
         self._gaps: deque[tuple[int, tuple[int, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
-        #: length [s] of the newest window that was checked, and the larger of its numbers of poses and of rows of gaps
+        #: length [s] of the newest window that was checked, and the number of its poses or rows of gaps, whichever is
+        #: larger
         self._left = (0.0, 0)
         self._newest_ns: int | None = None
         self._end_ns: int | None = None
@@ -111,10 +113,9 @@ class Windows:
         self._load_deviation = deviation
 
     def add_pose(self, stamp_ns: int, q: tuple[float, ...], deviation: tuple[float, ...] = ()) -> Window | None:
-        """Add a measured pose (x, y [m], theta [rad]), with NaN for missing components, and its standard deviations, if
-        known.
+        """Add a measured pose (x, y [m], theta [rad]) and its standard deviations; a missing component is NaN.
 
-        Returns a window of poses alone if one has become due, because the load is silent.
+        Return a window that contains only poses if such a window is due because no load arrives.
         """
         self._poses.append((stamp_ns, q, deviation))
         self._silent_ns = stamp_ns if self._silent_ns is None else self._silent_ns
@@ -151,9 +152,7 @@ class Windows:
         return window
 
     def last(self) -> Window | str:
-        """Return the window up to the newest sample at the end of the input, or a message why no window can be
-        formed.
-        """
+        """Return the last window, which ends at the newest sample, or a message why no window can be formed."""
         if self._newest_ns is None:
             return "got no load"
         window = self._form(self._newest_ns + 1)
@@ -210,7 +209,7 @@ class Windows:
         return Window(start_ns, end_ns, load, pose, len(rows), len(poses) + len(measured), lost, tabled)
 
     def _without_load(self, start_ns: int, end_ns: int) -> Window | None:
-        """Return a window of poses; None if there are few."""
+        """Return a window that contains only poses; None if there are few poses."""
         poses = [row for row in self._poses if start_ns <= row[0] < end_ns]
         if len(poses) < FEWEST_POSES:
             return None

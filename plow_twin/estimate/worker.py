@@ -1,9 +1,9 @@
 """The sliding estimate in a process of its own, so that it does not delay the samples of the twin.
 
 The class `Worker` runs in the process of the twin, which is called the *near side*. It queues data, which a thread
-sends to the *far side*. The far side is the process `python -m plow_twin.estimate.worker`. It compiles its kernels,
-reports that it is ready, computes the estimate of each window that is due, and sends the results back. If several
-windows become due during an estimate, only the newest of these windows is estimated next.
+sends to the *far side*. The far side is the process `python -m plow_twin.estimate.worker`. The far side compiles its
+kernels, reports that it is ready, computes the estimate of each window that is due, and sends the results to the near
+side. If several windows become due during an estimate, only the newest of these windows is estimated next.
 """
 
 from __future__ import annotations
@@ -35,11 +35,12 @@ from plow_twin.model.scene import Scene
 
 #: Upper bound on the interval at which queued data are sent [s].
 _SEND_S: Final = 0.05
-#: Upper bound on the number of queued items, which is reached only if the far side has stopped reading.
+#: Upper bound on the number of queued items. The bound is reached only if the far side has stopped reading.
 _MOST_WAITING: Final = 1_000_000
 #: `nice` value of the far side, which bounds its effect on the twin.
 _NICE: Final = 10
-#: Shortest time slice in ns, and number of the system call `sched_setattr`, by definition of Linux.
+#: Shortest time slice in ns, and number of the system call `sched_setattr`. By definition, Linux specifies both
+#: numbers.
 _SLICE_NS, _SCHED_SETATTR = 100_000, 314
 #: Upper bound on the time in s until the far side has ended.
 _STOP_S: Final = 5.0
@@ -63,9 +64,9 @@ class Found:
     guess : first guess of the fit
     estimate : the estimate
     wall_s : duration of the computation in s
-    skipped, restarts : numbers of skipped windows and of restarts before this window
+    skipped, restarts : number of windows that were skipped, and number of restarts, before this window
     text : the whole answer as JSON, with `forces` and `forecast` if requested
-    also : the answers `forces` and `forecast` without the estimate
+    also : the answers `forces` and `forecast` as JSON values, if requested
     """
 
     start_ns: int
@@ -112,8 +113,8 @@ class Worker:
         self._closed = threading.Event()
         #: reason why the process has ended; empty while it runs
         self.error = ""
-        #: None until the estimate that `finish` requests is done, then an empty text; without such an estimate, the
-        #: reason
+        #: None until the estimate that `finish` requests has ended; an empty text if it succeeded, or the reason of a
+        #: failure
         self.ended: str | None = None
         self._thread = threading.Thread(target=self._send_queue, name="estimate", daemon=True)
         self._thread.start()
@@ -149,7 +150,7 @@ class Worker:
         return len(self._waiting) > _MOST_WAITING // 10
 
     def poll(self) -> Found | None:
-        """Return the next result that has arrived, or None; results of windows before a restart are dropped."""
+        """Return the next result, or None if no result has arrived; results of windows before a restart are dropped."""
         if self.error or self.ended is not None:
             return None
         if len(self._waiting) > _MOST_WAITING:
@@ -169,7 +170,7 @@ class Worker:
                 return found if found.restarts == self._restarts else None
         except (EOFError, OSError):
             code = self._process.poll()
-            if code is not None:  # None while the process is still ending; a later call receives the code
+            if code is not None:  # the code is None while the process is ending; a later call of `poll` receives it
                 self._fail(f"the estimator ended with code {code}")
         return None
 
@@ -203,7 +204,7 @@ def serve(connection: Connection) -> None:
     """Receive data and send estimates until the near side closes the connection."""
     scene, windows, asked = connection.recv()
     warm_up(scene)
-    connection.send(None)  # the message that the kernels are compiled
+    connection.send(None)  # this message reports that the kernels are compiled
     guess: Guess = ()
     ended: str | None = None
     skipped = restarts = 0
@@ -223,7 +224,7 @@ def serve(connection: Connection) -> None:
                     due = formed
         if due is None:
             connection.send(ended)
-            connection.recv()  # wait until the near side closes the connection, which raises `EOFError`
+            connection.recv()  # wait until the near side closes the connection; `recv` then raises `EOFError`
         assert due is not None
         begin = time.perf_counter()
         found = answer(scene, due, guess, asked)
@@ -248,7 +249,7 @@ def add(windows: Windows, item: tuple[Any, ...]) -> Window | None:
 
 
 def _request_short_slices() -> None:
-    """Request time slices of 0.1 ms, so that other processes wait less for the core (x86-64, Linux 6.12 or newer)."""
+    """Request time slices of 0.1 ms, so that the twin waits less for the core (x86-64, Linux 6.12 or newer)."""
     if platform.machine() == "x86_64" and sys.platform == "linux":
         # struct sched_attr: size, policy, flags, nice, priority, runtime [ns], deadline, period
         attributes = struct.pack("IIQiIQQQ", 48, os.SCHED_OTHER, 0, _NICE, 0, _SLICE_NS, 0, 0)
@@ -256,7 +257,9 @@ def _request_short_slices() -> None:
 
 
 def main() -> None:
-    """Run the far side; the command-line arguments are a descriptor of the pipe, and modules with contact laws."""
+    """Run the far side. The command-line arguments are a descriptor of the pipe and the names of modules with contact
+    laws.
+    """
     # Ctrl-C sends SIGINT to the whole process group; the far side ignores SIGINT, because the near side ends the far
     # side
     signal.signal(signal.SIGINT, signal.SIG_IGN)

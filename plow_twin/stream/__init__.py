@@ -1,1 +1,1 @@
-"""Processing of the stream of samples: order of stamps, gaps, hold policy and health counters, without a clock."""
+"""Processing of the stream of samples, such as the order of stamps, gaps, the hold policy and counters."""

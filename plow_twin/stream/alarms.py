@@ -1,7 +1,7 @@
 """Alarms for published values, with two levels, hysteresis and a minimum duration.
 
-The highest level that an alarm has reached is its *latched* level. The latched level remains until an operator
-acknowledges the alarm. Alarms read no clock, so a replay raises the same alarms.
+The highest level that an alarm has reached since its last acknowledgement is its *latched* level. Alarms read no clock,
+so a replay raises the same alarms.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ HYSTERESIS: Final = 0.95
 #: Time [ns] over which the growth rate of the clearance is computed. Wear is too slow for a rate from two successive
 #: clearances.
 RATE_SPAN_NS: Final = 10 * NS_PER_S
-#: The poses of the model are stored for this time [ns], so that a late measured pose can be compared with the model.
+#: Time [ns] for which the poses of the model are stored, so that a late measured pose can be compared with the model.
 _KEPT_NS: Final = 2 * NS_PER_S
 _PRUNED: Final = 500
 _MOST_WAITING: Final = 1000
@@ -44,7 +44,9 @@ class Level(IntEnum):
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Smallest values with which an alarm has the level WARN or ERROR; a threshold of 0 disables its level."""
+    """Smallest values with which an alarm has the level WARN or the level ERROR. A threshold of 0 disables the
+    level.
+    """
 
     warn: float = 0.0
     error: float = 0.0
@@ -61,7 +63,7 @@ class Thresholds:
 
 @dataclass(frozen=True)
 class Raised:
-    """Cause of a latched level; `place` is the name of the pair or axis, or empty for other quantities."""
+    """Cause of a latched level; `place` is the name of a pair or an axis, or empty for a quantity without a place."""
 
     value: float
     threshold: float
@@ -79,7 +81,7 @@ class Alarm:
     latched: Level = Level.NONE
     raised: Raised | None = None
     _since_ns: int | None = None
-    #: smallest threshold above 0; an alarm with the level NONE keeps this level while its value is below the threshold
+    #: smallest threshold above 0; while the value is below this threshold, an alarm with the level NONE does not change
     lowest: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -123,7 +125,7 @@ class Alarm:
 
     def stays(self, values: NDArray[np.float64]) -> bool:
         """Return whether the level is NONE and all `values` leave it at NONE."""
-        if self.level or self.lowest == math.inf:  # an alarm without a threshold stays quiet
+        if self.level or self.lowest == math.inf:  # an alarm without a threshold never changes its level
             return not self.level
         return float(values.max(initial=-math.inf)) < self.lowest
 
@@ -142,7 +144,8 @@ class _Model:
     def add(self, stamp_ns: int, x: float, y: float) -> list[tuple[int, float]]:
         """Add a pose of the model; return stamp [ns] and residual [m] of each measured pose that had to wait."""
         place = bisect_left(self._stamps_ns, stamp_ns)
-        # a stamp that is not the newest belongs to a motion that is computed again; the old motion is dropped
+        # if the stamp is not the newest, the motion is being computed again, so the old poses from this stamp on are
+        # dropped
         del self._stamps_ns[place:], self._q[place:]
         self._stamps_ns.append(stamp_ns)
         self._q.append((x, y))
@@ -182,9 +185,9 @@ class Alarms:
     thresholds
         Thresholds of each alarm, by the name of its quantity:
 
-        - `force` [N]: largest force of a pair since the previous publication, apart from advances without samples
+        - `force` [N]: largest force of a pair since the previous publication; advances without samples are ignored
         - `clearance` [m]: the larger of the horizontal and the vertical clearance
-        - `clearance_rate` [m/s]: growth rate of this clearance over `RATE_SPAN_NS`
+        - `clearance_rate` [m/s]: growth rate of the larger clearance over `RATE_SPAN_NS`
         - `wear_rate` [m/s]: largest wear rate of a pad
         - `residual` [m]: distance of a measured pose from the model
     duration_s
@@ -196,14 +199,14 @@ class Alarms:
         self._duration_ns = round(duration_s * NS_PER_S)
         self._model = _Model() if "residual" in self.alarms else None
         self._clearances: deque[tuple[int, float]] = deque()
-        #: names of the alarms whose latched level was raised by the newest row or pose
+        #: names of the alarms with a latched level that the newest row or pose has raised
         self.raised: list[str] = []
 
     def feed(self, published: Published) -> Iterator[int]:
         """Update the alarms row by row, and yield the index of each row that changes a level.
 
-        While the generator is paused, the alarms have the levels at the yielded row. Rows that were computed without a
-        sample are skipped.
+        While the generator is paused at a row, the alarms have the levels at this row. Rows that were computed without
+        a sample are skipped.
         """
         if len(published.rows) > 1 and self._feed_quiet(published):
             return
@@ -247,9 +250,9 @@ class Alarms:
         return self._model is not None
 
     def _feed_quiet(self, published: Published) -> bool:
-        """Update the alarms with many rows at once and return True, provided that no row can change a level.
+        """Update the alarms with many rows together and return True if no row can change a level.
 
-        Otherwise return False and change nothing.
+        If a row might change a level, return False and change nothing.
         """
         rows, slow = published
         growth = self.alarms.get("clearance_rate")
@@ -310,7 +313,7 @@ class Alarms:
 
     @property
     def worst(self) -> Level:
-        """The highest level of all alarms, including latched levels."""
+        """Highest present or latched level of all alarms."""
         return max((max(levels) for levels in self.levels.values()), default=Level.NONE)
 
     def acknowledge(self) -> list[str]:

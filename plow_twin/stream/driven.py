@@ -61,11 +61,13 @@ class Following(Driven, Protocol):
 
     #: number of poses and estimates added so far
     added: int
-    #: whether a row that is published alone is returned before its intervals are computed, which `catch_up` does later
+    #: whether a row that is published alone is returned before its intervals are computed; `catch_up` computes them
     defers: bool
 
     def catch_up(self) -> None:
-        """Finish the deferred computation for the newest row; every other method does this first."""
+        """Finish the deferred computation for the newest row. Each method except this one finishes the computation
+        first.
+        """
 
     def add_pose(self, t: float, q: ArrayLike, known: float = ...) -> None:
         """Add a pose `q`, shape (3,), measured at model time `t` in s; a component that was not measured is NaN.
@@ -83,7 +85,7 @@ class Following(Driven, Protocol):
         """The estimate (JSON) that the twin follows; empty while it follows the prior."""
 
     def follow_estimate(self, known: str) -> None:
-        """Continue from the present state with the estimate `known`, a value of the property `known`."""
+        """Continue from the present state with the estimate `known` (JSON), as the property `known` returns it."""
 
     def follow_parameters(self) -> None:
         """Continue as a single twin from the state of the median twin, without corrections by poses."""

@@ -1,7 +1,7 @@
 """The driver, which feeds a session with the samples of a live stream and advances it while no samples arrive.
 
-An *intake* accepts or rejects each sample. During a *silence*, which is a stretch without samples, the model follows
-the steady clock.
+An *intake* accepts or rejects each sample. A time without samples is called a *silence*. During a silence, the model
+follows the steady clock.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ from plow_twin.stream.steps import Steps
 #: Stamp [ns] and wrench (Fx, Fy [N], M [N m]) of a sample that has arrived.
 Arrival = tuple[int, tuple[float, float, float]]
 
-#: Largest model time [ns] by which one call advances during a silence.
+#: Longest model time [ns] by which a single call of `silence` advances the model.
 _LARGEST_HOLD_NS: Final = NS_PER_S
-#: Longest time between two checks for silence [ns], so that a changed policy soon has an effect.
+#: Longest time [ns] between two checks for a silence, which is short so that a changed policy soon has an effect.
 _LONGEST_QUIET_NS: Final = NS_PER_S // 10
 #: Largest number of resets by jumps of the clock within `_RESET_WINDOW_NS`. Without this limit, two senders with
 #: different clocks would reset the model again and again.
@@ -72,13 +72,13 @@ class Policy:
     Attributes
     ----------
     excitation_timeout_s : float
-        Time without a sample [s] after which the model follows the steady clock. The model stays behind the clock by
-        this time, so that a sample with a smaller delay can still be used.
+        Time without a sample [s] after which the model follows the steady clock. The model lags behind the clock by
+        `excitation_timeout_s`, so that a sample with a smaller delay can still be used.
     hold : str
         With `hold`, the last load acts during a silence. With `zero`, the load falls to zero within one call of
         `Driver.silence`.
     hold_limit_s : float
-        Further time without a sample [s] after which the model stands still.
+        Time without a sample [s], counted from the end of `excitation_timeout_s`, after which the model stands still.
     failure_limit : int
         Number of consecutive failed advances after which the model is reset (see `Failures.wants_restart`); 0: never.
     """
@@ -92,8 +92,8 @@ class Policy:
 class Driver:
     """Feed a session from live events and return the publications.
 
-    The driver reads no clock. The argument `now_ns` is the time of a steady clock; stamps are times of the samples'
-    clock. With `every_sample`, each advance is published; otherwise only `due` publishes.
+    The driver reads no clock. The argument `now_ns` is the time of a steady clock, while stamps are times of the
+    samples' clock. If `every_sample` is set, each advance is published. If not, only `due` publishes.
     """
 
     def __init__(self, session: Session, intake: Intake, policy: Policy, *, every_sample: bool = True) -> None:
@@ -122,13 +122,14 @@ class Driver:
         #: stamp up to which the model time is counted in `real_time` [ns]
         self._counted_ns: int | None = None
         self._zeroed = False
-        #: time spent inactive [ns], by which the model lags behind the node's clock under the scene's own loads
+        #: time that the node has been inactive [ns]; under the scene's own loads, the model lags behind the node's
+        #: clock by it
         self._behind_ns = 0
         self._resumed = False
 
     @property
     def policy(self) -> Policy:
-        """The settings for silences and failures; a new policy takes effect at once."""
+        """The settings for silences and failures. A changed policy takes effect at once."""
         return self._policy
 
     @policy.setter
@@ -169,7 +170,7 @@ class Driver:
         3).
 
         Plausible samples are applied together and yielded as a `Series`. The caller must journal and publish the series
-        before it requests the next item. All other samples are processed as in `samples`.
+        before it requests the next item. A sample that needs more checks is processed as in `samples`.
         """
         run: list[Sample] = []
         goes_on = self.intake.go_on(stamps, wrench)
@@ -212,10 +213,11 @@ class Driver:
     ) -> Iterator[Published]:
         """Judge a sample and append it to `run`, a list of samples that will be applied together.
 
-        The samples already in `run` are applied first if the new sample cannot be judged or applied with them.
+        If the new sample cannot be judged or applied together with the samples in `run`, the samples in `run` are
+        applied first.
         """
         late = bool(run) and self._is_late(run[0])
-        # whether a stamp that does not rise is late or a jump back can be judged only after `run` has been applied
+        # if the stamp does not rise, `run` must be applied before the sample can be judged as late or as a jump back
         if run and not late and stamp_ns <= run[-1].stamp_ns:
             yield from self._use(run, now_ns)
             late = False
@@ -273,9 +275,10 @@ class Driver:
         return max(0, min(left_ns, _LONGEST_QUIET_NS))
 
     def clock_tick(self, stamp_ns: int, now_ns: int) -> Published:
-        """Advance under the scene's own loads to the time `stamp_ns` of the node's clock minus the time spent inactive.
+        """Advance under the scene's own loads to `stamp_ns` (node's clock) minus the time that the node has been
+        inactive.
 
-        The first call after `resume` determines the time spent inactive and does not advance the model.
+        The first call after `resume` measures how long the node has been inactive. It does not advance the model.
         """
         reached_ns = self.session.stamp_ns
         if reached_ns is None:
@@ -300,8 +303,8 @@ class Driver:
     def travel(self, stamp_ns: int, speed_m_s: float) -> None:
         """Apply a travel speed along the face [m/s] from its stamp on; the sign gives the direction.
 
-        A stamp that is more than `jump_forward_s` ahead of the model, or older than all stored states, must come from
-        another clock. The speed then takes effect at once and is counted in `travel_misplaced`.
+        A stamp that is more than `jump_forward_s` ahead of the model, or older than all stored states, must come from a
+        different clock. In this case, the speed takes effect at once and is counted in `travel_misplaced`.
         """
         reached_ns, oldest_ns = self.session.stamp_ns, self.session.history.oldest_ns
         if reached_ns is not None:
@@ -331,7 +334,9 @@ class Driver:
         return snapshot
 
     def restore(self, stamp_ns: int, snapshot: Snapshot) -> None:
-        """Return to the motion of a snapshot; the next sample, with any stamp, marks the model time of the snapshot."""
+        """Return to the motion of a snapshot. The stamp of the next sample corresponds to the model time of the
+        snapshot.
+        """
         self.failed.end()
         self.session.apply(Restore(stamp_ns, snapshot.data))
         self._begin_again()
@@ -339,7 +344,7 @@ class Driver:
         self.clock.restart()
 
     def set_model(self, stamp_ns: int, changes: Mapping[str, float]) -> None:
-        """Continue with changed numbers of the scene; a number without a key in `changes` has the value of the scene
+        """Continue with changed numbers of the scene. A number without a key in `changes` has the value of the scene
         file.
 
         Raises
@@ -381,7 +386,9 @@ class Driver:
         self.clock.restart()
 
     def resume(self, now_ns: int) -> None:
-        """Continue after a pause of the node; silence is measured from now on, and the model leaves out the pause."""
+        """Continue after a pause of the node. A silence is measured from `now_ns`, and the model does not advance by
+        the pause.
+        """
         self._received_ns = now_ns
         self._resumed = True
 

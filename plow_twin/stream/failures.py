@@ -24,7 +24,7 @@ class Failures:
         #: whether the motion has restarted since the newest stretch began
         self.restarts = False
         self._in_a_row = 0
-        #: length of the stretch before the newest restart [ns]
+        #: length [ns] of the stretch that led to the newest restart
         self._before_ns = 0
         self._restarted_ns: int | None = None
 
@@ -50,11 +50,11 @@ class Failures:
         self._in_a_row = 0
 
     def wants_restart(self, limit: int) -> bool:
-        """Return whether the model should restart; it never restarts if `limit` is 0.
+        """Return whether the model should restart. If `limit` is 0, the model never restarts.
 
-        The first restart comes after `limit` consecutive failed advances. If the model fails again soon after a
-        restart, the next restart waits until the new stretch is twice as long as the stretch before. The number of
-        restarts therefore grows only with the logarithm of time.
+        The first restart comes after `limit` consecutive failed advances. If the model fails soon after a restart, the
+        next restart waits until the new stretch is twice as long as the previous stretch. The number of restarts
+        therefore grows only with the logarithm of time.
         """
         if not 0 < limit <= self._in_a_row:
             return False

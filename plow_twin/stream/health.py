@@ -18,7 +18,7 @@ class DurationHistogram:
     """Histogram of durations from 1 us to 100 s; the width of the bins limits the error of a quantile to 2.4 %."""
 
     def __init__(self) -> None:
-        # a list, because incrementing an item of a NumPy array takes ten times as long
+        # a list is used, because incrementing an item of a NumPy array takes ten times as long
         self._counts = [0] * _BINS
         self._counted = np.zeros(len(self._counts), np.int64)
         self.largest_s = 0.0
@@ -29,8 +29,8 @@ class DurationHistogram:
         return sum(self._counts)
 
     def add(self, duration_s: float, count: int = 1) -> None:
-        """Count a duration [s] `count` times; durations beyond the range go to the nearest bin, negative ones are
-        ignored.
+        """Count a duration [s] `count` times. A duration outside the range is counted in the nearest bin. A negative
+        duration is ignored.
         """
         if not duration_s >= 0.0:
             return

@@ -1,4 +1,4 @@
-"""The last seconds of a session, stored so that the motion can be computed again with a late sample.
+"""Storage of the last seconds of a session, so that the motion can be computed again with a late sample.
 
 A history divides the stored time into *cells*. A session that applies samples one by one takes a snapshot at the first
 sample of each cell. A session that applies many samples at once takes fewer snapshots, but records the same stamps.
@@ -33,13 +33,13 @@ class History:
         self._snapshots: list[tuple[int, bytes]] = []
         #: stamp of the first sample of each cell [ns]
         self._kept_ns: list[int] = []
-        #: largest stamp that `_kept_ns` has contained [ns]; after `rewind`, old stamps are dropped only beyond this
-        #: stamp
+        #: largest stamp [ns] that `_kept_ns` has contained; after `rewind`, old stamps are dropped only if newer stamps
+        #: follow
         self._newest_kept_ns: int | None = None
         self._samples: list[Sample] = []
         self._stamps_ns: list[int] = []
         self._travels: list[Travel] = []
-        #: stamps of the first samples after held loads [ns]
+        #: stamps [ns] of samples that follow a held load
         self._resumed_ns: list[int] = []
         #: applied samples as arrays, which `_make_samples` converts to `Sample` objects when they are needed
         self._later: deque[tuple[NDArray[np.int64], NDArray[np.float64]]] = deque()
@@ -151,7 +151,7 @@ class History:
         self._travels.insert(place, travel)
 
     def add_snapshot(self, stamp_ns: int, data: bytes, *, kept: bool = True) -> None:
-        """Add a snapshot at `stamp_ns`; with `kept`, the stamp also counts as the first stamp of a cell."""
+        """Add a snapshot at `stamp_ns`. If `kept` is set, the stamp is recorded as the first stamp of a cell."""
         if not self._span_ns:
             return
         if not self._snapshots or self._snapshots[-1][0] < stamp_ns:
@@ -168,15 +168,15 @@ class History:
     def correction_limit_ns(self, stamp_ns: int) -> int:
         """Return the earliest stamp [ns] at which a correction may begin if it inserts a sample at `stamp_ns`.
 
-        The samples that `rewind` returns do not contain the held load before a sample. A correction that began before
-        the held load would therefore lose the held load.
+        A load can be held before a sample, and the samples that `rewind` returns do not contain the held load. A
+        correction must therefore not begin before a held load.
         """
         place = bisect_left(self._resumed_ns, stamp_ns)
         return max(self._resumed_ns[place - 1] if place else 0, self.oldest_ns or 0)
 
     def rewind(self, stamp_ns: int) -> tuple[bytes, list[Sample], list[Travel]]:
-        """Go back to the last snapshot before `stamp_ns`; return the snapshot, and the samples and speeds dropped after
-        it.
+        """Go back to the last snapshot before `stamp_ns` and drop all later data. Return the snapshot, and the dropped
+        samples and travel speeds.
         """
         self._make_samples()
         while self._snapshots[-1][0] >= stamp_ns:
@@ -192,7 +192,7 @@ class History:
 
 
 class RecentStamps:
-    """Stamps of measurements that may arrive up to `span_s` [s] late, and for which no motion is computed again."""
+    """Stamps of measurements that may arrive up to `span_s` [s] late and need no repeated computation of the motion."""
 
     def __init__(self, span_s: float) -> None:
         self._span_ns = round(span_s * 1e9)

@@ -1,7 +1,7 @@
 """The decision whether an arriving sample is used, and counts of unused samples by reason.
 
-A stamp *jumps* if it differs from the stamps before by more than late or missing samples can explain. The cause is
-usually a step of the sender's clock.
+A stamp *jumps* if it differs from the previous stamps by more than late or missing samples can explain. A jump is
+usually caused by a step of the sender's clock.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Verdict(Enum):
     WORKED_IN = "worked_in"
     #: a value or its rate of change exceeds the `Limits`
     IMPLAUSIBLE = "implausible"
-    #: the stamps have jumped too often, so this jump does not reset the model
+    #: the stamps have jumped too often, so a further jump does not reset the model
     UNSTEADY = "unsteady"
     #: the next sample did not confirm the jump of the stamp, so the stamp was wrong
     STRAY = "stray"
@@ -83,9 +83,10 @@ class Intake:
     jump_forward_s
         Largest time [s] by which a stamp may be ahead of the model; a later stamp is a jump.
     expected_rate_hz
-        Expected rate of the samples [Hz], from which missing samples are counted; with 0, they are not counted.
+        Expected rate of the samples [Hz], from which the number of missing samples is computed. With 0, missing samples
+        are not counted.
     limits
-        Largest plausible values and rates of change; with None, every finite value is plausible.
+        Largest plausible values and rates of change. With None, every finite value is plausible.
     on_unused
         Function that receives the reason, stamp [ns] and values of each unused sample.
     """
@@ -110,7 +111,8 @@ class Intake:
         self._newest_ns: int | None = None
         self._newest_values: Sequence[float] = ()
         self._before_jump_ns: int | None = None
-        #: whether the last sample continued the stamps from before a jump, so that the stamps since the jump were wrong
+        #: whether the last sample continued the stamps before a jump, which shows that the stamps since the jump were
+        #: wrong
         self.returned = False
         #: number of missing samples before the last jump
         self._missing_before = 0
@@ -124,8 +126,8 @@ class Intake:
 
     @property
     def missing(self) -> int:
-        """Number of missing samples: the number expected from the first to the newest stamp, minus the samples
-        received.
+        """Number of missing samples, which is the expected number between the first and the newest stamp minus the
+        received number.
         """
         if self._newest_ns is None or self.expected_rate_hz <= 0.0:
             return self._missing_before
@@ -158,8 +160,8 @@ class Intake:
         history
             Stamps of earlier samples, among which late samples are inserted.
         may_reset
-            Whether a jump may reset the model now. A jump that continues the stamps from before the last jump always
-            resets the model. Otherwise a single wrong stamp could exclude all correct stamps.
+            Whether a jump may reset the model. A jump that returns to the stamps before the last jump always resets the
+            model. Without this exception, a single wrong stamp could exclude all correct stamps.
         """
         verdict = self._judge(stamp_ns, values, reached_ns, history)
         self.returned = verdict.resets and self._goes_on_from_before(stamp_ns)
@@ -171,7 +173,7 @@ class Intake:
             return verdict
         if self._newest_ns is None or verdict.resets:
             self._missing_before, self._first_ns, self._since_first = self.missing, stamp_ns, 0
-            # after a return, the newest stamp is known to be wrong, so no later sample may continue from it
+            # after a return, the newest stamp is known to be wrong, so it is not stored as a stamp to return to
             self._before_jump_ns = None if self.returned else self._newest_ns
         self._since_first += 1
         if self._newest_ns is None or verdict.resets or stamp_ns > self._newest_ns:
@@ -186,14 +188,16 @@ class Intake:
         return not self.near(stamp_ns, newest_ns, reached_ns)
 
     def near(self, stamp_ns: int, newest_ns: int, reached_ns: int | None = None) -> bool:
-        """Return whether a stamp is no jump relative to the stamp `newest_ns` and to the time `reached_ns` of the
+        """Return whether a stamp neither jumps relative to `newest_ns` nor relative to `reached_ns`, the time of the
         model.
         """
         ahead_ns = stamp_ns - (newest_ns if reached_ns is None else max(newest_ns, reached_ns))
         return ahead_ns <= self.jump_forward_s * NS_PER_S and newest_ns - stamp_ns <= self.jump_back_s * NS_PER_S
 
     def goes_on(self, stamp_ns: int, values: Sequence[float], reached_ns: int) -> bool:
-        """Return whether a quick check shows that a sample will be accepted; otherwise `jumps` and `judge` decide."""
+        """Return whether a quick check shows that a sample will be accepted. If it does not, `jumps` and `judge`
+        decide.
+        """
         newest_ns = self._newest_ns
         if newest_ns is None or self.limits is None:
             return False
@@ -203,7 +207,7 @@ class Intake:
         return self.limits.keep(self._newest_values, values, (stamp_ns - newest_ns) * 1e-9)
 
     def go_on(self, stamps_ns: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return `goes_on` of each sample relative to the sample before, shape (n-1,), for n samples."""
+        """Return the result of `goes_on` for the second and each further of n samples, shape (n-1,)."""
         if self.limits is None:
             return np.zeros(len(stamps_ns) - 1, bool)
         ahead_ns = np.diff(stamps_ns)
@@ -231,7 +235,7 @@ class Intake:
         self._on_unused(verdict, stamp_ns, values)
 
     def restart(self) -> None:
-        """Forget the newest stamp, so that the next sample is treated as the first sample; the counts do not change."""
+        """Forget the newest stamp, so that the next sample is treated as the first sample. The counts do not change."""
         self._missing_before = self.missing
         self._newest_ns = None
 
@@ -254,7 +258,8 @@ class Intake:
             return Verdict.JUMP_FORWARD
         if ahead_ns > 0:
             return Verdict.IMPLAUSIBLE if self._too_fast(stamp_ns, values) else Verdict.ACCEPTED
-        # the newest stamp decides here, because during a silence the model may have moved ahead of the stamps
+        # the stamp is compared with the newest stamp, because during a silence the model may have moved ahead of the
+        # stamps
         if newest_ns - stamp_ns > self.jump_back_s * NS_PER_S:
             return Verdict.JUMP_BACK
         if history is not None and history.oldest_ns is not None and stamp_ns > history.oldest_ns:

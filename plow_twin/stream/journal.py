@@ -28,7 +28,7 @@ class Sample:
 class Hold:
     """Advance to `stamp_ns` with the load held at its last value.
 
-    If the loads of the scene are the excitation, these loads act instead.
+    If the loads of the scene are the excitation, the loads of the scene act.
     """
 
     stamp_ns: int
@@ -68,7 +68,7 @@ class SetWear:
 
 @dataclass(frozen=True)
 class SetModel:
-    """Change numbers of the scene, but not pose, rates and wear; contacts start without history.
+    """Change numbers of the scene. Pose, rates and wear do not change. Contacts start without history.
 
     `changes` is a JSON object with all numbers that differ from the scene of the run, by their keys in the scene file.
     """
@@ -79,8 +79,8 @@ class SetModel:
 
 @dataclass(frozen=True)
 class Restore:
-    """Continue from the motion in the snapshot `data` with the present wear; the next stamp is at the snapshot's
-    time.
+    """Continue from the motion in the snapshot `data` with the present wear. The next stamp is at the time of the
+    snapshot.
     """
 
     stamp_ns: int
@@ -100,7 +100,7 @@ class Failed:
     """Report that `advances` advances up to `stamp_ns` failed; the entry has no effect on the motion.
 
     Consecutive failures form a stretch, which began at `since_ns`. The first failure of a stretch has an entry of its
-    own. A second entry, at the end of the stretch, counts all further failures.
+    own. A second entry at the end of the stretch counts the second and all later failures.
     """
 
     stamp_ns: int
@@ -129,7 +129,7 @@ class Parameter:
 class Pose:
     """Measured pose of the head (x, y [m], theta [rad]), an input of the estimate.
 
-    `deviation` contains the standard deviations [m, m, rad] that were sent with the pose, or is empty.
+    `deviation` contains the standard deviations [m, m, rad] that the sender has stated, or is empty.
     """
 
     stamp_ns: int
@@ -188,10 +188,11 @@ class Estimated:
     samples, poses : int
         Numbers of load samples and of poses in the window.
     guess : tuple of float
-        Starting point of the fit; empty if the fit began with a search.
+        Starting point of the fit. It is empty if the fit began with a search.
     shift : tuple of float, length 6
-        Shifts [m] that are added to the model's clearances from this entry on. The first three are for the horizontal
-        clearance with wear, its 5 % quantile and its 95 % quantile. The last three are for the vertical clearance.
+        Shifts [m] that are added to the model's clearances from the time of this entry on. The first three shifts are
+        for the horizontal clearance with wear, its 5 % quantile and its 95 % quantile. The last three shifts are for
+        the vertical clearance.
     result : str
         The whole estimate (JSON).
     """

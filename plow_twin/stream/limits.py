@@ -15,7 +15,7 @@ from plow_twin.model.geometry import half_diagonal
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.scene import Scene
 
-#: Ratio of the largest plausible force to the sum of the scene's largest loads and the head's weight.
+#: Largest plausible force, divided by the sum of the scene's loads and the head's weight.
 _MARGIN: Final = 10.0
 #: Shortest time [s] in which a value may change by its largest magnitude; an impact lasts about a millisecond.
 _SHORTEST_S: Final = 1e-3
@@ -45,7 +45,7 @@ class Limits:
         `values` has the shape (n, k); `duration_s`, shape (n-1,), contains the times between the rows [s].
         """
         within = np.abs(values[1:]) <= np.array(self.largest)
-        with np.errstate(invalid="ignore"):  # inf - inf is NaN, and the comparison with NaN is False
+        with np.errstate(invalid="ignore"):  # inf - inf is NaN, and a comparison with NaN is False
             steady = np.abs(np.diff(values, axis=0)) <= np.array(self.fastest) * duration_s[:, None]
         return np.asarray((within & steady).all(axis=1))
 
@@ -58,9 +58,9 @@ class Limits:
 def pose_limits(scene: Scene, displacement: float = 0.0, rate: float = 0.0) -> Limits:
     """Return the limits of a pose (x, y [m], theta [rad]) and of its rates.
 
-    A `displacement` [m] of 0 is replaced by `largest_displacement`. A `rate` [m/s] of 0 is replaced by this
-    displacement per millisecond. The limit of an angle is half a turn, or infinite if the head is a block. The limit of
-    its rate is half a turn per millisecond.
+    If `displacement` [m] is 0, the result of `largest_displacement` is used. If `rate` [m/s] is 0, a change by the
+    largest displacement within a millisecond is allowed. The limit of an angle is half a turn, or infinite if the head
+    is a block. The limit of the angular rate is half a turn per millisecond.
     """
     displacement = displacement or largest_displacement(scene)
     rate = rate or displacement / _SHORTEST_S
@@ -75,7 +75,7 @@ def largest_displacement(scene: Scene) -> float:
 
 
 def value_limits(largest: float, rate: float = 0.0) -> Limits:
-    """Return the limits of a single value and its rate; with `rate` 0, a change by `largest` within 1 ms is allowed."""
+    """Return the limits of a value and its rate. If `rate` is 0, a change by `largest` within 1 ms is allowed."""
     return Limits((largest,), (rate or largest / _SHORTEST_S,))
 
 
@@ -84,9 +84,10 @@ def excitation_limits(
 ) -> Limits:
     """Return the limits of a load (Fx, Fy [N], M [N m]) and of its rates; a limit of 0 is derived from the scene.
 
-    The derived limit of a force is ten times the sum of all loads of the scene and the head's weight. For the moment,
-    this force is multiplied by half the frame's diagonal. Ten times the largest moment of the loads is added. The
-    derived rates allow a change by the limit within a millisecond.
+    The derived limit of a force is ten times the sum of all loads of the scene and the head's weight. The derived limit
+    of a moment is the sum of two terms. The first term is the limit of a force times half the frame's diagonal. The
+    second term is ten times the largest moment of the loads. The derived limits of the rates allow a change by the
+    limit of the value within a millisecond.
     """
     amplitude = compile_loads(scene.loads).largest()
     total = float(amplitude[:2].sum()) + scene.head.mass_kg * abs(scene.gravity.acceleration_m_s2)

@@ -1,7 +1,7 @@
 """Publications of the motion; each row summarises the motion since the previous row.
 
-The *window* is the motion since the previous publication. A *slow part* contains clearances and wear rates. Clearances
-and wear rates change slowly, so at most one publication in 0.1 s has a slow part. Publications depend on the journal
+The motion since the previous publication is called the *window*. Clearances and wear rates change slowly, so at most
+one publication in 0.1 s contains them. They form the *slow part* of a publication. Publications depend on the journal
 alone, so a replay gives bit-identical publications.
 """
 
@@ -47,9 +47,9 @@ SLOW: Final = np.dtype(
         ("wear_rate", "f8", (PAIR_COUNT,)),
     ]
 )
-#: Indices of the rows to publish if there is a single row.
+#: Indices of the published rows if a single row is added and published.
 THE_ONE: Final = np.zeros(1, np.int64)
-#: Indices of the rows to publish if no row is published.
+#: Indices of the published rows if no row is published.
 NONE: Final = np.zeros(0, np.int64)
 _NO_ROWS: Final = np.zeros(0, ROW)
 _NO_SLOW: Final = np.zeros(0, SLOW)
@@ -59,9 +59,10 @@ FOLLOWED_FIELDS: Final = (
 _MOTION: Final = ("t", "stamp_ns", "held", "q", "v", "penetration", "rate", "force", "wear_depth", *FOLLOWED_FIELDS)
 #: Fields that are checked for numbers that are not finite.
 _SUMMED: Final = ("q", "v", "penetration", "rate", "force", "impulse", "peak")
-#: Indices in `clearance` of the six numbers in `known_clearance`; an estimate shifts the same numbers.
+#: Indices in `clearance` of the six numbers in `known_clearance`. The shifts by an estimate are added to the same six
+#: numbers.
 _KNOWN: Final = np.array([0, len(_CLEARANCES), len(_CLEARANCES) + 1, 1, len(_CLEARANCES) + 2, len(_CLEARANCES) + 3])
-#: Number of rows allocated at once, which takes about as long as the allocation of a single row.
+#: Number of rows allocated together. The allocation takes about as long as the allocation of a single row.
 _STOCK: Final = 256
 
 
@@ -152,9 +153,8 @@ def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
     """Return the 5 % and 95 % quantiles of the wear depths under the prior of the wear coefficient, shape (8,) each
     [m].
 
-    The growth of a depth, without running-in, is assumed to be proportional to the wear coefficient k_s. This
-    approximation holds while the growth is small compared with the clearance. Without wear, both quantiles equal the
-    wear depth.
+    Running-in is neglected. The growth of a depth is assumed to be proportional to the wear coefficient k_s, which is
+    accurate while the growth is small compared with the clearance. Without wear, both quantiles equal the wear depth.
     """
     if scene.wear is None or scene.wear.coefficient_m2_n == 0.0:
         return wear_depth, wear_depth
@@ -172,7 +172,7 @@ class Outputs:
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._publish = scene, _publish()
-        #: the window, which includes the newest advance while `_waits` is 1
+        #: the window; it includes the newest advance if `_waits` is 1
         self._window = np.zeros(1, ROW)
         self._waits = 0
         self._stock = Stock()
@@ -187,21 +187,22 @@ class Outputs:
         self._shift: Array | None = None
 
     def set_shift(self, shift: Sequence[float]) -> None:
-        """Shift the published clearances and their quantiles by an estimate, from now on.
+        """Add the shifts of an estimate to the published clearances and their quantiles.
 
-        `shift` has 6 numbers [m]: three for the horizontal clearance, its 5 % and its 95 % quantile, and three for the
-        vertical clearance. A shift is not part of `state`, so the insertion of late samples does not change it.
+        `shift` contains six numbers [m]. The first three are for the horizontal clearance, its 5 % quantile and its 95
+        % quantile. The last three are for the vertical clearance. The shift is not part of `state`, so the insertion of
+        late samples does not change it.
         """
         values = np.zeros(len(CLEARANCE_NAMES))
         values[_KNOWN] = shift
         self._shift = values if values.any() else None
 
     def set_scene(self, scene: Scene) -> None:
-        """Use a scene with changed numbers from now on."""
+        """Use a scene with changed numbers for all later publications."""
         self._scene = scene
 
     def clear_shift(self) -> None:
-        """Publish the clearances of the model from now on, without a shift."""
+        """Publish the clearances of the model without a shift."""
         self._shift = None
 
     def add(self, rows: Rows, stamps: NDArray[np.int64], taken: NDArray[np.int64], *, held: bool = False) -> Published:
@@ -214,8 +215,8 @@ class Outputs:
         stamps : ndarray of int64, shape (n,)
             Stamps of the advances [ns].
         taken : ndarray of int64, shape (m,)
-            Rising indices of the advances after which to publish. If all advances before a publication have failed, its
-            stamp is 0.
+            Rising indices of the advances after which to publish. If all advances of a publication have failed, the
+            stamp of the publication is 0.
         held : bool
             Whether the advances were computed without samples.
 
@@ -239,10 +240,10 @@ class Outputs:
         return Published(rows, self._slow(rows))
 
     def correct(self, stamp_ns: int, oldest_ns: int) -> int:
-        """Register that the motion will be computed again from `stamp_ns`, and mark the window as corrected.
+        """Register that the motion from `stamp_ns` on will be computed again, and mark the window as corrected.
 
-        Return the earliest stamp of all such calls since the previous publication. Calls with stamps up to `oldest_ns`,
-        the age limit of late samples, no longer count.
+        Return the earliest `stamp_ns` of all calls since the previous publication. A call is ignored if its stamp does
+        not exceed `oldest_ns`, the age limit of late samples.
         """
         window = self._window[0]
         if not window["corrected"] or self._corrected_ns <= oldest_ns:
@@ -256,7 +257,7 @@ class Outputs:
     def begin_correction(self) -> None:
         """Restart impulses and peaks at the stamp that `correct` returned.
 
-        The newest unpublished advance before this stamp, if any, is still published if all later advances fail.
+        If all later advances fail, the newest unpublished advance before the stamp is published.
         """
         self._clear()
         if self._before is not None:
@@ -343,8 +344,8 @@ class Outputs:
     def modelled(self, wear_depth: Array) -> Array:
         """Return the clearances of the model without a shift, shape (6,) [m].
 
-        The first three are the horizontal clearance, its 5 % and its 95 % quantile; the others are for the vertical
-        clearance.
+        The first three numbers are the horizontal clearance, its 5 % quantile and its 95 % quantile. The last three
+        numbers are for the vertical clearance.
         """
         middle = clearances(self._scene, wear_depth)
         low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
@@ -362,8 +363,8 @@ class Outputs:
         self._clear()
         self._window["makes"] = parts[0].view(np.int64)
         self._window["impulse"], self._window["peak"] = parts[1:3]
-        # the state does not contain `measured_peak`, the peak over advances with samples; the peak over all advances
-        # replaces it
+        # the state does not contain `measured_peak`, the peak over advances with samples, so the peak over all advances
+        # is used
         self._window["measured_peak"] = parts[2]
         self._slow_wear_depth = parts[3].copy()
         slow_ns = int(np.frombuffer(data, np.int64, 1, offset=8 * _STATE_SIZE)[0])

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-#: Silence of the followed sender [ns] after which `OneSender` follows another sender.
+#: Time [ns] without a message of the followed sender after which `OneSender` may follow a different sender.
 _SILENT_NS = 10_000_000_000
-#: Largest number of senders whose next message number is stored; if there are more, the oldest entry is dropped.
+#: Largest number of senders for which the next message number is stored. If there are more, the oldest entry is
+#: dropped.
 _MOST_SENDERS = 64
 
 
@@ -21,7 +22,7 @@ class Senders:
         self.followed: bytes | None = None
         #: number of lost samples of the followed sender
         self.lost = 0
-        #: number of unused samples of other senders
+        #: number of samples from senders that are not followed
         self.ignored = 0
         self._next: dict[bytes, int] = {}
         self._before: frozenset[bytes] = frozenset()
@@ -29,7 +30,7 @@ class Senders:
         self._other: bytes | None = None
 
     def start(self, present: Collection[bytes]) -> None:
-        """Register the senders that exist now; messages that these senders have already sent do not count as lost."""
+        """Register the senders that exist at the start. Messages that they have already sent do not count as lost."""
         self._before = frozenset(present)
 
     def start_late(self, sender: bytes) -> None:
@@ -50,7 +51,7 @@ class Senders:
             self.followed = sender
         followed = sender == self.followed
         if followed:
-            # a message that arrives out of order was counted as lost before
+            # a message that arrives out of order was counted as lost, so it is subtracted
             self.lost += number - expected if number >= expected else -1 if self.lost else 0
         else:
             self.ignored += count
@@ -72,7 +73,9 @@ class Senders:
             self._other = None
 
     def switch(self) -> bool:
-        """Follow the other sender that sent most recently; return False if there is no other sender."""
+        """Follow the sender, of those not followed, that sent most recently; return False if there is no such
+        sender.
+        """
         if self._other is None:
             return False
         self._other, self.followed = self.followed, self._other
@@ -80,8 +83,8 @@ class Senders:
 
 
 class OneSender:
-    """Follow the sender of the first message until it disappears or sends nothing for 10 s while another sender
-    sends.
+    """Follow the sender of the first message until it disappears, or until it sends nothing for 10 s while a second
+    sender sends.
     """
 
     def __init__(self) -> None:
