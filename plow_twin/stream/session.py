@@ -1,11 +1,12 @@
-"""The session, which computes the motion deterministically from journal entries, in the live node and in a replay.
+"""The session, which computes the motion from journal entries. The computation is deterministic, so that a replay
+repeats the motion of the live node.
 
 Terms of this module:
 
 - An *advance* moves the model to a stamp, usually the stamp of a sample. Its result is a *row*.
 - The load is *held* while the motion advances without samples.
-- A sample is *late* if the model has already advanced beyond its stamp. The session then goes back to a snapshot in its
-  *history*, inserts the sample, and computes the motion again.
+- A sample is *late* if the model has already advanced beyond its stamp. For a late sample, the session goes back to a
+  snapshot in its *history*, inserts the sample, and computes the motion again.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ DIGEST_INTERVAL: Final = 100
 _HEADER: Final = struct.Struct("<?qqq?dq")
 _TRAVEL: Final = struct.Struct("<qd")
 #: Largest time [ns] by which a pose may be ahead of the model. If a bag is played fast, poses arrive long before the
-#: samples with the same stamps. A pose beyond the limit must come from another clock.
+#: samples with the same stamps. A pose beyond the limit must come from a different clock.
 _AHEAD_NS: Final = 3_600_000_000_000
 _WEAR_SIZE: Final = 8 * PAIR_COUNT
 _NO_LOAD: Final = np.zeros((1, 3))
@@ -79,7 +80,7 @@ def _ignore(entry: Entry) -> None: ...
 
 
 class _Measured(NamedTuple):
-    """A pose or an estimate that was passed to the twin, with the stamp that the model had reached at that time [ns].
+    """A pose or an estimate, with the stamp [ns] that the model had reached when it was passed to the twin.
 
     `number` counts the poses and estimates of the twin. The entry has no effect before model time `known` [s], even if
     the session goes back to an earlier time.
@@ -93,9 +94,7 @@ class _Measured(NamedTuple):
 
 
 class Applied(NamedTuple):
-    """Result of applying samples: a row for each sample, publications, digests, and counts of failed and late
-    samples.
-    """
+    """Result of applying samples, such as a row for each sample, publications and digests."""
 
     rows: Rows
     published: Published
@@ -156,7 +155,7 @@ class Session:
     pads do not wear. If the scene itself defines the loads, a `Hold` only advances the time.
 
     To insert a late sample, the session goes back to the newest snapshot before its stamp. From there it computes the
-    motion up to the newest sample again. Motion beyond the newest sample is dropped.
+    motion up to the newest sample again. Motion after the newest sample is dropped.
 
     Parameters
     ----------
@@ -167,7 +166,8 @@ class Session:
         Stamp of model time 0 [ns]; None for the first stamp.
     on_entry
         Function that receives each entry before the session applies it, and each digest after its advance. An entry
-        with a number that is not finite is also passed on, before the twin refuses it. A replay refuses this entry too.
+        with a number that is not finite is passed to the function before the twin refuses the entry. In a replay, the
+        twin refuses the same entry.
     rollback_span_s
         Largest age of a late sample relative to the newest sample [s]; with 0, late samples are refused.
     wear_depth
@@ -186,7 +186,7 @@ class Session:
         self._use(twin)
         #: poses and estimates since the oldest snapshot
         self._measured: deque[_Measured] = deque()
-        #: number of poses that were too far ahead of the model, or exceeded the number `MOST_MEASURED`
+        #: number of poses that were dropped, because they were too far ahead of the model or more than `MOST_MEASURED`
         self.poses_dropped = 0
         self._scene = twin.scene
         #: changed numbers of the scene: new value by key
@@ -296,10 +296,10 @@ class Session:
         return None
 
     def parts(self, samples: Sequence[Sample], *, each: bool = False) -> Iterator[Sequence[Sample]]:
-        """Yield parts of the samples for `apply_samples`; each part must be applied before the next part is requested.
+        """Yield parts of the samples for `apply_samples`. Each part must be applied before the next part is requested.
 
-        A late sample and all samples after it form one part. Any other part ends at the next digest, or after one
-        sample if `each` is set.
+        A late sample and all samples after it form one part. A part without a late sample ends at the next digest or,
+        if `each` is set, after one sample.
 
         Raises
         ------
@@ -319,11 +319,11 @@ class Session:
             samples = samples[count:]
 
     def apply_samples(self, samples: Sequence[Sample], *, each: bool = False) -> Applied:
-        """Emit and apply a part of samples that `parts` has yielded; the motion does not depend on the division into
-        parts.
+        """Emit and apply a part of the samples that `parts` has yielded.
 
-        With `each`, each sample is published, but samples inserted late are published together. Otherwise `outputs`
-        collects the samples for the next publication.
+        The motion does not depend on the division into parts. If `each` is set, each sample is published, except that
+        samples inserted late are published together. If `each` is not set, `outputs` collects the samples for the next
+        publication.
 
         Raises
         ------
@@ -355,7 +355,7 @@ class Session:
         Parameters
         ----------
         stamps : ndarray of int64, shape (n,)
-            Rising stamps [ns], of which the first is not late.
+            Rising stamps [ns]. The first stamp must not be late.
         wrench : ndarray, shape (n, 3)
             Finite loads Fx, Fy [N] and M [N m].
         each : bool
@@ -400,7 +400,7 @@ class Session:
         Parameters
         ----------
         stamps, wrench : ndarray, shapes (n,) and (n, 3)
-            Rising or equal stamps [ns], of which the first is not late, and the loads Fx, Fy [N] and M [N m].
+            Stamps [ns] that do not fall, and the loads Fx, Fy [N] and M [N m]. The first stamp must not be late.
         rows : ndarray of `ROW`, shape (n,), or None
             Array that receives the rows; with None, rows are neither computed nor published.
         taken : ndarray of int64
@@ -430,7 +430,7 @@ class Session:
         taken: NDArray[np.int64],
         digest_after: NDArray[np.int64],
     ) -> Applied:
-        """Advance in parts, which end at the stamps of waiting travel speeds and after the first sample after a held
+        """Advance in parts. A part ends at the stamp of a waiting travel speed, or after a sample that follows a held
         load.
         """
         if not np.isfinite(wrench).all():
@@ -444,7 +444,8 @@ class Session:
                 continue
             if travel is not None:
                 end = int(np.searchsorted(stamps, travel.stamp_ns, side="right"))
-            # a snapshot follows the first sample after a held load, because corrections of later motion begin there
+            # a snapshot is taken after the first sample that follows a held load, because corrections of later motion
+            # begin there
             if resumed:
                 end = begin + 1
             here = slice(begin, end)
@@ -592,7 +593,8 @@ class Session:
     def _work_in(self, stamp_ns: int, late: Sequence[Sample], *travels: Travel) -> Applied:
         """Go back to a state before a late stamp, and compute the motion again with late samples and travel speeds.
 
-        The next publication covers the motion from the earliest late stamp since the previous publication.
+        The next publication covers the motion from the earliest late stamp that was inserted since the previous
+        publication.
         """
         corrected_ns = self.outputs.correct(stamp_ns, self.history.correction_limit_ns(stamp_ns))
         again = self._rewind(corrected_ns, *travels)
@@ -613,9 +615,8 @@ class Session:
         self._restore(data)
         self._advances, self.outputs.slow_before = advances, slow
         if self.following is not None:
-            # A pose or estimate has no effect before the time at which it became known. Otherwise the motion would
-            # depend
-            # on how far the session goes back.
+            # A pose or an estimate has no effect before the time at which it became known. Without this rule, the
+            # motion would depend on how far the session goes back.
             measured, self._measured = self._measured, deque()
             for one in measured:
                 if one.number > self.following.added:
@@ -747,7 +748,7 @@ class Session:
         self._forget()
 
     def _changed_twin(self, changes: Mapping[str, float]) -> Driven:
-        """Return a twin with changed numbers of the scene.
+        """Return a twin of the scene with changed numbers.
 
         Raises
         ------

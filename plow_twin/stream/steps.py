@@ -1,4 +1,4 @@
-"""Distinction between a step of the sender's clock and a single wrong stamp, which is called *stray*."""
+"""Distinction between a step of the sender's clock and a *stray* stamp, which is a single wrong stamp."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ Timed = tuple[int, tuple[float, float, float], int]
 
 
 class Steps:
-    """Delay a sample whose stamp jumps until the next sample confirms the jump, so that a stray stamp has no effect."""
+    """Delay a sample with a jump of the stamp until the next sample confirms the jump, so that a stray stamp has no
+    effect.
+    """
 
     def __init__(self, intake: Intake) -> None:
         self._intake = intake
@@ -55,9 +57,7 @@ class Steps:
         return ()
 
     def unopposed(self, now_ns: int, silence_ns: int) -> Timed | None:
-        """Return the delayed sample if no other sample has arrived for `silence_ns`; the sample is no longer
-        delayed.
-        """
+        """Return the delayed sample and end its delay if no further sample has arrived for `silence_ns`."""
         jumped = self._jumped
         if jumped is None or now_ns - jumped[2] <= silence_ns:
             return None

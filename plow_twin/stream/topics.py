@@ -46,8 +46,8 @@ class Topic:
     content : str
         Content of a message, with units.
     cumulative : bool
-        Whether a message depends on the previous publication. After a lost message, a replay cannot compare such a
-        topic.
+        Whether a message depends on the previous publication. If it does, a replay cannot compare the topic after a
+        lost message.
     latched : bool
         Whether a subscriber that joins late receives earlier messages (durability `transient_local`).
     depth : int
@@ -55,8 +55,8 @@ class Topic:
     names : tuple of str
         Names in a `JointState`.
     columns : mapping
-        Fields of the record from which each field of the message is filled, in order, as (name, count of numbers).
-        Empty if a message needs other data than a record.
+        Fields of the record that fill each field of the message, in order, as (name, count of numbers). Empty if a
+        record does not contain all data of the message.
     """
 
     name: str

@@ -52,14 +52,13 @@ _COLUMNS: Final = (
 )
 #: Tolerance of the solver for a recording of another program, which states no tolerance.
 _TOLERANCE: Final = 1e-9
-#: Clock step [ns]. If a measured stamp is older than the newest stamp by more than this time, the clock of the
-#: measurement has stepped back.
+#: Time [ns] by which a measured stamp must be older than the newest stamp to show that the clock has stepped back.
 _STEP_NS: Final = 1_000_000_000
-#: Largest absolute value of a measurement, in any unit, that is used; the squares of larger values may overflow.
+#: Largest absolute value, in any unit, of a measurement that is used. The squares of larger values may overflow.
 _LARGEST: Final = 1e15
 _OF_THE_RUN: Final = "of the run"
 _MAP: Final = "map_"
-#: Name of a parameter in the header of the runs that an analysis writes, and of no other run.
+#: Name of a parameter that only the runs written by an analysis have in their headers.
 MAPPED_LOAD: Final = f"{_MAP}excitation"
 #: Callback that receives the share of the work done, 0..1.
 OnProgress = Callable[[float], object]
@@ -119,8 +118,8 @@ class Prediction:
     def is_of_longest(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
         """Return for each measured value whether it belongs to the longest stretch.
 
-        A value belongs to the stretch that contains its stamp. After the clock has stepped back, several stretches may
-        contain the stamp; then the value belongs to the stretch in which it arrived.
+        A value belongs to the stretch that contains its stamp. If the clock has stepped back, several stretches may
+        contain the stamp. In this case, the value belongs to the stretch in which it arrived.
         """
         at, _ = signal.series()
         if len(self.spans) < 2:
@@ -144,7 +143,7 @@ class Prediction:
 
     @property
     def stride(self) -> int:
-        """The number n if only every n-th row of the longest stretch is stored."""
+        """Number n for which every n-th row of the longest stretch is stored."""
         return self._longer().stride
 
 
@@ -161,7 +160,7 @@ class Measured:
         """Add the finite numbers of a message to the signals."""
         before, newest = self._latest.get(role, (0, stamp_ns))
         back = newest - stamp_ns > _STEP_NS
-        # the clock of the measurement may step back before the clock of the load does: a new stretch then begins here
+        # if the clock of the measurement steps back before the clock of the load, a new stretch begins here
         stretch = max(stretch, before + back)
         self._latest[role] = stretch, stamp_ns if back else max(newest, stamp_ns)
         prefix = {"forces": "force_", "gaps": "gap_"}.get(role, "")
@@ -183,7 +182,7 @@ class Analysis:
     input: dict[str, int]
     losses: dict[str, int]
     unknown_types: dict[str, str]
-    #: Times without samples; during these times, the load is interpolated linearly.
+    #: Times without samples. During a silence, the load is interpolated linearly.
     silences: Silences
     wall_s: float = 0.0
     #: Folders inside the recording that were not analysed, because they are empty or are separate recordings.
@@ -221,7 +220,9 @@ class Analysis:
         return found
 
     def facts(self) -> dict[str, Any]:
-        """Return the whole result for JSON: the first prediction at the top level, further predictions under `with`."""
+        """Return the whole result for JSON. The first prediction is at the top level, and further predictions are under
+        `with`.
+        """
         first, *others = self.predictions
         return {
             "run": str(self.path),
@@ -299,9 +300,10 @@ def analyse(
     scene
         Scene file or preset; by default the scene of a run, or `scene.yaml` beside another recording.
     mapping, units
-        YAML file that maps topics to roles, and a unit for each name (fx, x, ..., t) whose unit in the file is wrong.
+        YAML file that maps topics to roles, and a mapping of units. The mapping `units` contains a unit for each name
+        (fx, x, ..., t) for which the unit in the file is wrong.
     others
-        Further scenes, for each of which the motion is predicted too.
+        Further scenes. The motion is predicted for each of them.
     out
         Folder in which a recording of another program is converted to a run named `run`.
     tail, on_caught_up
@@ -413,7 +415,7 @@ def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measu
                 measured.add(name, *found)
         unknown |= source.losses.unknown_types
         for name, count in source.losses.counts.items():
-            # the reader of the run already counts all other losses in its folder
+            # the reader of the run counts all losses except these
             if count and (name == "undecodable" or number >= len(places)):
                 unused[name] += count
     return measured, unknown, unused

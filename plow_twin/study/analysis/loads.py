@@ -1,4 +1,4 @@
-"""Loads of the contacts, summed batch by batch: impacts, forces, contact times, load cycles, and dissipated energy."""
+"""Sums over the contacts of a run, such as impacts, forces, contact times and dissipated energy."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Pass:
 
 
 class Series:
-    """A series of any length, which is stored in memory up to `_IN_MEMORY` and on the disk beyond."""
+    """A series of any length. Up to `_IN_MEMORY`, it is stored in memory. A longer series is stored on the disk."""
 
     def __init__(self) -> None:
         self._file = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115 (goes with this object)
@@ -175,8 +175,7 @@ class LoadTotals:
     def _wear(self, depth: Array, speed: float, pieces: NDArray[np.int64]) -> None:
         """Add the wear of the pads, and the wear of the pieces of the slide that the pads pass.
 
-        A pad wears over the whole distance travelled. A point of the slide wears only while the length of a pad passes
-        it.
+        A pad wears over the whole distance travelled. A point of the slide wears only while a pad passes it.
         """
         wear = self.scene.wear
         if wear is None or wear.coefficient_m2_n == 0.0:

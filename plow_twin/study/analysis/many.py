@@ -51,7 +51,7 @@ def run_many(
 def _here(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> None:
     while waiting:
         left = _round(tasks, waiting, workers, done)
-        # a task has killed its worker: the first tasks run one at a time until this task is found
+        # a task has killed its worker, so the first tasks run one at a time until this task is found
         if len(left) == len(waiting):
             left, first = left[workers:], left[:workers]
             for number in first:

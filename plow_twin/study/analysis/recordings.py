@@ -21,7 +21,9 @@ def _holds(folder: Path, kinds: Sequence[str] = _KINDS) -> bool:
 
 
 def _is_recording(folder: Path, results: Sequence[Path]) -> bool:
-    """Return whether a folder is one recording: it contains parts of a recording, or files but no folder with a run."""
+    """Return whether a folder is one recording. Such a folder contains parts of a recording, or files but no folder
+    with a run.
+    """
     if not _holds(folder):
         return False
     if (folder / "metadata.yaml").is_file() or any(folder.glob(f"{glob.escape(folder.name)}_*")):
@@ -33,7 +35,9 @@ def _is_recording(folder: Path, results: Sequence[Path]) -> bool:
 
 
 def left_out(path: Path, results: Sequence[Path] = ()) -> list[Path]:
-    """Return the items in a folder that `expand` omits: empty folders, tables beside runs, and runs in other runs."""
+    """Return the items in a folder that `expand` omits, which are empty folders, tables beside runs, and runs in a
+    run.
+    """
     if not path.is_dir():
         return []
     folders = [item for item in sorted(path.iterdir()) if item.is_dir()]

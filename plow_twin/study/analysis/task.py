@@ -23,7 +23,7 @@ from plow_twin.scene_file.presets import scene_path
 from plow_twin.study.analysis.analyse import MAPPED_LOAD, OnProgress, analyse
 from plow_twin.study.analysis.report import write_report
 
-#: File with the inputs of an analysis. This file is written last: it exists only if the analysis is complete.
+#: File with the inputs of an analysis. The file is written last, so it exists only if the analysis is complete.
 _ASKED: Final = "asked.json"
 _FILES: Final = (_ASKED, "analysis.json", "report.html", "measured.parquet")
 #: Names of the tables. The names of tables of further scenes end in a number.
@@ -31,7 +31,7 @@ _TABLE: Final = re.compile(r"(predicted|clearance|face|slide_wear)(_\d+)?\.parqu
 
 
 def names_apart(paths: Sequence[Path]) -> list[str]:
-    """Return for each recording the shortest end of its path that differs from the ends of all other paths."""
+    """Return for each recording the shortest end of its path that no second path has."""
     whole = [path.absolute() for path in paths]
     stems = Counter(path if path.is_dir() else path.with_suffix("") for path in whole)
     parts = [
@@ -144,13 +144,13 @@ class Task:
         return {**found.facts(), "lossy": found.lossy}
 
     def _asked(self) -> dict[str, Any]:
-        """Return the inputs that determine the result: the recording, files beside it, scenes, mapping and units."""
+        """Return the inputs that determine the result, such as the recording, the scenes and the mapping."""
         folder = self.path if self.path.is_dir() else self.path.parent
         parts = [*sorted(folder.glob("*.mcap")), *beside_folders(folder)]
         beside = folder / "scene.yaml" if self.scene is None else None
         return {
             "run": _state(self.path, self.out),
-            # the other parts, and folders beside a part, may contain measurements
+            # all parts, and folders beside a part, may contain measurements
             "parts": [] if self.path.is_dir() else [_state(path, self.out) for path in parts],
             "scene": _scene_state(self.scene),
             "scene_beside": _scene_state(beside) if beside is not None and beside.is_file() else None,

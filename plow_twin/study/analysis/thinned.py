@@ -1,4 +1,4 @@
-"""Series in bounded memory. Of a long series, only every 2nd row is stored, then only every 4th row, and so on."""
+"""Series in bounded memory. If a series becomes too long, every second stored row is removed."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Largest number of stored rows: 150 MB for a prediction, 16 MB for a measured signal.
+#: Largest number of stored rows. A prediction with this number of rows needs 150 MB.
 MOST_ROWS: Final = 1_000_000
 
 
 class Thinned:
-    """Rows of several columns with their stamps. Of the received rows, every `stride`-th row is stored."""
+    """Rows of several columns, with stamps. Every `stride`-th received row is stored."""
 
     def __init__(self, columns: int) -> None:
         self._stamps: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]

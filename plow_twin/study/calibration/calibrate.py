@@ -6,8 +6,8 @@ The fit consists of independent starts. Each start has three stages:
 2. The best of these points are the first population of a differential evolution (scipy). Each generation is one
    ensemble of runs.
 3. The best point is improved by least squares in all unknowns that have a range (trust region reflective, scipy). One
-   ensemble gives the finite-difference Jacobian. A Nelder-Mead simplex follows if `Search.simplex` is positive, because
-   least squares may stop at a kink of the residuals.
+   ensemble gives the finite-difference Jacobian. Least squares may stop at a kink of the residuals. If `Search.simplex`
+   is positive, a Nelder-Mead simplex search follows.
 
 Every start has its own random generator. A seed therefore gives bit-identical results with any number of threads.
 
@@ -35,7 +35,9 @@ OnProgress = Callable[[float, float], object]
 
 @dataclass(frozen=True)
 class Search:
-    """Effort of one start: numbers of screened points, population members, generations and simplex evaluations."""
+    """Numbers that limit the effort of one start, such as the number of screened points and the number of
+    generations.
+    """
 
     screen: int = 200
     population: int = 30
@@ -49,7 +51,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Start:
-    """Result of a start: its point in the cube, the unknowns, and the objective before and after stage 3."""
+    """Result of a start, with the objective before and after stage 3."""
 
     number: int
     point: Array
@@ -66,7 +68,7 @@ class Calibration:
     starts: tuple[Start, ...]
     seed: int
     runs: int
-    #: The final populations of all starts, which show other points that fit almost as well.
+    #: The final populations of all starts. They show which points fit almost as well as the best point.
     population: Array = field(repr=False)
     population_objective: Array = field(repr=False)
 
@@ -105,7 +107,7 @@ def calibrate(
         points, values = _evolve(space, objective, rng, search, known, report)
         point, best = _polish(space, objective, points[np.argmin(values)], search)
         populations.append((points, values))
-        # least squares may end at a larger objective than that of its starting point
+        # the objective at the end of least squares may be larger than at the beginning
         if values.min() < best:
             point, best = points[np.argmin(values)], float(values.min())
         point = space.settled(point)

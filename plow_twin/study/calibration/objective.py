@@ -114,8 +114,7 @@ class RecordingObjective:
     """Difference from a recorded motion: (q - recorded q) / clearance for every row and coordinate.
 
     Differences of the angle are multiplied by half the diagonal. Residuals are divided by the square root of their
-    number. The objective is thus a mean square error of x, y and theta, relative to the clearance of the scene before
-    the fit.
+    number. The objective is therefore a mean square error of x, y and theta in units of the clearance before the fit.
     """
 
     scene: Scene

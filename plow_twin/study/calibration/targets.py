@@ -8,7 +8,7 @@ Each target gives one residual r of a candidate. A target that is met exactly ha
     above              r = max(0, largest - s) / (tolerance |largest|)                  met if r = 0
     trend              r = (sum of wrong steps + missing change) / (tolerance mean)     met if r = 0
 
-Here s is the target's statistic, or the smallest statistic if the target names several. The run of a
+Here s is the statistic of the target. If a target names several statistics, s is the smallest of them. The run of a
 target has the parameters `set`. In `above`, `largest` is the largest of the statistics with which s is compared. A
 trend is judged over a sequence of runs along one parameter: wrong steps go against the trend, and the required change
 is `margin` times the mean. In `rises_then_falls`, rise and fall must each reach the required change. The turning point
@@ -97,7 +97,9 @@ class Target:
 
 
 def _wrong_way(s: Array, least: Array) -> Array:
-    """Return a measure of the violation of a rise: the sum of all downward steps, plus the missing part of the rise."""
+    """Return a measure of the violation of a rise, which is the sum of all downward steps plus the missing part of the
+    rise.
+    """
     down = np.maximum(0.0, -np.diff(s, axis=1)).sum(axis=1)
     return np.asarray(down + np.maximum(0.0, least - (s[:, -1] - s[:, 0])))
 

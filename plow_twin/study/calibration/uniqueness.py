@@ -22,10 +22,11 @@ _DISTANCE: Final = 0.1
 
 @dataclass(frozen=True)
 class Identifiability:
-    """Singular values of dr/dz at the optimum, where r are the residuals and z the places of the unknowns with a range.
+    """Singular values of the Jacobian dr/dz at the optimum. Here r are the residuals, and z are the unknowns with a
+    range.
 
-    `weakest` is the singular vector of the smallest singular value: the combination of unknowns that the data determine
-    least.
+    `weakest` is the singular vector of the smallest singular value. It is the combination of unknowns that the data
+    determine least.
     """
 
     paths: tuple[str, ...]
@@ -35,7 +36,7 @@ class Identifiability:
 
 @dataclass(frozen=True)
 class Cluster:
-    """A group of near-optimal points with equal choices and similar values of the other unknowns."""
+    """A group of near-optimal points with equal choices and similar values of the unknowns that have a range."""
 
     members: int
     objective: float
@@ -59,7 +60,9 @@ def identifiability(space: Space, objective: Objective, point: Array) -> Identif
 
 
 def near_optimal(space: Space, found: Calibration, excess: float) -> list[Cluster]:
-    """Cluster all found points whose objective is at most `excess` above the best. The best cluster comes first."""
+    """Cluster all points with an objective of at most the smallest objective plus `excess`. The best cluster comes
+    first.
+    """
     points = np.concatenate([[start.point for start in found.starts], found.population])
     values = np.concatenate([[start.objective for start in found.starts], found.population_objective])
     keep = values <= found.best.objective + excess

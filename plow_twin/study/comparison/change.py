@@ -12,7 +12,7 @@ from scipy.stats import t as student
 
 Array = NDArray[np.float64]
 
-#: Number of bootstrap draws. The share of draws below the 2.5 % point then has a standard error of 0.5 %.
+#: Number of bootstrap draws. With 1000 draws, the share of draws below the 2.5 % point has a standard error of 0.5 %.
 _DRAWS: Final = 1000
 FEWEST: Final = 8
 #: Smallest standard deviation of the load within the groups, relative to the mean load. Below this value, the effect of
@@ -37,13 +37,13 @@ class Change:
     """Change of a mean from one group of windows to another, relative to the mean of the first group.
 
     `low` and `high` are the ends of the 95 % interval of `share`. `chance` is the probability that such a change occurs
-    by chance. The probabilities of all cells of a comparison are adjusted together by the method of Benjamini and
-    Hochberg. A *cell* is one quantity of one pair, or one clearance. Among the cells with an adjusted probability below
+    by chance. A *cell* of a comparison is one quantity of one pair, or one clearance. The probabilities of all cells
+    are adjusted together by the method of Benjamini and Hochberg. Among the cells with an adjusted probability below
     0.05, about one in twenty has not changed.
 
-    `machine`, `machine_low`, `machine_high` and `machine_chance` are the share, its interval and its probability for
-    the change at equal load. They are None if the loads of the two groups do not overlap, or if the load varies too
-    little within the groups.
+    The fields `machine`, `machine_low`, `machine_high` and `machine_chance` describe the change at equal load in the
+    same way. They are None if the loads of the two groups do not overlap, or if the load varies too little within the
+    groups.
     """
 
     share: float
@@ -57,7 +57,7 @@ class Change:
 
     @property
     def verdict(self) -> str:
-        """`chance`, or the cause of a significant change: `machine`, `load`, or `load or machine`."""
+        """The word `chance`, or the cause of a significant change (`machine`, `load`, or `load or machine`)."""
         if self.chance > _LEVEL:
             return "chance"
         if self.machine_chance is None:
@@ -72,7 +72,7 @@ def points(values: Array) -> dict[str, float]:
 
 
 def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
-    """Return the loads of each window, of the window before and of the window after, shape (n, 3).
+    """Return the load of each window and the loads of its two neighbours in time, shape (n, 3).
 
     The motion in a window also depends on the load in the neighbouring windows. The effect of a lasting change of the
     load is therefore the sum of the slopes with respect to all three loads. A missing neighbour is replaced by the
@@ -149,7 +149,8 @@ def changes(before: Drawn, after: Drawn) -> list[Change | None]:
 
 
 def _tested(differences: Array, mean: Array, fewest: int) -> tuple[Array, Array, Array, Array]:
-    """Return share, low, high and adjusted probability of each column. Row 0 contains values, all other rows draws.
+    """Return share, low, high and adjusted probability of each column. Row 0 contains values, all further rows contain
+    draws.
 
     Student's t distribution has the degrees of freedom of the smaller group, so that the probabilities are rather too
     large.

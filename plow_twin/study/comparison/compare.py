@@ -1,4 +1,4 @@
-"""Comparison of runs: windows are grouped by run, day or shift, and each group is compared with the first group."""
+"""Comparison of runs. Windows are grouped by run, day or shift, and each group is compared with the first group."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Label = Callable[[str, int], str]
 
 @dataclass
 class Comparison:
-    """Groups of windows in order of first appearance, and the changes from the first group to every other group."""
+    """Groups of windows in order of first appearance, and the changes from the first group to each later group."""
 
     groups: dict[str, Windows]
     #: Names of the runs with windows in each group.
@@ -112,7 +112,7 @@ def compare(
     seed: int = 0,
     scenes: Mapping[str, tuple[str, str]] = MappingProxyType({}),
 ) -> Comparison:
-    """Compare the first group of windows with every other group.
+    """Compare the first group of windows with each later group.
 
     `runs` are the names and windows of the runs in order of time. `scenes` contains the name and the contents of the
     scene of each run. `seed` is the seed of the bootstrap draws.

@@ -26,7 +26,7 @@ _DT: Final = 1.0 / RATE_HZ
 _NUMBERS: Final = 1000
 #: Number of touches for which random numbers are drawn. Later touches use the numbers of the last of these touches.
 _TOUCHES: Final = 64
-#: Smallest deviation [rad] of an angle from the line through the three rows before that shows an impact.
+#: Smallest deviation [rad] that shows an impact, of an angle from the line through the three previous rows.
 _TURN_IN_A_ROW: Final = 0.1
 LEAST_ROWS: Final = 4
 # largest number of rows of the bands (4 s; a block comes to rest within 1 s), and a speed [m/s] that no drop reaches
@@ -81,7 +81,9 @@ MARKER: Final = Marker(-0.0308, (2.3e-4, 5.2e-4))
 
 @dataclass(frozen=True)
 class Scatter:
-    """Standard deviations of the random parts of the parameters, of the fitted speeds and of the measured rows."""
+    """Standard deviations of three kinds: random parts of parameters, errors of fitted speeds, and errors of measured
+    rows.
+    """
 
     #: Variation from touch to touch: restitution [1], logarithm of the friction, and place along the table where the
     #: force acts [m].
@@ -184,7 +186,9 @@ def _free_flight(block: NDArray[np.void], axis: int, times: Array) -> tuple[Arra
 
 
 def _leaves_flight(rows: Array) -> bool:
-    """Return whether the last row follows an impact: its angle deviates from a line, or it rises after a fall."""
+    """Return whether the last row follows an impact, which shows by a deviation of the angle from a line or by a rise
+    after a fall.
+    """
     t = np.arange(-3.0, 1.0)
     turn = float(np.polyval(np.polyfit(t[:3], rows[-4:-1, 2], 1), t[3]))
     return bool(

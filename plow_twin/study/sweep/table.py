@@ -1,4 +1,4 @@
-"""A sweep: statistics of the motion for each value of one parameter, or each combination of two parameters.
+"""A sweep computes statistics of the motion for each value of one parameter, or each combination of two parameters.
 
 A *member* of a sweep is one run, with one value of each parameter.
 """
@@ -73,7 +73,7 @@ def parse_axis(text: str, scene: Scene) -> Axis:
 
 @dataclass(frozen=True)
 class Sweep:
-    """The arguments of a sweep as plain data. `scene_yaml` is self-contained: it refers to no other file."""
+    """The arguments of a sweep as plain data. The text `scene_yaml` is self-contained, so it refers to no file."""
 
     scene_yaml: str
     axes: tuple[Axis, ...]

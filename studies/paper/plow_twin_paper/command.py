@@ -1,4 +1,6 @@
-"""The command `plow-twin study paper`: it computes the paper's figures and numbers and compares them."""
+"""The command `plow-twin study paper`, which computes the paper's figures and numbers and compares them with the
+paper.
+"""
 
 from __future__ import annotations
 

@@ -61,7 +61,8 @@ def _zero_load(runs: PaperRuns) -> Contradiction:
 def _doubled(runs: PaperRuns) -> Contradiction:
     pair = int(runs.case.penetration.max(axis=0).argmax())
     depth = float(runs.case.penetration[:, pair].max())
-    # for a point outside a strip by `depth`, the sum of the distances to both sides exceeds the width by `excess`
+    # for a point that lies outside a strip by `depth`, the sum of its distances to both sides exceeds the width by
+    # `excess`
     width = runs.scene.frame.height_m + runs.scene.clearance.vertical_m
     excess = abs(-depth) + abs(width + depth) - width
     return Contradiction(

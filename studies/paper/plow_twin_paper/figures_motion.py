@@ -92,7 +92,7 @@ def fig09(runs: PaperRuns) -> Figure:
 def _close_up(runs: PaperRuns, sense: Sense) -> Figure:
     """Draw the forces of one direction of swing in a period around the quoted times, and the contacts of each point."""
     times = {moment: shown_time(moment.time_s, runs.t_end) for moment in MOMENTS if moment.sense == sense}
-    # a shorter run may end before some quoted times; then all quoted times move back by the same number of periods
+    # a shorter run may end before some quoted times, so all quoted times move back by the same number of periods
     back = max(moment.time_s - time for moment, time in times.items())
     times = {moment: moment.time_s - back for moment in times}
     centre = 0.5 * (min(times.values()) + max(times.values()))

@@ -1,4 +1,4 @@
-"""Rows of Figs 8 and 9: which points carry force at the same time, how often, and when."""
+"""Rows of Figs 8 and 9, which show which points carry force at the same time, how often, and when."""
 
 from __future__ import annotations
 

@@ -13,13 +13,15 @@ from plow_twin.model.scene import Scene
 from plow_twin.run.simulate import Result
 from plow_twin_paper.values import SHORTEST_HOLD_S, Sense
 
-#: Mode of a pair that carries force. Mode 0 is apart, and mode 2 is in contact with a force clipped at zero.
+#: Mode of a pair that carries force. A pair in mode 0 is apart. A pair in mode 2 is in contact, but its force is zero.
 _CARRIES = 1
 
 
 @dataclass(frozen=True)
 class Hold:
-    """A time in which exactly the corners `corners` carry force, e.g. `abd`; the text is empty if no corner does."""
+    """A time in which exactly the corners `corners`, such as `abd`, carry force. The text is empty if no corner carries
+    force.
+    """
 
     start_s: float
     end_s: float
@@ -33,7 +35,7 @@ class Hold:
 
 @dataclass(frozen=True)
 class SetFigures:
-    """Figures of one set: total and longest hold [s], and two further figures.
+    """Figures of one set. The durations are the total and the longest hold [s].
 
     `share` is the share of the contact time for its direction of swing, and `count` the number of long holds.
     """

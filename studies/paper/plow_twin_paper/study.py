@@ -1,4 +1,6 @@
-"""The study of the paper: figures and numbers are computed, compared with the published values, and reported."""
+"""The study of the paper, which computes figures and numbers, compares them with the published values, and reports
+them.
+"""
 
 from __future__ import annotations
 
