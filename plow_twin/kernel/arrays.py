@@ -1,4 +1,4 @@
-"""Helpers for arrays and records in kernels: views without a reference count, copies, searches and checks.
+"""Functions by which kernels view, copy, search and check arrays and records.
 
 These helpers compile faster than numba's own code. For example, the compilation of numba's assignment to a slice
 includes the formatting of an error message. This formatting takes 2 s in each process that compiles a twin.

@@ -1,4 +1,4 @@
-"""Two compilers for numba: one for kernels that only kernels call, and one for kernels that Python calls.
+"""Two compilers for numba. The first compiles kernels for calls from kernels, and the second for calls from Python.
 
 LLVM optimises a kernel together with every kernel that it calls. By default, numba would in addition optimise each
 called kernel alone and generate machine code for it, which takes a quarter of the compile time. The first compiler

@@ -1,4 +1,4 @@
-"""First-order low-pass filter of a pose: tau dy/dt = u - y with the input u and the output y."""
+"""First-order low-pass filter of a pose. The output y follows the input u by tau dy/dt = u - y."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The machine: its parameters, geometry, contact laws and loads, independent of the method of solution.
+"""Parameters, geometry, contact laws and loads of the machine, independent of the method of solution.
 
 Docstrings call the publication Mao, Zhang et al. (2015) "the paper" (docs/study.md).
 """

@@ -1,4 +1,4 @@
-"""Normal force of a pair: functions for one value, and for its power series in time.
+"""Normal force of a pair. The functions compute a single value of the force, or its power series in time.
 
     additive laws     F = K d^n + C psi(d) d',  psi = 1 (Kelvin-Voigt) or u^2 (3 - 2 u), u = min(d / ramp, 1)
     all other laws    F = K d^n (1 + lambda d')
@@ -51,7 +51,7 @@ def normal_force(
     viscous: float,
     ramp: float,
 ) -> float:
-    """Return the contact force in N: `free_force`, but 0 without penetration and where the law would pull."""
+    """Return the contact force in N. It is `free_force`, or 0 without penetration and where the law would pull."""
     if penetration <= 0.0:
         return 0.0
     return max(0.0, free_force(penetration, rate, stiffness, exponent, damping_factor, viscous, ramp))

@@ -239,7 +239,7 @@ def largest_angle(scene: Scene) -> float:
 
 
 def length_scale(scene: Scene) -> float:
-    """Return the reference length in m for tolerances: the smallest clearance that is not negligible.
+    """Return the reference length in m for tolerances, which is the smallest clearance that is not negligible.
 
     A clearance below 1e-4 of the frame's diagonal is negligible. Without any clearance above this limit, the reference
     length is 1e-4 of the diagonal.

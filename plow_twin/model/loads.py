@@ -1,4 +1,4 @@
-"""Loads of a scene in the form that the solver uses: one list of harmonics and one piecewise linear wrench.
+"""Loads of a scene in the form of the solver, which is one list of harmonics and one piecewise linear wrench.
 
 A load (Fx, Fy) has a constant arm (x, y) in world axes. Its moment about the centre of the cavity is M = x Fy - y Fx in
 every pose (paper, section 2). Gravity is treated separately.

@@ -76,7 +76,7 @@ def _choice(doc: str, choices: Collection[str], default: Any = ...) -> Any:
 
 @dataclass(frozen=True)
 class Head:
-    """The moving body: a plough head whose cavity surrounds the frame, or a block inside a fixed cavity."""
+    """The moving body. It is a plough head with a cavity around the frame, or a block inside a fixed cavity."""
 
     mass_kg: float = _quantity("kg", "mass", gt=0.0)
     inertia_kg_m2: float = _quantity("kg m^2", "moment of inertia about the centre of mass", gt=0.0)
@@ -301,7 +301,7 @@ Load = Harmonic | Constant | Table
 
 @dataclass(frozen=True)
 class Initial:
-    """State at t = 0: pose of the cavity's centre relative to the frame's centre, and the rate of the pose."""
+    """State at t = 0. It consists of the pose of the cavity's centre relative to the frame's centre, and its rate."""
 
     q: tuple[float, float, float] = _quantity("m, m, rad", "x, y, theta", (0.0, 0.0, 0.0))
     v: tuple[float, float, float] = _quantity("m/s, m/s, rad/s", "rates of q", (0.0, 0.0, 0.0))

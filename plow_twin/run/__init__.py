@@ -1,1 +1,1 @@
-"""The calls for users of the library: whole motions and live twins, single or many at once."""
+"""Functions and classes for users of the library. They compute whole motions and advance live twins."""

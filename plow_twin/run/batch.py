@@ -58,7 +58,7 @@ def _signature(parts: Parts, scene: Scene) -> tuple[bool, ...]:
 
 
 class TwinBatch:
-    """A live ensemble: twins that are advanced together, each under its own sampled load.
+    """A live ensemble of twins. The twins are advanced together, each under its own sampled load.
 
     Parameters
     ----------

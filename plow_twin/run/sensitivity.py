@@ -422,7 +422,7 @@ def _beside(
     before: Sequence[State],
     work: Work,
 ) -> list[State]:
-    """Return a state and its shadows: one for each free coordinate or rate, and one for each changed scene.
+    """Return a state, a shadow for each free coordinate, a shadow for each rate, and a shadow for each changed scene.
 
     `moved` contains the displacements of the shadows for coordinates and rates. Shadows of changed scenes are not
     displaced. The damping factors of these shadows were set at their own touches, and are taken from the states

@@ -1,4 +1,4 @@
-"""The live twin: one head, advanced in time under sampled or analytic loads. Its state can be saved and restored."""
+"""The live twin of one head, which is advanced in time under sampled or analytic loads. Its state can be saved."""
 
 from __future__ import annotations
 

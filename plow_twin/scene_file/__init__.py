@@ -1,4 +1,4 @@
-"""Scene files: conversion of YAML to a `Scene` and back.
+"""Conversion of scene files (YAML) to a `Scene` and back.
 
 Scalars follow the YAML 1.2 core schema: `9.6975e6` is a number, and `on` is a text.
 """

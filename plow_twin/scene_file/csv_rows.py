@@ -64,7 +64,7 @@ def check_text(begin: bytes) -> None:
 
 
 def delimiter_of(header: str) -> str:
-    """Return the delimiter of a header line: the most frequent of comma, semicolon and tab outside quotes."""
+    """Return the delimiter of a header line, which is the most frequent of comma, semicolon and tab outside quotes."""
     return max(",;\t", key=re.sub(r'"[^"]*"', "", header).count)
 
 

@@ -35,7 +35,8 @@ def is_parquet(path: Path) -> bool:
 
 
 class ParquetLines(io.RawIOBase):
-    """A Parquet file, read as UTF-8 text: a line with the names of the columns, then a line for each row.
+    """A Parquet file that is read as UTF-8 text. The first line contains the names of the columns. A line for each row
+    follows.
 
     Numbers are written without loss of digits. Times with a zone are written in UTC. Times without a zone are written
     unchanged. A missing value gives an empty cell. Columns of lists, structures or bytes are omitted.

@@ -1,1 +1,1 @@
-"""The solver: Taylor series with event detection, the main loop, and fixed-step methods."""
+"""The solver. It consists of Taylor series with event detection, the main loop, and fixed-step methods."""

@@ -1,4 +1,4 @@
-"""Contact force of a pair: the functions of `model.contact`, called with the constants of a scene and its state."""
+"""Contact force of a pair, by the functions of `model.contact` with the constants and the state of a scene."""
 
 from __future__ import annotations
 

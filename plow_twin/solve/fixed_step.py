@@ -1,4 +1,4 @@
-"""Fixed-step methods without event detection: RK4 as in the paper, and semi-implicit Euler.
+"""Fixed-step methods without event detection. They are RK4, as in the paper, and semi-implicit Euler.
 
 These methods serve as a check of the Taylor series. They share only the geometry and the contact law with the series,
 and integrate the equations of motion (paper, eq. 5) in world axes about the centre of mass.

@@ -1,4 +1,4 @@
-"""Friction with stick: force of sticking corners, and conditions for slip and stick.
+"""Friction with stick. The functions compute the force of sticking corners, and conditions for slip and stick.
 
 A spring and a damper connect a sticking corner to its anchor a on the wall. A slipping corner exerts sliding friction:
 
@@ -192,8 +192,8 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         for k in range(1, order):
             power *= state.sigma_end
             noise = max(noise, _ROUNDING_OVER_STEP * abs(g[k]) * power)
-    # a negative first value within rounding error is set to 0; the higher orders then determine the sign of the guard
-    # function
+    # a negative first value within rounding error is set to 0, so that the higher orders determine the sign of the
+    # guard function
     if abs(g[0]) <= _ROUNDING * size + noise:
         g[0] = max(g[0], 0.0)
     g[0] += late

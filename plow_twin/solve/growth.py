@@ -89,7 +89,7 @@ def _largest(grown, count, height, scratch) -> float:
     """Return the largest spectral norm of the first `height` rows of the matrices grown[:, i, :], at least 1.
 
     The sum of squares of a matrix is an upper bound of its squared norm. The norm of the matrix with the largest sum is
-    computed first, so that few other norms have to be computed.
+    computed first, so that few of the remaining norms have to be computed.
     """
     most, begin, size = 1.0, 0, len(grown)
     squares = scratch[5:].reshape(-1)

@@ -1,4 +1,4 @@
-"""Kinematics of the head: penetrations, their rates, and conversions between body axes and world axes.
+"""Kinematics of the head. The functions compute penetrations and their rates, and convert between axes.
 
 The argument `rows` contains coefficients of each pair for cosine and sine of the head's angle and for its position x, y
 (`model.geometry`).

@@ -119,7 +119,7 @@ def _clear(totals) -> None:
 
 @kernel()
 def _undo(support, state, w, target) -> None:
-    """Undo a failed advance: set the time to `target`, and the head to its state and wear before the advance.
+    """Undo a failed advance. Set the time to `target`, and the head to its state and wear before the advance.
 
     If the advance began within a step, this step is shortened to the time before the advance. `w.saved_y` and
     `w.saved_wear` contain the saved state and wear.

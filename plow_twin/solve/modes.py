@@ -1,4 +1,4 @@
-"""The eight pairs of corner and wall: penetrations, contact modes, damping factors, and range of validity."""
+"""Contact modes, damping factors and range of validity of the eight pairs of corner and wall."""
 
 from __future__ import annotations
 
@@ -262,7 +262,7 @@ def read_range(p, state, y, out) -> None:
 
 @kernel()
 def within_range(p, state, y) -> bool:
-    """Return whether the model is valid at y: |theta| <= 45 degrees, and penetrations at most half the cavity."""
+    """Return whether |theta| is at most 45 degrees and all penetrations are at most half the cavity at y."""
     if _all_shallow(p, state, y):
         return abs(named_angle(p, y, y[THETA])) <= LARGEST_ANGLE
     deepest = 0.0

@@ -30,8 +30,8 @@ ACTS, DAMPS, BASE, SIGN, RATIO, SUM, FIRST, SECOND, RAMPS = range(9)
 OFF: Final = 0
 ON: Final = 1
 CLIPPED: Final = 2
-#: Mode for exponents that are not integers: the penetration is less than `Params.release`, so the force of the pair is
-#: negligible.
+#: Mode RELEASED, for exponents that are not integers. The force of the pair is negligible, because its penetration is
+#: less than `Params.release`.
 RELEASED: Final = 3
 #: Code of the event at which a penetration crosses the end of the damping ramp. This event does not change the mode.
 CROSSING: Final = 4
@@ -360,7 +360,7 @@ ROW: Final = np.dtype(
         # the time since the previous publication.
         ("followed", "i8"),  # `FOLLOWED` if only the clearances are filled, `WITH_INTERVALS` if all fields are filled
         *((f"{name}_{end}", "f8", (PAIR_COUNT,)) for name in ("force", "peak", "impulse") for end in ("low", "high")),
-        ("known_clearance", "f8", (6,)),  # horizontal clearance and its two quantiles, the same of the vertical clearance
+        ("known_clearance", "f8", (6,)),  # horizontal clearance, its quantiles; vertical clearance, its quantiles
     ]
 )
 

@@ -1,4 +1,4 @@
-"""A step of the solver: choice of the method, first event, and change of modes at the end of the step.
+"""A step of the solver. It consists of the choice of the method, the first event, and the change of modes at its end.
 
 Steps do not depend on the output times. A step ends at an event, at a knot of the load, or where its series is no
 longer accurate.

@@ -111,8 +111,8 @@ class Curves:
 def extremes(spans, values):  # type: ignore[no-untyped-def]
     """Mark the first least and the first largest value of each column.
 
-    `values` has shape (n, k). The rows with equal successive numbers in `spans`, shape (n,), form one group with its
-    own extremes.
+    `values` has shape (n, k). Successive rows with equal numbers in `spans`, shape (n,), form one group with extremes
+    of its own.
     """
     count, columns = values.shape
     kept = np.zeros((count, columns), np.bool_)

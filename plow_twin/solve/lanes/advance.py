@@ -89,12 +89,12 @@ class Samples(NamedTuple):
     rows: NDArray[np.void]  #: rows of `ADVANCE` to fill, shape (m, n)
     place: NDArray[np.int64]  #: number of samples that each twin has passed, shape (m,)
     progress: NDArray[np.int64]  #: indexed by `BLOCK_NOW` to `END`
-    other: NDArray[np.int64]  #: indices of the twins that another method continues, shape (m,)
+    other: NDArray[np.int64]  #: indices of the twins that a method without lanes continues, shape (m,)
 
 
-#: Indices in `Samples.progress`: current block, number of twins that another method continues, state of the current
-#: block, first twin of the thread, and the twin after its last twin. The state of a block is `_LOADED` if it is in the
-#: lanes, `_LEFT` if one of its twins has left the lanes, and 0 in all other cases.
+#: Indices in `Samples.progress`: current block, number of twins that a method without lanes continues, state of the
+#: current block, first twin of the thread, and the twin after its last twin. The state of a block is `_LOADED` if it is
+#: in the lanes, `_LEFT` if one of its twins has left the lanes, and 0 in all other cases.
 BLOCK_NOW, OTHERS, LOADED, FIRST, END = range(5)
 _LOADED, _LEFT = 1, 2
 
@@ -352,7 +352,7 @@ def _write_rows(s, lanes, reached) -> None:
 def _go_on(s, lanes, passed) -> int:
     """Start the advances of lanes to their next samples. Remove twins that have passed the last sample.
 
-    Returns a bit mask of the lanes that can take a step without another check.
+    Returns a bit mask of the lanes that can take a step without a further check.
     """
     over = 0
     for lane in range(WIDTH):

@@ -101,8 +101,8 @@ def _list_powers(lanes, order, hysteretic, fraction) -> None:
 def _may_end(series, factor, first, order, h):
     """Return a bit mask of the lanes whose guard function may become negative.
 
-    Term 0 of the guard function is `first`. The other terms are those of `series`, multiplied by `factor`. The test is
-    that of `_write_guard`.
+    Term 0 of the guard function is `first`. Every higher term is the term of `series` times `factor`. `_write_guard`
+    describes the test.
     """
     reach = term = exact_splat(0.0)
     for k in range(order, 0, -1):

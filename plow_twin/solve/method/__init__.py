@@ -1,4 +1,4 @@
-"""Methods that compute a step: free flight, rest, implicit steps and Taylor series.
+"""Methods that compute a step. They are free flight, rest, implicit steps and Taylor series.
 
-Each method is a module with the functions of `method.protocol`. The other modules contain helpers of these methods.
+Each method is a module with the functions of `method.protocol`. All further modules contain helpers of the methods.
 """

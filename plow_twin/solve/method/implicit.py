@@ -1,4 +1,4 @@
-"""Implicit steps for overdamped contact: collocation at Radau points with fixed contact modes.
+"""Implicit steps for overdamped contact, by collocation at Radau points with fixed contact modes.
 
 In overdamped contact, the damper stops a pair much faster than the spring moves it. For this reason, stability limits
 the steps of an explicit series to a few decay times, even if the motion is smooth. Radau IIA collocation (Hairer and

@@ -1,4 +1,4 @@
-"""Size of a step: the interval over which its series is accurate, with bounds where the series hides its error."""
+"""Size of a step, over which its series is accurate. Where a series hides its error, bounds limit the size."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A step by Taylor series: choice of the series variable, the series, and the interval over which it is accurate."""
+"""Computation of a step by Taylor series, from the choice of the series variable to the size of the step."""
 
 from __future__ import annotations
 
