@@ -60,12 +60,20 @@ class Advance(_View):
         The underlying row.
     t : float
         Model time in s.
-    q, v : ndarray, shape (3,)
-        Pose x, y [m], theta [rad] of the cavity's centre, and the rates of the pose.
-    penetration, rate, force : ndarray, shape (8,)
-        Signed penetration [m] of each pair at `t`, its rate [m/s], and the normal force [N].
-    peak, impulse : ndarray, shape (8,)
-        Largest force [N] of each pair, and its impulse [N s], since the previous advance.
+    q : ndarray, shape (3,)
+        Pose x, y [m], theta [rad] of the cavity's centre.
+    v : ndarray, shape (3,)
+        Rates of the pose in m/s, m/s and rad/s.
+    penetration : ndarray, shape (8,)
+        Signed penetration of each pair at `t` in m.
+    rate : ndarray, shape (8,)
+        Rate of each penetration in m/s.
+    force : ndarray, shape (8,)
+        Normal force of each pair in N.
+    peak : ndarray, shape (8,)
+        Largest force of each pair since the previous advance in N.
+    impulse : ndarray, shape (8,)
+        Impulse of each pair since the previous advance in N s.
     time_in_contact : ndarray, shape (8,)
         Time in contact since the previous advance [s].
     makes : ndarray of int64, shape (8,)

@@ -274,9 +274,10 @@ class TwinBatch:
         ----------
         which : array_like of int, shape (k,)
             Indices of the twins.
-        q, v : array_like, shape (k, 3)
-            Poses x, y [m], theta [rad] and their rates. If a contact continues, the damping factor from its first touch
-            remains valid.
+        q : array_like, shape (k, 3)
+            Poses x, y [m], theta [rad]. If a contact continues, the damping factor from its first touch remains valid.
+        v : array_like, shape (k, 3)
+            Rates of the poses in m/s, m/s and rad/s.
         """
         index = np.asarray(which, dtype=np.int64)
         poses, rates = np.asarray(q, dtype=np.float64), np.asarray(v, dtype=np.float64)

@@ -38,8 +38,10 @@ class Ensemble:
     ----------
     t : ndarray, shape (n,)
         Times of the output rows in s.
-    q, v : ndarray, shape (m, n, 3)
-        Pose x, y [m], theta [rad] and its rates. The rows after a failure are NaN.
+    q : ndarray, shape (m, n, 3)
+        Poses x, y [m], theta [rad] of the cavity's centre. The rows after a failure are NaN.
+    v : ndarray, shape (m, n, 3)
+        Rates of the poses in m/s, m/s and rad/s.
     peak : ndarray, shape (m, 8)
         Largest force of each pair in N.
     impulse : ndarray, shape (m, 8)

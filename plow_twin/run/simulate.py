@@ -44,10 +44,14 @@ class Result:
     ----------
     t : ndarray, shape (n,)
         Times of the output rows in s.
-    q, v : ndarray, shape (n, 3)
-        Pose x, y [m], theta [rad] of the cavity's centre, and the rates of the pose.
-    force, penetration : ndarray, shape (n, 8)
-        Normal force [N] and signed penetration [m] of each pair.
+    q : ndarray, shape (n, 3)
+        Pose x, y [m], theta [rad] of the cavity's centre.
+    v : ndarray, shape (n, 3)
+        Rates of the pose in m/s, m/s and rad/s.
+    force : ndarray, shape (n, 8)
+        Normal force of each pair in N.
+    penetration : ndarray, shape (n, 8)
+        Signed penetration of each pair in m.
     events : ndarray of `EVENT_DTYPE`, shape (k,)
         All changes of contact mode, in order of time.
     statistics : mapping

@@ -1,4 +1,4 @@
-"""Columns of the linearised equations (`solve.tangents`) for displacements and for changes of parameters."""
+"""Columns of the linearised equations (`solve.tangents`). Each column is a displacement or a change of a parameter."""
 
 from __future__ import annotations
 

@@ -329,9 +329,10 @@ class Twin:
 
         Parameters
         ----------
-        q, v : array_like, shape (3,)
-            Pose x, y [m], theta [rad] and its rates. If a contact continues, the damping factor from its first touch
-            remains valid.
+        q : array_like, shape (3,)
+            Pose x, y [m], theta [rad]. If a contact continues, the damping factor from its first touch remains valid.
+        v : array_like, shape (3,)
+            Rates of the pose in m/s, m/s and rad/s.
         """
         place = geometry.states_of(self.scene, np.concatenate([q, v])[None])
         settle_moved(self._params, self._states, _THE_ONE, place, self.time, self._parts.terms.stick)

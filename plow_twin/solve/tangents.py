@@ -430,8 +430,10 @@ def follow_columns(
     ----------
     columns : ndarray of `COLUMNS`, shape (b,)
         Blocks of eight columns. The first six columns are derivatives with respect to the state.
-    omegas, amplitudes : ndarray, shapes (h,) and (b, h, 2, 3, 8)
-        Angular frequencies [rad/s] of the loads that the columns change, and the changes of their amplitudes.
+    omegas : ndarray, shape (h,)
+        Angular frequencies in rad/s of the loads that the columns change.
+    amplitudes : ndarray, shape (b, h, 2, 3, 8)
+        Changes of the amplitudes of the loads by each column.
     curved : int or None
         1 if the contact force is nonlinear in penetration and rate, else None.
     ends : ndarray, shape (n,)
