@@ -92,7 +92,7 @@ class Felt:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Load cells whose forces agree with the motion.
+    """Load cells that measure forces in agreement with the motion.
 
     pairs : (k,) indices of the pairs of these cells
     force : (n, 8) measured forces minus `offset` in N

@@ -1,7 +1,7 @@
 """Estimate of walls and stiffness from the weak form of the equations of motion.
 
 The method simulates no motion, so errors of the load do not accumulate. The equations are multiplied by smooth test
-functions psi. Integration by parts then moves the derivatives from the measured poses q to psi:
+functions psi. Integration by parts moves the derivatives from the measured poses q to psi:
 
     integral psi'' q  =  integral psi (load + contact) / M,
     contact = K sum n p (1 + d p'),   integral psi p p' = -1/2 integral psi' p^2,

@@ -5,10 +5,10 @@ the state is known best, and an error of the state has the smallest effect on th
 from its own starting state (multiple shooting), so errors due to the load or to bounces do not accumulate from swing to
 swing. Levenberg-Marquardt steps minimise the sum of Huber's function of the residuals and the terms of the prior.
 
-If the load is unknown between its samples, the swings are short, and each swing is *linked* to the next swing. The
-start of the next swing may then differ from the end of the swing by a random jump, with the covariance that the unknown
-load causes (weak constraints). Simulations from displaced starting states give the variance of the prediction at each
-time. This variance is added to the variance of the measurement.
+If the load is unknown between its samples, the swings are short, and each swing is *linked* to the next swing. A link
+allows a random jump between the end of a swing and the start of the next swing (weak constraints). The jump has the
+covariance that the unknown load causes. Simulations from displaced starting states give the variance of the prediction
+at each time. This variance is added to the variance of the measurement.
 
 References: Bock, Recent advances in parameter identification techniques for ODE (1983); Nocedal and Wright, Numerical
 Optimization, ch. 10; Huber, Robust Statistics, ch. 7; Tremolet, Q. J. R. Meteorol. Soc. 132 (2006) 2483.

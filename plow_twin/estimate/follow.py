@@ -233,7 +233,7 @@ class Follower:
 
     @property
     def lost(self) -> int:
-        """Number of members whose motion has left the range of the model."""
+        """Number of members that have left the range of the model."""
         self.catch_up()
         return int((~self._ensemble.good).sum())
 
@@ -514,7 +514,7 @@ class Follower:
         return self._text
 
     def follow_estimate(self, known: str) -> None:
-        """Follow the estimate that was the property `known` of another follower.
+        """Follow the estimate `known` (JSON), which is the property `known` of a different follower.
 
         The model times of the two followers may have different origins. The phases of the load's harmonics are unknown
         in this case, so the harmonics are dropped.
@@ -649,7 +649,7 @@ def _facts(data: bytes) -> tuple[dict[str, Any], int]:
 
 
 def prior(scene: Scene) -> Estimate:
-    """Return the prior of a scene as an estimate that also contains the damping and the gains of the load."""
+    """Return the prior of a scene as an estimate, including the damping and the gains of the load."""
     units = Units.of(scene, _NO_LOAD)
     unknowns = Unknowns.stated(units.scene(scene), _NO_LOAD, _NO_POSES)
     normal = [Interval.normal(*pair) for pair in zip(unknowns.nominal(), unknowns.deviations(), strict=True)]

@@ -78,7 +78,7 @@ class _At:
 class _Block:
     """Normal equations of a swing, from which its starting state has been eliminated.
 
-    normal, score : (b, b), (b,) matrix and right-hand side for the other unknowns, which form the border
+    normal, score : (b, b), (b,) matrix and right-hand side for the unknowns of the border, which are all other unknowns
     state : (6,) step of the starting state if the border's unknowns do not change
     answer : (6, b) derivative of the starting state's step with respect to the steps of the border's unknowns
     root : (6, 6) Cholesky factor of the covariance of the starting state

@@ -1,4 +1,4 @@
-"""Contact forces with intervals, from an ensemble of twins whose parameters are drawn from an estimate.
+"""Contact forces with intervals, from an ensemble of twins with parameters drawn from an estimate.
 
 A twin of the ensemble is called a member. The clearances, the contact parameters and the load gains of each member are
 drawn from the estimate with their correlations. The ends of a force's interval are quantiles of this force over the
@@ -84,7 +84,7 @@ class Forces:
 
 
 class ForceEnsemble:
-    """Ensemble of twins whose parameters are drawn from an estimate, and which are advanced together.
+    """Ensemble of twins with parameters drawn from an estimate. All twins are advanced together.
 
     Parameters
     ----------

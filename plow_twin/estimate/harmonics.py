@@ -28,7 +28,8 @@ _KNOTS = 24
 
 @dataclass(frozen=True, eq=False)
 class Harmonics:
-    """Fourier terms that are added to a load: a constant, then sine and cosine of each multiple of the frequency.
+    """Fourier terms that are added to a load. They are a constant, and sine and cosine of each multiple of the
+    frequency.
 
     omega : angular frequency of the load in rad/s
     multiples : multiples of `omega` for which there are terms

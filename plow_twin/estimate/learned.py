@@ -1,6 +1,6 @@
 """Estimation of the members' parameters from the poses that move the members of a follower.
 
-With a hard contact the motion is too irregular for a fit, so an estimate hardly determines stiffness and load gains.
+With a hard contact, the motion is too irregular for a fit, so an estimate hardly determines stiffness and load gains.
 Stiffness and load gains are therefore estimated from the poses while the twin follows the machine. The method is
 similar to a two-stage Kalman filter (Friedland, IEEE Trans. Autom. Control 14 (1969) 359):
 
@@ -100,7 +100,7 @@ class Learner:
 
     @classmethod
     def of(cls, drawn: Array, time: float) -> Learner | None:
-        """Return a learner of all parameters whose deviation exceeds one unit.
+        """Return a learner of all parameters that have a standard deviation above one unit.
 
         The result is None if there is no such parameter, or if there are too few members.
         """

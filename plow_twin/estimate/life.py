@@ -97,7 +97,7 @@ def period_of(scene: Scene) -> float:
 def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, Array]:
     """Return the mean force of each worn pad in N, shape (8,), and its standard error over the periods.
 
-    If pads also wear by sliding in the plane of the motion, each force is multiplied by the sliding distance per
+    If the scene has wear by sliding in the plane of the motion, each force is multiplied by the sliding distance per
     travel.
 
     Raises

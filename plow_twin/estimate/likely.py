@@ -2,9 +2,9 @@
 
 Motions with random parameters are simulated. Their features, including the path, are modelled as a quadratic function
 of the parameters plus normal noise (synthetic likelihood: Wood, Nature 466 (2010) 1102). The clearances of largest
-likelihood are then used as features of a regression over the simulated motions (semi-automatic approximate Bayesian
-computation: Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012) 419). The path itself cannot be used for the
-regression, because it has more numbers than there are motions.
+likelihood are features of a regression over the simulated motions (semi-automatic approximate Bayesian computation:
+Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012) 419). The path itself cannot be used for the regression, because it
+has more numbers than there are motions.
 """
 
 from __future__ import annotations

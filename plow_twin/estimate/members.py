@@ -298,7 +298,7 @@ class Ensemble:
             self._set_numbers(np.zeros(1, np.int64), before._numbers[:1])
 
     def stand_about(self, q: Array, v: Array) -> None:
-        """Move the first member to the pose `q`, and the other members to the pose scaled to their clearances."""
+        """Move the first member to the pose `q`. Move each further member to the pose scaled to its clearances."""
         places = q * self._shares(np.broadcast_to(self._room()[0], (len(self.good), 3)))
         force = self._force(self._penetration(places))[:1]
         self._stand(places, np.tile(v, (len(places), 1)), np.tile(force, (len(places), 1)))
@@ -497,7 +497,7 @@ class Ensemble:
         return found
 
     def twins(self) -> list[bytes]:
-        """Return the exact states of the first twin and of the other twins."""
+        """Return two byte strings: the exact state of the first twin, and the exact states of all further twins."""
         return [self.first.snapshot(), b"" if self.others is None else self.others.snapshot()]
 
     def set_twins(self, states: Sequence[bytes]) -> None:

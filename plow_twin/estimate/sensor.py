@@ -1,6 +1,6 @@
 """Models of a sensor with a lever arm, and of a sensor with a low pass.
 
-A sensor with a lever arm measures a point away from the centre of the head. This point also moves when the head
+A sensor with a lever arm measures a point away from the centre of the head. The measured point moves when the head
 rotates. A first-order low pass y of the pose u obeys tau dy/dt = u - y. The mean delay tau of the low pass is part of
 the delay of the stamps. For a small tau, the remaining difference is tau^2 / 2 times the acceleration.
 """

@@ -149,10 +149,10 @@ def _repeated(problem: Problem, fit: Fit, period: float, verdict: Verdict) -> No
 
 
 def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
-    """Test whether another contact law explains the residuals (linearised score test).
+    """Test whether the alternative contact law explains the residuals (linearised score test).
 
-    The motion under the other law is simulated from the same starting states and mixed into the predicted motion. The
-    share of the other law is an additional unknown. All other unknowns are eliminated.
+    The motion under the alternative law is simulated from the starting states of the fit and mixed into the predicted
+    motion. The share of the alternative law is an additional unknown. All unknowns except the share are eliminated.
     """
     unknowns = with_other_law(problem.unknowns)
     if unknowns is None or not fit.finished:
@@ -268,7 +268,7 @@ def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
         changed = np.abs(growth)
     # a wrong load or law can resemble a change, but only a real change explains a large share of the residuals
     if changed.any() and share > tuning.CHANGE_SHARE and _felt(problem, fit):
-        # a change up to the deviation of a rough clearance is included in the interval instead
+        # a change up to the deviation of a rough clearance only widens the interval
         verdict.broken |= bool(changed.max() > 2.0 * tuning.OBSERVED)
         verdict.changed = changed
 

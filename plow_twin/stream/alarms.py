@@ -161,8 +161,8 @@ class _Model:
     def residual(self, stamp_ns: int, x: float, y: float) -> tuple[int, float] | None:
         """Return the stamp [ns] of a measured pose and its distance [m] from the model.
 
-        The result is None for a pose that is older than all stored poses of the model. It is also None for a pose that
-        is newer than the model and therefore waits.
+        The result is None if the pose is older than all stored poses of the model, or if it is newer than the model and
+        therefore waits.
         """
         if not self._stamps_ns or stamp_ns > self._stamps_ns[-1]:
             if len(self._waiting) < _MOST_WAITING:

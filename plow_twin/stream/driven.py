@@ -14,7 +14,8 @@ from plow_twin.run.twin import Advanced
 
 Array = NDArray[np.float64]
 
-#: Largest number of measured poses that are stored in case the motion is computed again: ten seconds at 1 kHz.
+#: Largest number of measured poses that are stored for a repeated computation of the motion. It is reached after ten
+#: seconds at 1 kHz.
 MOST_MEASURED: Final = 10_000
 
 
@@ -56,7 +57,7 @@ class Driven(Protocol):
 class Following(Driven, Protocol):
     """A twin that is corrected by measured poses and by estimates.
 
-    Its rows also contain the fields `FOLLOWED_FIELDS` of `plow_twin.stream.outputs`.
+    The rows of its advances contain the additional fields `FOLLOWED_FIELDS` of `plow_twin.stream.outputs`.
     """
 
     #: number of poses and estimates added so far

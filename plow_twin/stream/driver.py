@@ -50,7 +50,7 @@ _LARGEST_HOLD_NS: Final = NS_PER_S
 #: Longest time [ns] between two checks for a silence, which is short so that a changed policy soon has an effect.
 _LONGEST_QUIET_NS: Final = NS_PER_S // 10
 #: Largest number of resets by jumps of the clock within `_RESET_WINDOW_NS`. Without this limit, two senders with
-#: different clocks would reset the model again and again.
+#: different clocks would reset the model at each of their samples.
 _MOST_RESETS: Final = 5
 _RESET_WINDOW_NS: Final = 10 * NS_PER_S
 
@@ -146,7 +146,8 @@ class Driver:
         """Judge samples in order of arrival, advance to the accepted samples, and yield the publications.
 
         The caller must send each publication before it requests the next publication, so that a recording contains the
-        publications in order. A sample whose stamp jumps waits until the next sample arrives or a silence begins.
+        publications in order. If the stamp of a sample jumps, the sample waits until the next sample arrives or a
+        silence begins.
         """
         run: list[Sample] = []
         for stamp_ns, wrench in arrived:

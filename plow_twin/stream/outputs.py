@@ -114,7 +114,7 @@ NOTHING: Final = Published(_NO_ROWS, _NO_SLOW)
 
 
 def _numbered_from(slow: Rows, first: int) -> Rows:
-    """Return a copy of slow parts whose row indices count from the row `first`."""
+    """Return a copy of slow parts with row indices that count from the row `first`."""
     if len(slow):
         slow = slow.copy()
         slow["row"] -= first

@@ -34,7 +34,7 @@ class Senders:
         self._before = frozenset(present)
 
     def start_late(self, sender: bytes) -> None:
-        """Register a sender whose messages before its first received sample do not count as lost."""
+        """Register a sender. Its messages before the first received sample do not count as lost."""
         self._before |= {sender}
 
     def hear(self, sender: bytes, number: int, count: int = 1) -> bool:
@@ -73,9 +73,7 @@ class Senders:
             self._other = None
 
     def switch(self) -> bool:
-        """Follow the sender, of those not followed, that sent most recently; return False if there is no such
-        sender.
-        """
+        """Follow the newest active sender among those not followed; return False if there is none."""
         if self._other is None:
             return False
         self._other, self.followed = self.followed, self._other

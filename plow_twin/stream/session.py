@@ -146,7 +146,7 @@ class _UndoneError(Exception):
 
 
 class Session:
-    """One run of a twin whose inputs are entries of a journal.
+    """One run of a twin. The inputs of the twin are entries of a journal.
 
     The same entries in the same order give bit-identical motion, publications and digests.
 
@@ -154,14 +154,14 @@ class Session:
     but not the wear, which only `SetWear` changes. While the load is held or removed, the true load is unknown, so the
     pads do not wear. If the scene itself defines the loads, a `Hold` only advances the time.
 
-    To insert a late sample, the session goes back to the newest snapshot before its stamp. From there it computes the
-    motion up to the newest sample again. Motion after the newest sample is dropped.
+    To insert a late sample, the session goes back to the newest snapshot before its stamp. From this snapshot on, the
+    motion up to the newest sample is computed again. Motion after the newest sample is dropped.
 
     Parameters
     ----------
     twin
-        The twin, which only the session may advance. A twin that follows measurements also receives the measured poses
-        and the estimates.
+        The twin, which only the session may advance. A twin that follows measurements receives measured poses and
+        estimates from the session.
     origin_ns
         Stamp of model time 0 [ns]; None for the first stamp.
     on_entry
@@ -623,7 +623,7 @@ class Session:
                     self._follow(one.stamp_ns, one.entry, one.known)
                 else:
                     self._measured.append(one)
-        # a speed whose stamp is that of the snapshot may occur twice
+        # a speed with the stamp of the snapshot may occur twice
         known = {travel.stamp_ns: travel for travel in (*self._travels, *travels, *pending, *more)}
         self._travels = sorted(known.values(), key=lambda travel: travel.stamp_ns)
         return samples

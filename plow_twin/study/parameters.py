@@ -220,7 +220,7 @@ def _vector(load: Any, field_name: str) -> tuple[float, ...]:
 
 
 def _times(vector: tuple[float, ...], factor: float) -> tuple[float, ...]:
-    # +0 instead of -0: two equal scenes then give equal files
+    # -0 is replaced by +0, so that two equal scenes give equal files
     return tuple(factor * x if x != 0.0 else 0.0 for x in vector)
 
 

@@ -50,7 +50,8 @@ _COLUMNS: Final = (
     *(f"force_{name}" for name in PAIR_NAMES),
     *(f"gap_{name}" for name in PAIR_NAMES),
 )
-#: Tolerance of the solver for a recording of another program, which states no tolerance.
+#: Tolerance of the solver for a recording that another program has written, because such a recording states no
+#: tolerance.
 _TOLERANCE: Final = 1e-9
 #: Time [ns] by which a measured stamp must be older than the newest stamp to show that the clock has stepped back.
 _STEP_NS: Final = 1_000_000_000
@@ -99,7 +100,7 @@ class Prediction:
         return np.asarray(np.any(inside, axis=0))
 
     def outside(self, signal: ThinnedSignal) -> int:
-        """Return the number of values of a signal whose stamps lie in no stretch of the load."""
+        """Return the number of values of a signal that have a stamp in no stretch of the load."""
         inside = self.is_inside(signal)
         return round(signal.came * (1.0 - float(inside.mean()))) if len(inside) else 0
 

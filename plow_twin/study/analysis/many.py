@@ -26,8 +26,8 @@ def run_many(
 ) -> list[dict[str, Any]]:
     """Return the result of each task, or a mapping with the key `error` if the task failed.
 
-    A task with a stored result does not run again. The tasks run in `workers` processes, or on the Dask cluster with
-    the scheduler at `dask`. The workers of the cluster must have access to the same files.
+    A task with a stored result does not run. The tasks run in `workers` processes, or on the Dask cluster with the
+    scheduler at `dask`. The workers of the cluster must have access to the same files.
 
     Raises
     ------

@@ -74,9 +74,9 @@ def points(values: Array) -> dict[str, float]:
 def with_neighbours(load: Array, start_ns: NDArray[np.int64]) -> Array:
     """Return the load of each window and the loads of its two neighbours in time, shape (n, 3).
 
-    The motion in a window also depends on the load in the neighbouring windows. The effect of a lasting change of the
-    load is therefore the sum of the slopes with respect to all three loads. A missing neighbour is replaced by the
-    window itself.
+    The motion in a window depends on the load in the window and in its two neighbours. The effect of a lasting change
+    of the load is therefore the sum of the slopes with respect to all three loads. A missing neighbour is replaced by
+    the window itself.
     """
     steps = np.diff(start_ns)
     joined = (steps > 0) & (steps < _NEXT * np.median(steps)) if len(steps) else steps > 0

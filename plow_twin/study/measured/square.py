@@ -42,8 +42,8 @@ SQUARE: Final = np.array(
 class Marker:
     """Place of the tracked coordinate frame on the block.
 
-    Two observations show that the frame is not at the centre of the block. In 242 of 250 drops the block lies flat at
-    rest, but the tracked angle is then -33 mrad. The tracked height at rest depends on the side on which the block
+    Two observations show that the frame is not at the centre of the block. In 242 of 250 drops, the block lies flat at
+    rest, but its tracked angle at rest is not zero. The tracked height at rest depends on the side on which the block
     lies.
     """
 

@@ -142,7 +142,7 @@ def run_all(
 def _sweeps(
     scene: Scene, scale: tuple[float, float], t_end: float, workers: int | None, on_progress: OnProgress
 ) -> tuple[tuple[Sweep, Sweep], int]:
-    """Return the curves of Figs 10 and 11, and the number of failed runs, whose forces are NaN."""
+    """Return the curves of Figs 10 and 11, and the number of failed runs. The forces of a failed run are NaN."""
     fine = np.linspace(GRID_M[0], GRID_M[-1], _FINE_STEPS * (len(GRID_M) - 1) + 1)
     cells = [(FIXED_M, value) for value in fine] + [(value, FIXED_M) for value in fine]
     scenes = [_at(scene, scale, *cell) for cell in cells]

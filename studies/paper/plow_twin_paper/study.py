@@ -30,7 +30,7 @@ FORMS = ("constant moment", "exact, I about the centre of mass", "exact, I about
 
 @dataclass(frozen=True)
 class Change:
-    """A statement whose verdict depends on the model of the head's rotation."""
+    """A statement with a verdict that depends on the model of the head's rotation."""
 
     form: str
     row: Row
