@@ -21,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
         sys.exit("plow-twin: NUMBA_DISABLE_JIT is set, expected it unset, because the solver must be compiled")
     with _ending_at_once():
-        # the cause of an ImportError is reported if it exists, because it is more precise
+        # if an ImportError has a cause, the cause is reported, because it is more precise
         try:
             import plow_twin.run.twin  # noqa: F401
             from plow_twin.cli.app import main as run
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def _open_what_is_closed() -> None:
-    """Open /dev/null for closed standard streams, so that no other file receives the descriptors 0 to 2."""
+    """Open /dev/null for closed standard streams, so that no file of the program receives the descriptors 0 to 2."""
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(descriptor)
@@ -47,7 +47,7 @@ def _open_what_is_closed() -> None:
 
 @contextmanager
 def _ending_at_once() -> Iterator[None]:
-    """End the process at Ctrl-C without a traceback. Nothing must be saved, because no work has begun."""
+    """End the process at Ctrl-C without a traceback. No data need to be saved, because no work has begun."""
 
     def end(*_: object) -> None:
         os.write(2, b"plow-twin: interrupted\n")

@@ -88,7 +88,7 @@ def analyse(
 
 
 def found_recordings(recordings: Sequence[Path], out: Path | None = None) -> tuple[list[Path], tuple[Path, ...]]:
-    """Return the recordings at paths and in folders, and the other items in the folders, which are also reported."""
+    """Return the recordings at paths and in folders, and the items in the folders that are not recordings."""
     from plow_twin.study.analysis.recordings import counted_once, expand, left_out
 
     for path in recordings:
@@ -122,7 +122,7 @@ def _alone(task: Any, quiet: bool) -> dict[str, Any]:
 
 
 def _run(tasks: list[Any], workers: int, dask: str | None, quiet: bool) -> list[dict[str, Any]]:
-    """Analyse recordings on all cores or on a cluster. Results of an interrupted command are used."""
+    """Analyse recordings on all cores or on a cluster. Results that an interrupted command has written are used."""
     from plow_twin.study.analysis.many import run_many
 
     with progress("analysing", quiet) as on_progress:
@@ -153,7 +153,7 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
             sys.stdout.flush()
         else:
             _show([facts], False, False, quiet)
-        # the reports take at most a tenth of the time
+        # the interval between reports is chosen so that the reports take at most a tenth of the time
         due = time.monotonic() + max(every, 9.0 * (time.monotonic() - begin))
 
     with interruptible() as stopped:

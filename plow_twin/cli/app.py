@@ -33,7 +33,7 @@ from plow_twin.cli.telemetry import telemetry
 from plow_twin.cli.view import view
 from plow_twin.errors import ExcessError, InputError, PlowTwinError, RunInterrupted, UnitError
 
-#: Extra of the package that installs each optional module.
+#: Extra of the package that must be installed for each optional module.
 EXTRA_OF_MODULE: Final = {
     "rclpy": "ros",
     "rcl_interfaces": "ros",
@@ -66,7 +66,7 @@ EXTRA_OF_MODULE: Final = {
     "distributed": "dask",
 }
 
-#: Largest length of an error message [characters]. A message may list the names in a file, which may be a million.
+#: Largest length of an error message [characters]. A message may list names in a file, and a file may have many names.
 _LONGEST: Final = 16_000
 
 
@@ -123,7 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         if sys.stdout is not None:  # standard output is None if it was closed at the start
             sys.stdout.flush()
     except BrokenPipeError:
-        # with this replacement, Python does not report a broken pipe at exit
+        # standard output is replaced, so that Python does not report a broken pipe at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(code)
 

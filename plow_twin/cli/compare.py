@@ -136,7 +136,7 @@ def _show(found: Comparison) -> None:
     console.print(_KEY, highlight=False)
 
 
-#: Sign of each cause of a change in a table, and an explanation of the signs.
+#: Sign of each cause of a change in a table.
 _SIGNS: Final = {"chance": "", "machine": "M", "load": "L", "load or machine": "?"}
 _KEY: Final = (
     "M: the machine changed; L: the load changed; ?: the machine or the load changed; no letter: the change may be "

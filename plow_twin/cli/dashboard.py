@@ -1,4 +1,4 @@
-"""The command `plow-twin dashboard`, which shows a node or a recording in the browser, and the options of the page."""
+"""The command `plow-twin dashboard`, which shows a node or a recording on a page in the browser."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def access_of(options: dict[str, Any]) -> PageAccess:
 def access_if_shown(options: dict[str, Any]) -> PageAccess | None:
     """Return the result of `access_of`, or None without the option `--dashboard`.
 
-    Without `--dashboard`, the other options of the page are errors.
+    Without the option `--dashboard`, the options `--listen` and `--token-file` are errors.
     """
     if options["dashboard"]:
         return access_of(options)

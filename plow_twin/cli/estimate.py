@@ -188,7 +188,10 @@ def _measured(source: Path, scene: Path | None, mapping: Path | None, folder: bo
 
 
 def _load_of(measured: Measured) -> tuple[Load, int]:
-    """Return the load and the number of unusable rows; a load that was not measured is zero over the poses or gaps."""
+    """Return the load and the number of unusable rows.
+
+    If the load was not measured, the returned load is zero during the measured poses or gaps.
+    """
     from plow_twin.estimate.measurements import Load
 
     if len(measured.load):
@@ -241,7 +244,7 @@ def _check_units(source: Path, measured: Measured) -> None:
 
 
 def _repeated(source: Path) -> _Task | None:
-    """Return the task to compute the last estimate of a live node again, or None if there is no estimate."""
+    """Return the task to repeat the last estimate of a live node, or None if there is no estimate."""
     from plow_twin.estimate.answer import answer
     from plow_twin.live.estimation import asked_of
     from plow_twin.live.parameters import settings
@@ -300,7 +303,7 @@ def _labels(scene: Scene) -> dict[str, str]:
 
 
 def _forces(task: _Task, result: Estimate, members: int) -> Forces | None:
-    """Return the contact forces under the measured load, or None if no twins can be drawn from the estimate."""
+    """Return the contact forces under the measured load, or None if the estimate is not sufficient to compute them."""
     from plow_twin.estimate.forces import forces_of
     from plow_twin.estimate.result import State
 

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
 
 
-#: Smallest plausible ratio of a limit to the clearance. A smaller limit was probably given in m instead of mm.
+#: Smallest plausible ratio of a limit to the clearance. If the ratio is smaller, the limit was probably given in m, not
+#: in mm.
 _METRES: Final = 1e-2
 
 
@@ -158,7 +159,7 @@ def _check_limits(limits_m: tuple[float, float], scene: Scene) -> None:
 def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
     """Return the scene, the last estimate, and the losses of the journal.
 
-    For a run, the scene is that at the end of the run. Without a run, there is no estimate.
+    If `name` is a run, the scene at the end of the run is returned. If `name` is not a run, the estimate is None.
     """
     from plow_twin.record.estimated import left_by
     from plow_twin.record.reader import RunReader, own_run

@@ -20,7 +20,7 @@ def interruptible(on_overdue: Callable[[], object] = lambda: None) -> Iterator[C
     """Yield a function that returns whether a stop signal has arrived.
 
     If the context has not ended `PATIENCE_S` seconds after the signal, `on_overdue` is called and the process ends with
-    exit code 1. A library that waits for a viewer cannot be interrupted in another way.
+    exit code 1. The process is ended because a library that waits for a viewer cannot be interrupted.
     """
     asked, done = threading.Event(), threading.Event()
     receive, send = os.pipe()

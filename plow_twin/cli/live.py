@@ -216,7 +216,7 @@ def _show_estimate(front: BridgeFront) -> None:
 
 
 def _settings(options: dict[str, Any]) -> Settings:
-    """Return the parameters from the file, from `--set` and from other options; later sources have priority."""
+    """Return the parameters from the file, the option `--set` and the specific options, in ascending priority."""
     from plow_twin.live import parameters
 
     values = parameters.read_parameters(options["params"]) if options["params"] else {}
@@ -280,7 +280,7 @@ def _bridge(source: str, options: dict[str, Any], rate_hz: float) -> Bridge:
 
 
 def _tables(folder: Path, *, growing: bool) -> list[Path]:
-    """Return the tables in a folder, without Parquet files if the tables are growing."""
+    """Return the tables in a folder. If the tables are growing, Parquet files are omitted."""
     from plow_twin.scene_file.csv_rows import tables
     from plow_twin.scene_file.parquet_lines import is_parquet
 

@@ -21,8 +21,8 @@ class Report:
     """Printer of reports.
 
     Status and alarms are printed as text when they change, unless `quiet` is true. With `lines`, all parts are printed
-    as JSON lines. An alarm is reported when it is raised and when it is acknowledged. A slow reader does not delay the
-    twin; lines are dropped and counted instead.
+    as JSON lines. An alarm is reported when it is raised and when it is acknowledged. If the reader is slow, lines are
+    dropped and counted, so that the twin is not delayed.
     """
 
     def __init__(self, *, lines: bool, quiet: bool, stamp_ns: Callable[[], int]) -> None:
@@ -35,7 +35,7 @@ class Report:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is not None:  # without an error, the caller has closed both outputs
+        if kind is not None:  # if there is no error, the caller has closed the two outputs
             with suppress(BrokenPipeError):
                 self.close_lines()
             self.close()
@@ -46,15 +46,15 @@ class Report:
         return self._out.lost
 
     def error(self, text: str) -> None:
-        """Report an error. The method may be called from another thread."""
+        """Report an error. The method may be called from any thread."""
         self._errors.put(f"plow-twin: {text}")
 
     def close_lines(self) -> bool:
-        """Write the last JSON lines; return False if their reader does not read them."""
+        """Write the last JSON lines; return False if the reader does not read all lines."""
         return self._out.close()
 
     def close(self) -> bool:
-        """Write the last lines of text; return False if their reader does not read them."""
+        """Write the last lines of text; return False if the reader does not read all lines."""
         return self._errors.close()
 
     def say(self, name: str, part: Part) -> None:

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-#: Largest number of lines in the queue. The oldest lines are dropped.
+#: Largest number of lines in the queue. If there are more lines, the oldest lines are dropped.
 MOST_WAITING: Final = 1000
 #: Longest wait at the end for a reader that does not read a line [s].
 _PATIENCE_S: Final = 2.0
@@ -16,8 +16,8 @@ _PATIENCE_S: Final = 2.0
 class Outlet:
     """Queue of lines that a separate thread writes in order.
 
-    The function `write` writes a line and returns whether this succeeded. The function `on_loss` is called when the
-    first line is dropped.
+    The function `write` writes a line and returns whether the write succeeded. The function `on_loss` is called when
+    the first line is dropped.
     """
 
     def __init__(self, write: Callable[[str], bool], on_loss: Callable[[], object] = lambda: None) -> None:
@@ -47,7 +47,7 @@ class Outlet:
             self._thread.start()
 
     def close(self) -> bool:
-        """Wait until all lines are written; return False if the reader does not read them.
+        """Wait until all lines are written; return False if the reader does not read all lines.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""The command `plow-twin record`, which records other topics in the folder of a run."""
+"""The command `plow-twin record`, which records topics of other nodes in the folder of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Summarize the content, the end and the losses of a recording."""
+"""Summarize the content of a recording, the state of its end, and its losses."""
 
 from __future__ import annotations
 

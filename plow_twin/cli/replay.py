@@ -1,4 +1,4 @@
-"""The command `plow-twin replay`, which computes a recording again and compares the results."""
+"""The command `plow-twin replay`, which replays a recording and compares the results with the recorded outputs."""
 
 from __future__ import annotations
 

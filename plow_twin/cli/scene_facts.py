@@ -1,4 +1,7 @@
-"""List the numbers of a scene with their marks, and quantities that are derived from them."""
+"""List the numbers of a scene, and quantities that are derived from the numbers.
+
+The *mark* of a number states whether the number is given, measured, reconstructed or assumed.
+"""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ def _run(
 ) -> tuple[Result, LimitError | RunInterrupted | None]:
     """Simulate the scene, and return the result and None.
 
-    At a limit or after Ctrl-C, return the result up to this time and the reason.
+    If the simulation ends at a limit or after Ctrl-C, return the result up to the end and the reason.
     """
     from plow_twin.errors import LimitError, RunInterrupted, SceneError, ToleranceWarning
     from plow_twin.run.simulate import simulate as run
@@ -148,7 +148,10 @@ def _check_rows(t_end: float, output_dt: float | None) -> None:
 
 
 def write_samples(result: Result, path: Path) -> None:
-    """Write the output rows as .csv, with 17 digits, or as .npz, with all contact events."""
+    """Write the output rows as .csv or as .npz.
+
+    Numbers in a .csv file have 17 digits. A .npz file contains all contact events in addition.
+    """
     from plow_twin.record.durable import whole_file
 
     with whole_file(path) as stream:
@@ -202,7 +205,7 @@ def as_plain(result: Result, scene: str, t_end: float) -> dict[str, Any]:
 
 
 def balance_of(balance: EnergyBalance) -> dict[str, Any]:
-    """Return the balance, with the imbalance relative to the turnover, as a dictionary for JSON."""
+    """Return the energy balance as a dictionary for JSON, with the ratio of the imbalance to the turnover."""
     from dataclasses import asdict
 
     import numpy as np
@@ -238,7 +241,7 @@ def _balance_table(balance: EnergyBalance) -> Table:
         ("- stored in contacts, end minus start", -stored),
         ("= kinetic energy gained", kinetic),
     ):
-        rows.add_row(name, f"{value + 0.0:.6g}")  # adding 0.0 turns -0 into 0
+        rows.add_row(name, f"{value + 0.0:.6g}")  # the sum of negative zero and 0.0 is positive zero
     rows.add_row("largest imbalance at any step", f"{balance.imbalance_j:.3g}")
     rows.add_row("largest imbalance over turnover", f"{balance.relative_imbalance:.1e}")
     rows.add_row(

@@ -27,7 +27,7 @@ def study() -> None:
 def paper_command() -> click.Command:
     """Return the verb `paper` of the package `plow_twin_paper`, which may be installed or in a clone.
 
-    Without the package, return a verb whose error explains the installation.
+    If the package is missing, the returned verb raises an error that explains the installation.
     """
     if CLONE.is_dir() and str(CLONE) not in sys.path:
         sys.path.append(str(CLONE))

@@ -112,9 +112,9 @@ def calibrate(
 
 
 def _merged(proposed: Sequence[str], given: Sequence[str]) -> tuple[str, ...]:
-    """Return the unknowns in the target file, `proposed`, with changes by the unknowns of the user, `given`.
+    """Return the unknowns in the target file, `proposed`, after changes by the unknowns of the user, `given`.
 
-    An unknown of the user replaces the unknown of the same parameter; damping and restitution count as one parameter.
+    An unknown of the user replaces the unknown of the same parameter. Damping and restitution count as one parameter.
     The text `PATH=fixed` removes an unknown.
     """
     paths = {text.partition("=")[0] for text in given}
@@ -157,7 +157,7 @@ def _check_options(options: dict[str, Any]) -> None:
 def _objective(
     scene: str, settings: Sequence[str], options: dict[str, Any]
 ) -> tuple[Scene, Objective, str, tuple[str, ...]]:
-    """Return the scene, the objective function, a name of the fitted data, and the unknowns in the target file."""
+    """Return the scene, the objective function, the name of the fitted data, and the unknowns in the target file."""
     from dataclasses import replace
 
     from plow_twin.record.unit_check import check_poses

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 #: Largest number of rows of a table on the terminal. The files contain all rows.
 MOST_ROWS: Final = 24
-#: Width of a column of numbers, and additional width of the first column [characters].
+#: Width of a column of numbers, and width that is added for the first column [characters].
 _COLUMN, _FIRST_COLUMN = 12, 8
 
 

@@ -1,4 +1,4 @@
-"""The command `plow-twin telemetry`, which sends the results of a node, and the options for the receivers."""
+"""The command `plow-twin telemetry`, which sends the results of a node, and the options that define the receivers."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from plow_twin.view.rrd import ViewSummary
 
 
-#: Largest factor by which a drawing enlarges the clearance. With larger factors, the cavity is far from the frame.
+#: Largest factor by which a drawing enlarges the clearance. A larger factor would draw the cavity far from the frame.
 _MOST_EXAGGERATED = 1e4
 
 
@@ -203,8 +203,8 @@ def _serve(file: Path, port: int) -> int:
     command = [program, str(file), "--serve-web", "--bind", LOOPBACK, "--port", str(data_port)]
     click.echo(f"serving until interrupted: {page_address(port, data_port)}")
     sys.stdout.flush()
-    # The program replaces this process, so that it receives the signals. Only errors are logged, because the log would
-    # contain an address of the page with the light theme, whose labels cannot be read.
+    # The program replaces this process, so that the program receives the signals. Only errors are logged, because the
+    # address of the page in the log selects the light theme, in which labels cannot be read.
     os.execve(program, [*command, "--web-viewer-port", str(port)], {"RUST_LOG": "error", **os.environ})
 
 
@@ -217,7 +217,7 @@ def _follow(
     wait: float,
     quiet: bool,
 ) -> int:
-    """Show a run while it is recorded. If the command starts a viewer, the viewer ends with the command."""
+    """Show a run while it is recorded. A viewer that the command has started ends with the command."""
     from plow_twin.cli.interruption import interruptible
     from plow_twin.record.running import find_run
     from plow_twin.view.live import follow

@@ -1,4 +1,4 @@
-"""Access to the operator's screen: its address, its token, and the host names under which it can be requested."""
+"""Access to the operator's screen: the address, the token, and the allowed host names."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ class DashboardError(InputError):
 
 @dataclass(frozen=True)
 class PageAccess:
-    """Address and token of the screen. Without a token, all users of this machine can see it and acknowledge alarms."""
+    """Address and token of the screen.
+
+    Without a token, all users of this machine can see the screen and acknowledge alarms.
+    """
 
     host: str
     port: int
@@ -37,8 +40,8 @@ class PageAccess:
     def of(cls, listen: str, token_file: Path | None) -> PageAccess:
         """Return the access for HOST:PORT. The token is the first line of a file, or is taken from the environment.
 
-        Raises `DashboardError` if the address cannot be parsed, or if other machines can reach the address and there is
-        no token.
+        `DashboardError` is raised if the address cannot be parsed. It is raised if there is no token although machines
+        in the network can reach the address.
         """
         try:
             parts = urlsplit(f"//{listen}")
@@ -63,7 +66,7 @@ class PageAccess:
     def answers_to(self, host: str) -> bool:
         """Return whether the screen can be requested under the name in the header `Host`.
 
-        Other names are rejected: with DNS rebinding, a foreign page could use its own name to read the screen.
+        Unknown host names are rejected, because a foreign page could read the screen by DNS rebinding.
         """
         try:
             name = urlsplit(f"//{host}").hostname or ""

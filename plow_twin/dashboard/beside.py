@@ -9,22 +9,22 @@ from typing import Any, Final, Self
 
 from plow_twin.dashboard.link import pair
 
-#: Longest time [s] in which the process must end on request.
+#: Time within which the process must end after a request [s].
 END_S: Final = 3.0
 
 
 class Beside:
-    """A running process and the link to it, as a context manager that ends the process.
+    """Context manager that runs a process and opens a link to it.
 
-    The command-line arguments of the module are the file descriptor of the link, followed by `descriptors`. Secrets are
-    in the message `first`, because other users can read the command line.
+    The command-line arguments of the process are the file descriptor of the link, followed by `descriptors`. Secrets
+    are sent in the message `first`, because all users of the machine can read the command line.
     """
 
     def __init__(self, module: str, first: dict[str, Any], descriptors: Sequence[int] = ()) -> None:
         self.link, theirs = pair()
         with theirs:
             numbers = (theirs.fileno(), *descriptors)
-            # in its own session, the process does not receive Ctrl-C; `close` ends it
+            # the process has its own session, so that Ctrl-C does not end it; `close` ends the process
             self.process = subprocess.Popen(
                 [sys.executable, "-m", module, *map(str, numbers)],
                 stdin=subprocess.DEVNULL,

@@ -1,4 +1,4 @@
-"""Feed of a process beside a twin: it collects publications and sends summaries at a fixed rate.
+"""Feed of a separate process. The feed collects the publications of a twin, and sends updates at a fixed rate.
 
 If an update does not fit in the buffer of the link, its peaks and newest values become part of the next update.
 """
@@ -28,7 +28,8 @@ _LONGEST: Final = 1000
 #: Largest number of operator requests that are handled in one call.
 _MOST_ASKED: Final = 8
 _NO_LOAD: Final = np.full(3, np.nan)
-#: States of a clearance with a measured value. They are repeated here, so that `estimate` need not be imported.
+#: States of a clearance that has a measured value. The names are repeated here, because the import of the package
+#: `estimate` takes long.
 _KNOWN_STATES: Final = ("estimated", "rough")
 
 
@@ -42,7 +43,7 @@ class Motion:
         self.penetration = np.full(PAIR_COUNT, np.nan)
         self.force = np.full(PAIR_COUNT, np.nan)
         self.clearance: Array | None = None
-        #: The newest estimate, until newer clearances are published.
+        #: The newest estimate. It is empty if newer clearances have been published.
         self.estimate: Mapping[str, str] = {}
         self.status: Mapping[str, str] = {}
         self.load = _NO_LOAD
@@ -52,7 +53,7 @@ class Motion:
     def clear(self) -> None:
         """Reset the extremes."""
         self.peak = np.zeros(PAIR_COUNT)
-        #: 5 % and 95 % points of the peaks, shape (2, 8), or None if they are unknown.
+        #: 5 % and 95 % points of the peaks, shape (2, 8), or None if the points are unknown.
         self.points: Array | None = None
         self.lowest = self.highest = self.load
         self.was_held = False
@@ -122,7 +123,9 @@ class Motion:
 
 
 class Feed:
-    """Sender of updates from a twin, or from a reader beside it, to the screen or a receiver of telemetry.
+    """Sender of updates to the screen, or to a receiver of telemetry.
+
+    The updates come from a twin in this process, or from the topics or the recording of a twin in another process.
 
     Parameters
     ----------
@@ -131,16 +134,18 @@ class Feed:
     facts
         Facts about the machine (`facts.facts_of`).
     answer
-        Function that carries out an operator request: `acknowledge`, or `mark` with a text. The function
-        returns success and an answer.
+        Function that carries out the operator request `acknowledge`, or the request `mark` with a text. It returns
+        whether the request succeeded, and an answer.
     load
         Function that returns the load Fx, Fy [N], M [N m] at the newest publication, shape (3,).
     on_error
         Callback that receives the reason when the feed has ended.
-    process, consequence
-        Name of the process, and the consequence of its end for the user.
+    process
+        Name of the process.
+    consequence
+        Consequence for the user when the process ends.
     by_second
-        If True, an update is sent for each second of stamps, even if samples arrive faster than in real time.
+        Whether an update is sent for each second of the stamps, even if samples arrive faster than in real time.
     """
 
     def __init__(
@@ -183,7 +188,7 @@ class Feed:
             self._sum_up()
 
     def part(self, name: str, part: Part) -> None:
-        """Add a status. It replaces the previous status with the same name."""
+        """Add a status, which replaces the previous status with the same name."""
         level, message, values = part
         # the diagnostics have a part with the name of this topic, which is recognised by its key `estimates`
         if name == "estimate" and "estimates" not in values:
@@ -219,7 +224,7 @@ class Feed:
                 self._do(asked)
 
     def send(self) -> bool:
-        """Send an update. Return False, and count the update, if it does not fit in the buffer of the link."""
+        """Send an update. If the update does not fit in the buffer of the link, count it and return False."""
         self._sum_up()
         update: dict[str, Any] = {**self._news, "not_taken": self.not_taken}
         if self._parts:
@@ -258,7 +263,7 @@ def _joined(rows: list[NDArray[np.void]], name: str) -> NDArray[Any]:
 
 
 def part_of(message: Message) -> Part:
-    """Convert a status or named numbers to the form of the page. Of contact forces, the peaks are used."""
+    """Convert a status or named numbers to the form that the page reads. Peaks represent the contact forces."""
     if isinstance(message, DiagnosticStatus):
         return message.level, message.message, dict(message.values)
     if not isinstance(message, JointState):

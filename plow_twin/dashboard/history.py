@@ -1,4 +1,4 @@
-"""History of the last hour for the screen: the extremes in each second of stamps."""
+"""History of the last hour for the screen. It contains the extremes in each second of the stamps."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ from collections import deque
 from typing import Any, Final
 
 SPAN_S: Final = 3600
-#: Clearances of a second, in the order of the page.
+#: Names of the clearances in a second, in the order in which the page reads them.
 _CLEARANCES: Final = tuple(f"{name}{point}" for name in ("horizontal", "vertical") for point in ("", "/p05", "/p95"))
 
 
 class History:
     """The seconds of the last hour. A page can request the seconds that have changed since its last update.
 
-    A second is a list: time [s], eight peaks, six extremes of the load, six clearances, and the hold flag. If intervals
-    of the peaks are known, their 5 % and 95 % points follow.
+    A second is a list of the time [s], eight peaks, six extremes of the load, six clearances, and the hold flag. The
+    hold flag is True if the load had no new samples. If the intervals of the peaks are known, the list ends with the
+    5 % and the 95 % points of the peaks.
     """
 
     def __init__(self) -> None:
@@ -59,7 +60,7 @@ class History:
 
 
 def _joined(before: list[Any], now: list[Any]) -> list[Any]:
-    """Merge a second with later values: the extremes of peaks and loads, and the newest clearances."""
+    """Merge a second with later values. The result has the extremes of peaks and loads, and the newest clearances."""
     largest = [_extreme(max, *pair) for pair in zip(before[1:9], now[1:9], strict=True)]
     lowest = [_extreme(min, *pair) for pair in zip(before[9:12], now[9:12], strict=True)]
     highest = [_extreme(max, *pair) for pair in zip(before[12:15], now[12:15], strict=True)]

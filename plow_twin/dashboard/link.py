@@ -1,4 +1,4 @@
-"""Link between a twin and a process beside it: messages of limited size in both directions, without blocking."""
+"""Link between a twin and a separate process. It passes messages of limited size, and never blocks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import suppress
 from typing import Any, Final
 
 LONGEST: Final = 1 << 16
-#: Size of the buffer for messages that wait for the other process [B].
+#: Size of the buffer for messages that the receiving process has not read [B].
 _ROOM: Final = 1 << 18
 
 
@@ -27,7 +27,7 @@ class Link:
         return self._end.fileno()
 
     def send(self, message: dict[str, Any]) -> bool:
-        """Send a message. Return False if it is too long, if the buffer is full, or if there is no receiver."""
+        """Send a message. Return False if the message is too long, the buffer is full, or there is no receiver."""
         data = json.dumps(message, separators=(",", ":")).encode()
         if self.broken or len(data) > LONGEST:
             return False
@@ -40,7 +40,7 @@ class Link:
             return False
 
     def receive(self) -> dict[str, Any] | None:
-        """Return the next message, or None if none has arrived."""
+        """Return the next message, or None if no message has arrived."""
         if self.broken:
             return None
         try:
@@ -56,20 +56,20 @@ class Link:
         return found
 
     def close(self) -> None:
-        """Close this end. The other end then finds the link broken."""
+        """Close this end. The process at the opposite end is notified that the link is broken."""
         with suppress(OSError):
             self._end.close()
         self.broken = True
 
 
 def pair() -> tuple[Link, socket.socket]:
-    """Return the end of this process, and the socket for the other process."""
+    """Return the end for this process, and the socket for the separate process."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     return Link(ours), theirs
 
 
 def number(value: float) -> float | None:
-    """Round a number to seven digits for JSON. Return None if it is not finite."""
+    """Round a number to seven digits for JSON. Return None if the number is not finite."""
     return float(f"{value:.7g}") if math.isfinite(value) else None
 
 

@@ -44,12 +44,16 @@ _SHOWN: Final = (
 )  # fmt: skip
 #: Longest time to wait for the answer of a service [s].
 _PATIENCE_S: Final = 5.0
-#: Queue depths: of topics of which only the newest message is needed, and of topics of which all messages are needed.
+#: Depths of the queues. The first depth is for topics from which only the newest message is needed. The second depth is
+#: for topics from which all messages are needed.
 _NEWEST, _ALL = 1, 1000
 
 
 class NodeWatch:
-    """Client of a node. Raises `DashboardError` if it does not find the node within `wait_s`, or is `stopped`."""
+    """Client of a node.
+
+    `DashboardError` is raised if the node is not found within `wait_s` [s], or if `stopped` returns True.
+    """
 
     def __init__(self, namespace: str, name: str, wait_s: float, stopped: Callable[[], bool]) -> None:
         self.node = WithoutEvents(
@@ -81,9 +85,10 @@ class NodeWatch:
     def facts(self, scene: str | None) -> dict[str, Any]:
         """Return the facts of the node.
 
-        `scene` replaces the scene of the node if its file cannot be read on this machine.
+        The argument `scene` is needed if the scene file of the node cannot be read on this machine. It replaces the
+        scene of the node.
 
-        Raises `DashboardError` if the node does not answer, and `SceneError` if the scene cannot be read.
+        `DashboardError` is raised if the node does not answer. `SceneError` is raised if the scene cannot be read.
         """
         answer = self._called(self._ask, GetParameters.Request(names=list(_SHOWN)))
         if answer is None:
@@ -95,7 +100,7 @@ class NodeWatch:
         return facts_of(found, parameters, f"node {self.name}")
 
     def listen(self, feed: Feed) -> None:
-        """Pass all further messages to a feed."""
+        """Pass all messages that arrive after this call to a feed."""
         self.feed = feed
         best_effort = partial(QoSProfile, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._subscribe(JointState, "contact_forces", best_effort(depth=_NEWEST), self._forces)
@@ -113,7 +118,7 @@ class NodeWatch:
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._diagnostics, DIAGNOSTICS)
 
     def answer(self, action: str, text: str) -> tuple[bool, str]:
-        """Call the service for an operator request. Return success and the answer."""
+        """Call the service for an operator request. Return whether the request succeeded, and the answer."""
         service = "acknowledge_alarms" if action == "acknowledge" else "mark"
         if service == "mark":
             value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=text)
@@ -132,7 +137,7 @@ class NodeWatch:
         return future.result() if future.done() else None
 
     def _subscribe(self, kind: type, topic: str, quality: QoSProfile, take: Callable[[Any], None]) -> None:
-        """Subscribe to an output. Its messages are decoded to the classes that recordings use."""
+        """Subscribe to an output. The messages are decoded to the classes that recordings use."""
         message_type = plain.JointState.TYPE if kind is JointState else plain.DiagnosticStatus.TYPE
         message_type = plain.Odometry.TYPE if kind is Odometry else message_type
         self.node.create_subscription(kind, topic, lambda data: take(decode(data, message_type)), quality, raw=True)

@@ -1,4 +1,7 @@
-"""The screen of a recording. During recording, it shows the live run, and afterwards the last hour."""
+"""The screen of a recording.
+
+While the run is being recorded, the screen shows the newest data. After the end of the run, it shows the last hour.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,7 @@ from plow_twin.stream.topics import Cadence, names_of
 
 #: Topics with messages that are decoded one by one.
 _SLOW: Final = names_of(Cadence.ESTIMATE, Cadence.CHANGE)
-#: Interval [s] between attempts to send an update. The feed of a live run drops the update instead of waiting.
+#: Interval between attempts to send an update [s].
 _WAIT_S: Final = 2e-3
 
 
@@ -62,7 +65,7 @@ class RunFeed:
             self._feed.motion.was_held |= self._feed.motion.held
             while not (self._feed.send() or self._stopped()):
                 time.sleep(_WAIT_S)
-        self._say(batch)  # last, because an estimate replaces earlier clearances
+        self._say(batch)  # this call is the last, because an estimate replaces earlier clearances
 
     def _counted(self) -> dict[str, str]:
         others = self._inputs.facts()
@@ -112,7 +115,10 @@ def pose_of(numbers: Array) -> Array:
 
 
 def show_run(path: Path, access: PageAccess, stopped: Callable[[], bool], on_open: Callable[[Screen], object]) -> None:
-    """Show a recording, which may still be written, until `stopped` returns True. `on_open` receives the screen."""
+    """Show a recording until `stopped` returns True. The function `on_open` receives the screen.
+
+    The recording may still be in progress.
+    """
     reader = RunReader(path, Tail(stopped))
     header = reader.header
     with Screen(access, facts_of(header.scene(reader.path), header.parameters, str(path))) as screen:
@@ -121,7 +127,7 @@ def show_run(path: Path, access: PageAccess, stopped: Callable[[], bool], on_ope
         for batch in reader.batches():
             if len(batch.entries) or batch.outputs:
                 run.add(batch)
-            else:  # all recorded data have been sent: wait for more
+            else:  # all recorded data have been sent, and new data are awaited
                 screen.feed.turn()
             if stopped() or screen.has_ended:
                 return

@@ -1,4 +1,4 @@
-"""The screen beside a twin: the process of its server, and the feed of this process."""
+"""The operator's screen of a twin. It consists of a server process, and of a feed that sends updates to the server."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from plow_twin.dashboard.feed import Array, Feed
 
 
 class Screen(Beside):
-    """A running server of the screen with its feed, as a context manager that ends the server.
+    """Context manager that runs the server of the screen and the feed.
 
-    See `Feed` for most arguments. Raises `DashboardError` if the address cannot be used, and `ModuleNotFoundError` if a
-    library of the server is not installed.
+    The arguments that are passed on are described in `Feed`. `DashboardError` is raised if the address cannot be used.
+    `ModuleNotFoundError` is raised if a library of the server is not installed.
     """
 
     def __init__(

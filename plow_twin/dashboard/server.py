@@ -1,7 +1,7 @@
 """Server of the screen, run as a separate process: `python -m plow_twin.dashboard.server LINK SOCKET`.
 
-A page receives a new update only after it has received the previous one. A slow page therefore receives fewer updates,
-and pages do not wait for each other.
+A page receives a new update only after it has received the previous update. A slow page therefore receives fewer
+updates, and does not delay the updates of any other page.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from plow_twin.dashboard.board import Board
 from plow_twin.dashboard.link import Link
 
 PAGE: Final = Path(__file__).with_name("page")
-#: Largest number of open pages. Further pages are refused.
+#: Largest number of open pages. If the number is reached, new pages are refused.
 MOST_PAGES: Final = 50
-#: Longest time for a page to receive an update, or to send its token [s].
+#: Longest time in which a page must receive an update or send its token [s].
 _PATIENCE_S: Final = 20.0
 #: Longest time between two messages to a page, and shortest time between two requests of a page [s].
 _WORD_S, _WISH_S = 1.0, 0.2
@@ -56,7 +56,7 @@ class Guard:
         self._app, self._access = app, access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, or refuse it."""
+        """Pass a request to the application, or refuse the request."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
@@ -79,7 +79,7 @@ class Guard:
 
 
 class Pages:
-    """The open pages that show a board. Their requests are sent through a link."""
+    """The open pages that show a board. The requests of the pages are sent through a link."""
 
     def __init__(self, board: Board, link: Link, access: PageAccess) -> None:
         self._board, self._link, self._access = board, link, access
@@ -97,7 +97,7 @@ class Pages:
                 return
             await self._serve(socket)
         except (WebSocketDisconnect, TimeoutError, RuntimeError):
-            return  # the page has been closed, or does not read its messages
+            return  # the page has been closed, or does not read messages
         finally:
             self._board.pages -= 1
 
@@ -183,7 +183,10 @@ async def serve(link: Link, listening: socket.socket, access: PageAccess) -> Non
 
 
 def main() -> None:
-    """Serve on the two file descriptors in the arguments. The first message contains the address and the token."""
+    """Serve on the two file descriptors in the arguments.
+
+    The first message on the link contains the address and the token.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
     end, listening = (socket.socket(fileno=int(number)) for number in sys.argv[1:3])

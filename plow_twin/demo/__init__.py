@@ -1,1 +1,1 @@
-"""The demo: a publisher of excitation and the node with its recorder, as processes, and a summary of the recording."""
+"""The demo, which runs a publisher of the load and the node with its recorder, and prints a summary of the run."""

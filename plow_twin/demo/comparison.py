@@ -1,4 +1,7 @@
-"""Comparison of the forces of the twin and of the nominal scene with the forces of the demo's synthetic machine."""
+"""Compare the forces of a demo with the true forces, which are the forces of the synthetic machine.
+
+The compared forces are the forces of the twin and the forces of the nominal scene.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ from plow_twin.stream.journal import Estimated
 
 Array = NDArray[np.float64]
 
-#: Length [s] of the compared part at the end of a run, about one load period of the paper.
+#: Length of the compared part at the end of a run [s]. It is about one period of the load in the paper.
 COMPARED_S: Final = 3.2
 
 
@@ -30,11 +33,12 @@ class Comparison:
     peaks : dict of str to ndarray, shape (8,)
         Largest force of each pair [N], for the keys `nominal`, `followed` and `true`.
     error : dict of str to float
-        RMS of the difference from the true forces divided by the RMS of the true forces, for `nominal` and `followed`.
+        RMS of the difference from the true forces, divided by the RMS of the true forces. The keys are `nominal` and
+        `followed`.
     estimates_s : list of float
-        Times [s] of the run at which estimates were made.
+        Times in the run at which estimates were made [s].
     since_s : float
-        Time [s] of the run at which the compared part begins.
+        Time in the run at which the compared part begins [s].
     """
 
     peaks: dict[str, Array]

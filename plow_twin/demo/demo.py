@@ -1,4 +1,4 @@
-"""A live run: publisher and node with its recorder as processes, with a summary at the end."""
+"""Run a publisher of the load, and the node with its recorder, as processes, and print a summary of the recording."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from plow_twin.model.scene import Mark, Provenance, Wear
 from plow_twin.scene_file import dump_scene, load_scene
 
 DONE, FAILED, DONE_WITH_LOSS = 0, 1, 3
-#: Longest wait [s] for an estimate, and for the compilation of the solver on a busy machine.
+#: Longest wait for an estimate, and for the compilation of the solver on a busy machine [s].
 _START_TIMEOUT_S: Final = 300.0
 _STOP_TIMEOUT_S: Final = 10.0
 _RATE_HZ: Final = 1000.0
-#: Difference [mm] between the clearances of the synthetic machine and of the scene.
+#: Clearance of the synthetic machine minus the clearance of the scene [mm].
 _SENSOR_MM: Final = 1.5
-#: Duration of the shortest demo with an estimate [s], length of the estimate's window [s], and time between two windows
-#: [s].
+#: Times of the estimate [s]. They are the duration of the shortest demo with an estimate, the length of the window of
+#: measurements, and the time between two windows.
 _ESTIMATED_S, _WINDOW_S, _INTERVAL_S = 15.0, 14.0, 3.0
 _STUCK_S: Final = 30.0
 
@@ -53,7 +53,7 @@ class Watch:
     reports: int = 0
 
     def receive(self, message: Any) -> None:
-        """Take the values of a `DiagnosticArray`."""
+        """Store the values of a `DiagnosticArray`."""
         for status in message.status:
             part = status.name.partition(": ")[2]
             self.parts[part] = {value.key: value.value for value in status.values}
@@ -69,10 +69,10 @@ class Watch:
 
 
 def run_demo(speed: str, seconds: float, out: Path, quiet: bool, screen: list[str] | None = None) -> int:
-    """Run the twin under the paper's load and print a summary. Return 0, 1 after a failure, or 3 after counted losses.
+    """Run the twin under the load of the paper, print a summary, and return the exit code.
 
-    At the speed `real`, the run uses the clock of the system; at the speed `fast`, it uses `/clock`. `screen` contains
-    the arguments of the operator's screen.
+    The exit code is 0 on success, 1 after a failure, or 3 after counted losses. At the speed `real`, the run uses the
+    system clock. At the speed `fast`, the run uses `/clock`. `screen` contains the arguments of the operator's screen.
     """
     folder = out / datetime.now().strftime("%Y%m%d_%H%M%S_%f")
     folder.mkdir(parents=True)
@@ -98,14 +98,14 @@ def run_demo(speed: str, seconds: float, out: Path, quiet: bool, screen: list[st
 def _set_environment(folder: Path) -> None:
     """Restrict the ROS communication of the demo to this machine and to a ROS domain of its own."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    # domain numbers above 101 use ports that outgoing connections use too
+    # domain numbers above 101 are not used, because outgoing connections may use their ports
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
     os.environ.setdefault("ROS_LOG_DIR", str((folder / "log").resolve()))
 
 
 def _worn_scene(folder: Path) -> Path:
-    """Write the paper's scene with wear, so that the clearance grows. Return its path."""
+    """Write the scene of the paper with wear, so that the clearance grows. Return the path of the scene."""
     wear = Wear(coefficient_m2_n=1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0)
     assumed = Provenance(Mark.ASSUMED, "hard steel guide in coal dust, 1e-15 .. 1e-13 m^2/N; not in the paper")
     paper = load_scene("paper")
@@ -118,7 +118,7 @@ def _worn_scene(folder: Path) -> Path:
 def _run(
     speed: str, seconds: float, folder: Path, console: Console, quiet: bool, screen: list[str] | None
 ) -> tuple[Watch, int]:
-    """Run all processes to their end. Return the last diagnostics of the node and the number of samples sent."""
+    """Run all processes until they end. Return the last diagnostics of the node, and the number of sent samples."""
     from plow_twin.demo.excitation_publisher import QUEUE
 
     parameters = {
@@ -183,7 +183,7 @@ def _follow(source: Child, twin: Child, watch: Watch, spin: Any, bar: Progress, 
         now = watch.number("state", "model_time_s")
         if now > reached:
             moved, reached = time.monotonic(), now
-        # on a busy machine, the publisher starts slowly
+        # the wait for the first sample is longer, because the publisher starts slowly on a busy machine
         elif time.monotonic() - moved > (patience := _STUCK_S if reached else _START_TIMEOUT_S):
             raise DemoError(f"no progress for {patience:g} s at model time {reached:g} s\n{twin.output()}")
         bar.update(task, completed=reached)
@@ -201,7 +201,7 @@ def _until(name: str, reached: Any, spin: Any, twin: Child, timeout_s: float) ->
 
 
 class Child:
-    """A process of the demo. Its output is written to a file."""
+    """A process of the demo. The output of the process is written to a file."""
 
     def __init__(self, arguments: list[str], log: Path) -> None:
         self._name = arguments[0]
@@ -231,7 +231,7 @@ class Child:
             raise DemoError(f"{self._name} ended with code {code}\n{self.output()}")
 
     def stop(self) -> None:
-        """Request the end of the process. Raise `DemoError` if it does not end in time, or ends with an error."""
+        """Request the end of the process. Raise `DemoError` if the process ends late or with an error."""
         if self.running:
             self._process.send_signal(signal.SIGINT)
         try:
@@ -241,7 +241,7 @@ class Child:
         self.check(allowed=(0,))
 
     def end(self) -> None:
-        """Terminate the process; kill it if it does not end."""
+        """Terminate the process. If the process does not end, kill it."""
         if self.running:
             self._process.terminate()
             try:
@@ -263,7 +263,7 @@ def _process(arguments: list[str], log: Path) -> Iterator[Child]:
 
 @contextmanager
 def _watching() -> Iterator[tuple[Watch, Any]]:
-    """Subscribe to `/diagnostics`. Yield its values, and a function that waits briefly for messages."""
+    """Subscribe to `/diagnostics`. Yield the newest values, and a function that waits briefly for messages."""
     from diagnostic_msgs.msg import DiagnosticArray
 
     from plow_twin.ros.connections import WithoutEvents

@@ -1,11 +1,12 @@
-"""The program `excitation_publisher`: a scene's load as samples on `excitation`, in real time or as fast as possible.
+"""The program `excitation_publisher`, which publishes the load of a scene as samples on the topic `excitation`.
 
-With `--sensor`, it also publishes `head_pose`: the pose of a head in a wider guide, with noise of a sensor. This
-synthetic measurement has a known true clearance. With `--cutting`, it adds a stochastic cutting load and publishes the
-speed along the face on `travel`.
+With `--sensor`, the program publishes synthetic measurements on `head_pose`, in addition to the load. They are the pose
+of a head in a wider guide, with the noise of a sensor, so that the true clearance is known. With `--cutting`, a
+stochastic cutting load is added, and the speed along the face is published on `travel`.
 
-At the speed `real`, each sample is sent at its time on the steady clock, or at once if it is late. At the speed `fast`,
-the program publishes `/clock`. It sends at most `WINDOW` samples ahead of the twin's `contact_peaks`.
+At the speed `real`, each sample is sent at its time on the steady clock. A late sample is sent immediately. At the
+speed `fast`, the program publishes `/clock`, and sends at most `WINDOW` samples ahead of the `contact_peaks` of the
+twin.
 """
 
 from __future__ import annotations
@@ -44,20 +45,20 @@ from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.stream.intake import NS_PER_S
 
-#: Stamp [ns] of the first sample under /clock. A stamp of zero would mean that there is no stamp.
+#: Stamp of the first sample if `/clock` is published [ns]. The stamp is not 0, because 0 means that a stamp is missing.
 FIRST_STAMP_NS: Final = NS_PER_S
 #: Largest number of samples without an answer at the speed `fast`.
 WINDOW: Final = 200
-#: Number of samples by which a reliable reader may be late: 100 s at 1 kHz.
+#: Number of samples by which a reliable reader may be late. At 1 kHz, the number corresponds to 100 s.
 QUEUE: Final = 100_000
 _CLOCK_EVERY: Final = 10
 _TRAVEL_S: Final = 0.1
 _POSE_HZ: Final = 100.0
 #: Standard deviations [m, m, rad] of the noise of the synthetic sensor.
 _POSE_NOISE: Final = np.array([5e-4, 5e-4, 2e-3])
-#: Time [s] without an answer after which samples are counted as lost.
+#: Time without an answer after which samples are counted as lost [s].
 _STALL_S: Final = 2.0
-#: First bytes of a serialised message that begins with a stamp: 4 bytes of encapsulation, sec and nanosec.
+#: Layout of the first bytes of a serialised message with a stamp. Four bytes of encapsulation precede sec and nanosec.
 _STAMP: Final = struct.Struct("<4xiI")
 
 
@@ -65,9 +66,14 @@ _STAMP: Final = struct.Struct("<4xiI")
 class Plan:
     """The samples to send.
 
-    `wrench`, shape (n, 3), are the loads Fx, Fy [N], M [N m], one row every `period_ns`. `speed`, shape (n,), is the
-    speed of travel [m/s]. `pose`, shape (m, 3), are poses x, y [m], theta [rad] of a synthetic sensor; one row is sent
-    with every `pose_every`-th sample.
+    Attributes
+    ----------
+    wrench : ndarray, shape (n, 3)
+        Loads Fx, Fy [N], M [N m]. The interval between two rows is `period_ns`.
+    speed : ndarray, shape (n,)
+        Speed of travel [m/s].
+    pose : ndarray, shape (m, 3)
+        Poses x, y [m], theta [rad] of a synthetic sensor. One row is sent with every `pose_every`-th sample.
     """
 
     wrench: NDArray[np.float64]
@@ -109,7 +115,7 @@ class ExcitationPublisher(WithoutEvents):
         )
 
     def wait_for_twin(self, timeout_s: float) -> bool:
-        """Wait until a twin subscribes to `excitation`. Return False after the time limit or on a stop."""
+        """Wait until a twin subscribes to `excitation`. Return False after the time limit or a requested stop."""
         give_up = time.monotonic() + timeout_s
         while not self._connected():
             if self._stop.stopped or time.monotonic() > give_up:
@@ -122,7 +128,7 @@ class ExcitationPublisher(WithoutEvents):
         return self._twin_reads and self._samples.get_subscription_count() > 0 and answering
 
     def run_real(self) -> None:
-        """Send each sample at its time, with this time as its stamp."""
+        """Send each sample at its time. The stamp of a sample is its time."""
         stamp_ns, start_ns = time.time_ns(), time.monotonic_ns()
         for index, wrench in enumerate(self._plan.wrench.tolist()):
             due_ns = start_ns + index * self._plan.period_ns
@@ -182,7 +188,7 @@ class ExcitationPublisher(WithoutEvents):
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         values = {value.key: value.value for value in message.values}
-        # this process may find the connection earlier than the twin does
+        # this process may detect the connection before the twin detects it
         self._twin_reads = values.get("lifecycle") == "active" and values.get("publishers_excitation", "0") != "0"
 
     def _on_answer(self, data: bytes) -> None:
@@ -193,7 +199,7 @@ class ExcitationPublisher(WithoutEvents):
 def plan(
     scene_name: str, rate_hz: float, seconds: float, cutting: CuttingLoad | None = None, sensor_mm: float | None = None
 ) -> Plan:
-    """Sample the loads of a scene, without gravity, and add a cutting load.
+    """Sample the loads of a scene, except gravity, and add a cutting load.
 
     With `sensor_mm`, the plan contains noisy poses of a head whose clearances are larger by `sensor_mm` [mm].
     """
@@ -262,7 +268,10 @@ def _cutting(options: argparse.Namespace) -> CuttingLoad | None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Send a scene's load. Return 0 on success, 1 without a twin, 2 for wrong usage, or 3 if answers are missing."""
+    """Send the load of a scene, and return the exit code.
+
+    The exit code is 0 on success, 1 without a twin, 2 for wrong usage, or 3 if answers are missing.
+    """
     import rclpy.utilities
 
     given = list(sys.argv if arguments is None else ["excitation_publisher", *arguments])

@@ -1,4 +1,4 @@
-"""Summary of a recorded run: forces by corner and direction of swing, contact sets, clearance and wear."""
+"""Summarize a recorded run by its forces, contact sets, clearances and wear."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from plow_twin.record.estimated import left_by
 from plow_twin.record.reader import RunReader
 from plow_twin.record.recording import read_recording
 
-#: Mask of the pairs that stop a counter-clockwise or a clockwise swing.
+#: Masks of the pairs that stop a counter-clockwise swing, and of the pairs that stop a clockwise swing.
 SENSES: Final = {"ccw": STOPS_COUNTER_CLOCKWISE, "cw": ~STOPS_COUNTER_CLOCKWISE}
 
 
@@ -27,19 +27,22 @@ class RunSummary:
 
     Attributes
     ----------
-    largest, mean_in_contact : ndarray, shape (8,)
-        Largest force, and impulse divided by the time in contact [N]. The time in contact is a sum of sample intervals,
-        so each touch adds an uncertainty of one interval.
+    largest : ndarray, shape (8,)
+        Largest force of each pair [N].
+    mean_in_contact : ndarray, shape (8,)
+        Impulse of each pair divided by its time in contact [N]. The time in contact is a sum of sample intervals, so
+        each touch adds an uncertainty of one interval.
     makes : ndarray, shape (8,)
         Number of touches.
     contact_sets : dict
-        Share of the contact time in which exactly the corners of a set carry force, by direction of swing and set.
+        Share of the contact time in which exactly the corners of a set carry force. The keys are the direction of the
+        swing and the set.
     clearance : dict
-        Newest value, 5 % and 95 % point [m] of `horizontal` and `vertical`.
+        Newest value, 5 % point and 95 % point of the clearances `horizontal` and `vertical` [m].
     wear_depth : ndarray, shape (8,)
         Newest wear depth of each pad [m].
     frames : int
-        Number of messages on contact_forces.
+        Number of messages on the topic `contact_forces`.
     estimate : dict or None
         The newest estimate of the node, in the format of `plow-twin estimate --json`.
     """
@@ -56,7 +59,7 @@ class RunSummary:
 
 
 def corner_letters(scene: Scene) -> dict[str, str]:
-    """Return the letter of each corner. A corner without a letter has its name instead."""
+    """Return the letter of each corner. If a corner has no letter, return its name."""
     letters = {corner: letter for letter, corner in scene.frame.labels.items()}
     return {corner: letters.get(corner, corner) for corner in CORNER_NAMES}
 

@@ -1,8 +1,8 @@
 """Look up the publishers and subscribers on the topics of a node in the ROS graph.
 
 The lookup replaces the events of the middleware, which can cause a deadlock in rmw_fastrtps (ros2/rmw_fastrtps#890).
-When an event is requested or taken, rmw_fastrtps acquires two locks in one order. When an event occurs, it acquires
-them in the opposite order.
+When an event is requested or taken, rmw_fastrtps acquires two locks in one order. When an event occurs, rmw_fastrtps
+acquires the two locks in the opposite order.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 
 LOOK_S: Final = 0.2
-#: Name of a node that is not yet known, although its topics are: rmw_dds_common announces the two in separate messages.
+#: Name of a node whose topics have been announced before its name, because rmw_dds_common announces them separately.
 _UNNAMED: Final = "_NODE_NAME_UNKNOWN_"
 #: Shortest interval between two error messages about `/clock` [s].
 _SAY_AGAIN_S: Final = 5.0
@@ -35,8 +35,8 @@ _TYPES: Final = frozenset(kind.value for kind in Parameter.Type)
 class WithoutEvents(Node):
     """Node that uses no events of the middleware, not even for the topics that rclpy creates.
 
-    The node refuses negative times on `/clock`, and parameters that rclpy cannot read. In rclpy, they would end the
-    program.
+    The node refuses negative times on `/clock`, and parameters that rclpy cannot read. Without this check, a negative
+    time or an unreadable parameter would end the program.
     """
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **options: Any) -> Service:
@@ -98,7 +98,7 @@ class Connections:
         self._unnamed: set[tuple[str, bytes]] = set()
 
     def publishers(self, subscription: Subscription) -> tuple[list[Any], int]:
-        """Return the publishers that can connect to a subscription, and the number of new publishers that cannot."""
+        """Return the publishers that can connect to a subscription, and the number of new incompatible publishers."""
         topic, found = subscription.topic_name, []
         kind, refused = type_name(subscription.msg_type), 0
         for publisher in self._node.get_publishers_info_by_topic(topic):
@@ -123,7 +123,7 @@ class Connections:
         if key in self._said:
             return False
         if other.node_name == _UNNAMED and key not in self._unnamed:
-            self._unnamed.add(key)  # the name may be known at the next lookup
+            self._unnamed.add(key)  # the name may have been announced at the next lookup
             return False
         self._said.add(key)
         self._node.get_logger().warning(f"{topic}: {text}")

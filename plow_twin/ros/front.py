@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 class RosFront:
     """Topics, timers and services of a configured node. It is created on configure and closed on cleanup.
 
-    The function `changed` is called when the state of the stream may have changed. The other arguments, and the errors,
-    are described in `Runtime`.
+    The function `changed` is called when the state of the stream may have changed. All arguments except `changed`, and
+    the errors, are described in `Runtime`.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class RosFront:
         made.callback(lambda: self._lost.extend(runtime.close()))
         wanted = (settings.estimate, settings.estimate_forces, any(settings.forecast_limits))
         without = [topic for topic, one in zip(ESTIMATES, wanted, strict=True) if not (settings.estimate and one)]
-        # the topic `status` is published by the node, because it exists before configure
+        # the node publishes on the topic `status`, because the topic exists before configure
         if settings.follows != "full":
             without += FOLLOWED_TOPICS
         self._publishers = OutputPublishers(node, ["status", *without], runtime.publishing.memory)
@@ -144,7 +144,7 @@ class RosFront:
         return self._loop.error
 
     def look_for_others(self) -> None:
-        """Check whether another node publishes on the output topics, and update the state of the OPC UA connection."""
+        """Check whether another node publishes on the output topics. Update the state of the OPC UA connection."""
         if self._server is not None:
             with self.turns:
                 self._server.look()

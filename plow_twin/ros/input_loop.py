@@ -1,7 +1,7 @@
 """A thread that reads the input queues when messages arrive, and calls timers of a monotonic clock.
 
-The thread replaces the executors of rclpy, which create a task for each message. The events executor runs its timers
-only when no message is waiting. In a test with samples at 10 kHz, the twin therefore published nothing.
+The thread replaces the executors of rclpy, which create a task for each message. The events executor of rclpy is not
+used, because it runs timers only when no message is waiting. Its timers may never run if samples arrive at 10 kHz.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from plow_twin.live.timer import Timer
 
 #: Largest number of messages in a batch. Timers and other threads run between two batches.
 _MOST: Final = 200
-#: Period with which all queues are read even without a notification [s].
+#: Period at which all queues are read, even if no message was signalled [s].
 _LOOK_S: Final = 0.1
 
 
@@ -65,14 +65,14 @@ class Receiver(Protocol):
 class InputLoop:
     """Thread that processes the inputs of a node.
 
-    While it works, the thread holds the lock `turns`, which the thread of the executor also uses. If an error ends the
-    thread, the error is stored in the attribute `error` and passed to the function `on_error`.
+    The thread and the thread of the executor use the lock `turns`. An error that ends the thread is stored in the
+    attribute `error` and passed to the function `on_error`.
     """
 
     def __init__(self, turns: Turns, on_error: Callable[[Exception], None]) -> None:
         self._turns, self._on_error = turns, on_error
         self._queues: dict[int, tuple[Queue, Receiver, str]] = {}
-        #: timers; the first timer, which reads all queues, runs even if the timers are stopped
+        #: timers; `run_timers` does not stop the first timer, which reads all queues
         self._timers = [Timer(_LOOK_S, self._look_at_all)]
         self._active = self._stopped = False
         self._due = 0.0
@@ -82,7 +82,7 @@ class InputLoop:
         self.error: Exception | None = None
 
     def add(self, queue: Queue, receiver: Receiver, topic: str) -> None:
-        """Pass messages from a queue to the receiver. `close` will close the queue."""
+        """Pass messages from a queue to the receiver. The method `close` of this object closes the queue."""
         with self._turns:
             self._queues[queue.fd] = queue, receiver, topic
             self._signs.append(queue.fd)
@@ -140,7 +140,7 @@ class InputLoop:
                     left = [fd for fd in ready if self._receive(fd)]
                     if time.monotonic() >= self._due:
                         self._look_at_timers()
-        except Exception as error:  # an unreported end of the thread would stop the twin without a message
+        except Exception as error:  # any error is reported, because the twin stops when the thread ends
             self.error = error
             self._on_error(error)
 

@@ -49,8 +49,8 @@ class _Info(ctypes.Structure):
     ]
 
 
-#: Layouts of two structures. In `_Info`, these are the times of sending and reception, the sequence number and the
-#: publisher; in `SerializedMessage`, the address and the length of the bytes.
+#: Layouts of two structures. The layout of `_Info` contains the times of sending and reception, the sequence number and
+#: the publisher. The layout of `SerializedMessage` contains the address and the length of the bytes.
 _INFO, _PLACE = struct.Struct("=qqQ16x16s"), struct.Struct("=QQ")
 #: Return code of rcl for an empty queue.
 _NOTHING_TAKEN: Final = 401
@@ -60,7 +60,7 @@ _NOTHING_TAKEN: Final = 401
 def _count_up() -> ctypes.c_void_p:
     """Return the address of the C function `eventfd_write`, which rcl calls for new messages.
 
-    The arguments of the call are the file descriptor, which is the user data, and the number of messages.
+    rcl passes two arguments to the function: the user data, which is the file descriptor, and the number of messages.
     """
     return ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
 
@@ -95,7 +95,7 @@ class InputQueue:
     def pop(self, most: int, *, all_there_are: bool = False) -> tuple[list[Taken], bool]:
         """Return at most `most` messages in the order of arrival, and whether the queue contains more messages.
 
-        By default, the number of messages is the number of signals, which saves a read of the empty queue. With
+        By default, as many messages are read as were signalled, which saves a read of the empty queue. With
         `all_there_are`, the queue is read until it is empty.
         """
         try:
@@ -105,7 +105,7 @@ class InputQueue:
         self._signs += signs
         wanted = most if all_there_are else min(most, self._signs)
         taken = self._taken(wanted)
-        # after an overflow of the queue, there are fewer messages than signals
+        # if the queue has overflowed, it contains fewer messages than were signalled
         self._signs = max(0, self._signs - len(taken)) if len(taken) == wanted else 0
         return taken, self._signs > 0 or (all_there_are and len(taken) == most)
 

@@ -1,4 +1,4 @@
-"""The program `twin`, which runs one node in one process and stops cleanly at SIGINT and SIGTERM."""
+"""The program `twin`, which runs one node in one process and stops cleanly at the signals SIGINT and SIGTERM."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
-    # these imports follow the installation of the signal handlers: a signal during the imports causes no traceback
+    # the imports follow the installation of the signal handlers, so that a signal during an import causes no traceback
     import rclpy.utilities
 
     from plow_twin.live.parameters import ParameterError
@@ -72,7 +72,7 @@ def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
         while not stop.stopped and rclpy.utilities.ok():
             if starting and node.prepared:
                 starting = False
-                if node.lifecycle == "unconfigured":  # a lifecycle manager may have configured the node before
+                if node.lifecycle == "unconfigured":  # a lifecycle manager may already have configured the node
                     node.start()
             executor.spin_once(timeout_sec=_SPIN_S)
         executor.remove_node(node)

@@ -1,4 +1,4 @@
-"""Publish markers for RViz (walls of the cavity, frame, worn pads and forces), and the pose of the head on /tf."""
+"""Publish the pose of the head on /tf, and markers for RViz of the cavity, the frame, the pads and the forces."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ _ARROW: Final = 0.5
 class Markers:
     """Publisher of the markers. All coordinates are in the frame `frame_id`.
 
-    The namespaces of the markers are `frame`, `cavity`, `pads` and `forces`. A pad is drawn behind its wall at a
-    distance equal to the wear depth. The arrows of `forces` are the forces on the head.
+    The namespaces of the markers are `frame`, `cavity`, `pads` and `forces`. The distance between a pad and its wall is
+    the wear depth of the pad. The arrows in `forces` are the forces on the head.
     """
 
     def __init__(self, node: Node, settings: Settings, scene: Scene) -> None:

@@ -13,14 +13,14 @@ from std_msgs.msg import Header
 from plow_twin.record import messages as plain
 from plow_twin.stream.intake import NS_PER_S
 
-#: Content of a message: stamp [ns], numbers, whether the numbers are a load, and whether the load has a component that
-#: is not in the plane.
+#: Content of a message: the stamp [ns], the numbers, and two flags. The first flag is True if the numbers are a load.
+#: The second flag is True if the load has a component out of the plane.
 Read = tuple[int, tuple[float, ...], bool, bool]
 #: Content of a message that cannot be decoded.
 UNREADABLE: Final[Read] = (0, (), False, False)
 
-#: Layouts of a wrench message, in big-endian and little-endian order. Of each pair, the first layout contains the stamp
-#: and the length of the frame name, and the second layout contains the force and the torque.
+#: Two layouts of a wrench message for big-endian order, and two layouts for little-endian order. The first layout
+#: contains the stamp and the length of the frame name. The second layout contains the force and the torque.
 _WRENCH_LAYOUTS: Final = tuple((struct.Struct(f"{order}iII"), struct.Struct(f"{order}6d")) for order in "><")
 
 
@@ -32,8 +32,8 @@ def stamp_ns(header: Header) -> int:
 def deviations(covariance: Sequence[float]) -> tuple[float, ...]:
     """Return the standard deviations of x, y [m] and theta [rad] from a row-major 6 x 6 covariance matrix.
 
-    If the three variances are 0, they are unknown and the result is empty. The result of a negative variance is NaN, so
-    that the message is refused.
+    If the three variances are 0, they are unknown, and the result is empty. If a variance is negative, its result is
+    NaN, so that the message is refused.
     """
     variances = [float(covariance[7 * axis]) for axis in (0, 1, 5)]
     found = tuple(math.sqrt(variance) if variance >= 0.0 else math.nan for variance in variances)

@@ -76,7 +76,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
         self._status = self.create_publisher(DiagnosticStatus, "status", OUTPUTS["status"])
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS)
         for name in SERVICES:
-            # the services exist in all states: a waiting request to a destroyed service would end the executor of rclpy
+            # the services exist in all states, because a request to a destroyed service would end the executor of rclpy
             self.create_service(Trigger, f"~/{name}", partial(self._answer, name))
         # the timers use the steady clock, so that reports continue while /clock is paused
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -139,7 +139,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to use samples."""
         super().on_activate(state)
-        # while samples arrive, the garbage collector then skips all objects that exist now
+        # the garbage collector skips all existing objects while samples arrive
         gc.collect()
         gc.freeze()
         self._configured().activate()
@@ -212,7 +212,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
                 self.runtime.parameter(name, value, self._table.settings)
 
     def _refuse_invalid_transitions(self) -> None:
-        """Refuse invalid transitions by an answer. The callback of rclpy would raise an error that ends the process."""
+        """Answer requests of invalid transitions. The callback of rclpy would raise an error that ends the process."""
         service = self._service_change_state
         change = service.callback
 
@@ -248,11 +248,11 @@ class TwinNode(WithoutEvents, LifecycleNode):
     def _publish_diagnostics(self) -> None:
         if self._front is not None:
             if self._front.error is not None:
-                raise self._front.error  # the error ends the program, like an error in any callback
+                raise self._front.error  # the error ends the program
             self._connections.look_for_subscribers(self.publishers)
             self._front.look_for_others()
         elif self.lifecycle == "unconfigured" and not self.reason:
-            # compile now, so that a lifecycle manager that configures the node later does not have to wait
+            # the solver is compiled before configure, so that a lifecycle manager does not have to wait for it
             self.prepare()
         runtime = self.runtime
         if runtime is not None and runtime.without_clock and self._reports % _SAY_AGAIN == 0:

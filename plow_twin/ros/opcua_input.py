@@ -22,7 +22,7 @@ from plow_twin.record.sources import Arrived
 
 
 class OpcUaInput:
-    """Inputs from an OPC UA server. The object is both the queue and the receiver of these inputs.
+    """Inputs from an OPC UA server. The object is the queue and the receiver of the inputs.
 
     The parameters of the node contain the server, the mapping and the credentials. At the start and after a broken
     connection, the object waits for the server. The function `warn` receives a text for each problem of the connection.

@@ -47,9 +47,9 @@ def _converted(parameter: Parameter) -> Parameter:
 class ParameterServer:
     """Declaration of all parameters on a node. The attribute `settings` contains the current values.
 
-    The node must be created with `automatically_declare_parameters_from_overrides=True`. The initial values can then be
-    read before rclpy checks their types. An integer is thus accepted for a double, and one error lists all invalid
-    values.
+    The node must be created with `automatically_declare_parameters_from_overrides=True`, so that the initial values can
+    be read before rclpy checks their types. An integer is accepted for a double. All invalid values are listed in one
+    error.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class ParameterServer:
         node.add_post_set_parameters_callback(self._after)
 
     def _before(self, asked: list[Parameter]) -> list[Parameter]:
-        """Convert integers to doubles, and log all invalid values, because rclpy reports only the first of them."""
+        """Convert integers to doubles, and log all invalid values. rclpy reports only the first invalid value."""
         found = parameters.problems({parameter.name: parameter.value for parameter in asked})
         if found:
             self._node.get_logger().warning(str(parameters.ParameterError(found, "parameters refused")))

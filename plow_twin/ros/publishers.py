@@ -22,7 +22,7 @@ CLASSES: Final[dict[str, type]] = {JOINT_STATE: JointState, ODOMETRY: Odometry, 
 class OutputPublishers:
     """Publishers of all outputs except the topics in `without`.
 
-    `memory` contains, by base name of the topic, the buffers of messages that are sent after each sample.
+    `memory` contains the buffers of the messages that are sent after each sample, by base name of the topic.
     """
 
     def __init__(self, node: Node, without: Collection[str], memory: Mapping[str, memoryview]) -> None:

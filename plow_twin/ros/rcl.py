@@ -1,6 +1,7 @@
 """Send and receive serialized messages through rcl, the public C interface below rclpy.
 
-With rclpy, the publisher of a received message is unknown, and each message is converted to a Python object.
+rcl is used because rclpy does not provide the publisher of a received message, and because rclpy converts each message
+to a Python object.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ class SerializedMessage(ctypes.Structure):
 
 @cache
 def libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
-    """Return the libraries rcl and rcutils, which rclpy has loaded before."""
+    """Return the libraries rcl and rcutils, which rclpy has already loaded."""
     rcl, rcutils = ctypes.CDLL("librcl.so"), ctypes.CDLL("librcutils.so")
     rcutils.rcutils_get_default_allocator.restype = Allocator
     rcutils.rcutils_uint8_array_init.argtypes = [
@@ -44,16 +45,16 @@ def libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
 
 @cache
 def _publish() -> Any:
-    # PyDLL does not release the interpreter lock: to release and acquire it takes longer than to send a message
+    # PyDLL does not release the interpreter lock, because releasing the lock takes longer than sending a message
     publish = ctypes.PyDLL("librcl.so").rcl_publish_serialized_message
     publish.argtypes = [ctypes.c_void_p] * 3
     return publish
 
 
 class Sender:
-    """Sender of the CDR message in a buffer. It sends the content that the buffer has at the time of the call.
+    """Sender of the CDR message in a buffer.
 
-    After the publisher is destroyed, nothing is sent.
+    The method `send` sends the present content of the buffer. After the publisher is destroyed, nothing is sent.
     """
 
     def __init__(self, publisher: Any, data: memoryview) -> None:

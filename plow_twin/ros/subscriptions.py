@@ -59,7 +59,7 @@ class Subscriptions:
         #: next expected sequence number, by topic and publisher
         self._following: dict[tuple[str, bytes], int] = {}
         self._since_ns = time.time_ns()  # time of the subscription to the load
-        #: for each publisher that appeared after the subscription, its first message and the losses before this message
+        #: first message of each publisher that appeared after the subscription, and number of messages lost before it
         self._appeared: dict[bytes, tuple[Taken, int]] = {}
         self._before: frozenset[bytes] = frozenset()
         with_covariance = runtime.settings.head_pose_type == "pose_with_covariance"
@@ -71,7 +71,7 @@ class Subscriptions:
         self._subscribe(JointState, "gaps", _SLOW_DEPTH)
 
     def look(self) -> None:
-        """Update the publishers of all inputs. The lookup does not hold the lock, so that samples do not wait."""
+        """Update the publishers of all inputs. The lock is not held during the lookup, so that samples do not wait."""
         found = {topic: self._connections.publishers(taken) for topic, taken in self._taken_from.items()}
         present = {topic: self._noted(topic, publishers) for topic, (publishers, _) in found.items()}
         refused = sum(count for _, count in found.values())
@@ -171,7 +171,8 @@ class Subscriptions:
         """Count lost messages that a publisher sent after the subscription but before its first received message.
 
         A publisher that is new to the node may have started before the subscription, because discovery takes time. The
-        start is estimated from the rate of the publisher. If it is before the subscription, no message is counted.
+        start of the publisher is estimated from its rate. If the start is before the subscription, no message is
+        counted.
         """
         newest = {message.sender: message for message in batch}
         for sender, (first, counted) in list(self._appeared.items()):
@@ -195,7 +196,7 @@ class Subscriptions:
             stamp, values, fits, out_of_plane = self._read(topic, message.data)
             wanted = inputs.wanted(message.sender, message.number, stamp, values, fits)
             if inputs.senders.followed != followed:
-                # the samples in `arrived` are from the publisher that was followed before
+                # the samples in `arrived` are from the previously followed publisher
                 self._step(arrived)
                 arrived, followed = [], inputs.senders.followed
             if wanted:
@@ -244,7 +245,7 @@ class Subscriptions:
             with_covariance = self._pose is PoseWithCovarianceStamped
             pose = message.pose.pose if with_covariance else message.pose
             turn, stamp = pose.orientation, stamp_ns(message.header)
-            # z and w are both zero if the sender did not set the orientation, or if it is no rotation about z
+            # z and w are zero if the sender has not set the orientation, or if the orientation is no rotation about z
             if turn.z == turn.w == 0.0:
                 self._inputs.head_pose.refuse(Verdict.MALFORMED, stamp, (pose.position.x, pose.position.y))
                 continue

@@ -56,7 +56,7 @@ class TopicRecorder:
 
     def __init__(self, node: Node, writer: BagWriter, wanted: Callable[[str], bool]) -> None:
         self._node, self._writer, self._wanted = node, writer, wanted
-        #: type, channel number in the file, and qualities of service of the subscriptions, for each topic
+        #: message type, channel number and qualities of service of the subscriptions of each topic
         self._topics: dict[str, tuple[str, int, set[_Quality]]] = {}
         #: quality of service of the subscription that records the messages of each publisher
         self._taken_as: dict[tuple[str, bytes], _Quality] = {}
@@ -136,7 +136,7 @@ class TopicRecorder:
         """Write the messages that a subscription received, without duplicates."""
         for message in taken:
             key = (name, message.sender)
-            # a best-effort subscription receives the messages of reliable publishers, too
+            # a best-effort subscription receives the messages of reliable publishers in addition
             if self._taken_as.setdefault(key, quality) != quality:
                 continue
             before = self._newest.get(key, message.number - 1)
@@ -190,13 +190,13 @@ def record_topics(
     on_started
         Function that receives the created folder.
     on_trouble
-        Function that receives a text when the disk is full, and when it has space again.
+        Function that receives a text when the disk becomes full, and a text when it has space after that.
 
     Returns
     -------
     dict
-        Numbers of written and lost messages by topic, and the topics that were not recorded. `complete` is True if no
-        message was lost and all topics in `topics` were recorded.
+        Numbers of written and lost messages by topic, and the topics that were not recorded. The value of `complete` is
+        True if no message was lost and all topics in the argument `topics` were recorded.
     """
     named = {name if name.startswith("/") else f"/{name}" for name in topics}
     left_out = {*but, "/parameter_events"}

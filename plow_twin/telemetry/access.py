@@ -1,4 +1,4 @@
-"""Descriptions of outputs by address, with credentials from files or from the environment."""
+"""Create the descriptions of outputs from addresses, and from credentials in files or in the environment."""
 
 from __future__ import annotations
 
@@ -40,9 +40,18 @@ _NO_TOPIC: Final = re.compile(r"[+#\x00-\x1f]|^\$")
 class WayOut:
     """Description of an output.
 
-    `name` is the part of the diagnostics for the output. `address` contains no credentials. `modules` are the modules
-    that the process of the output imports. `first` is the first message to this process, with the options.
-    `may_acknowledge` is True if an operator at the destination may acknowledge alarms.
+    Attributes
+    ----------
+    name : str
+        Name of the part of the diagnostics for the output.
+    address : str
+        Address of the receiver without credentials.
+    modules
+        Modules that the process of the output imports.
+    first
+        First message to the process of the output, which contains the options.
+    may_acknowledge : bool
+        Whether an operator at the receiver may acknowledge alarms.
     """
 
     name: str
@@ -54,14 +63,14 @@ class WayOut:
 
 @dataclass(frozen=True)
 class Credentials:
-    """Credentials by section (`mqtt`, `opcua`, `influx`). Paths in them are relative to the folder of their file."""
+    """Credentials in the sections `mqtt`, `opcua` and `influx`. Paths are relative to the folder of the file."""
 
     sections: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, repr=False)
     folder: Path = Path()
 
     @classmethod
     def read(cls, path: Path | None) -> Credentials:
-        """Read a YAML file. Raise `InputError` or `OSError` if it cannot be used."""
+        """Read a YAML file. Raise `InputError` or `OSError` if the file cannot be used."""
         if path is None:
             return cls()
         data, found = read_yaml(path, "credentials", _CREDENTIALS["description"])
@@ -70,11 +79,14 @@ class Credentials:
         return cls(data, path.parent)
 
     def text(self, section: str, key: str, otherwise: str = "") -> str:
-        """Return a value of a section, or `otherwise` if it is not given."""
+        """Return a value of a section, or `otherwise` if the value is missing."""
         return str(self.sections.get(section, {}).get(key, otherwise))
 
     def file(self, section: str, key: str) -> str | None:
-        """Return the absolute path of a file, or None if it is not given. Raise `AccessError` if it does not exist."""
+        """Return the absolute path of a file, or None if the section has no path.
+
+        `AccessError` is raised if the file does not exist.
+        """
         name = self.text(section, key)
         if not name:
             return None
@@ -84,7 +96,10 @@ class Credentials:
         return str(path)
 
     def secret(self, section: str, key: str, variable: str) -> str:
-        """Return the first line of the given file; without it, return the variable `PLOW_TWIN_<variable>`."""
+        """Return the first line of the stated file.
+
+        If no file is stated, return the environment variable `PLOW_TWIN_<variable>`.
+        """
         path = self.file(section, key)
         return os.environ.get(f"PLOW_TWIN_{variable}", "") if path is None else read_secret(Path(path))
 
@@ -92,8 +107,8 @@ class Credentials:
 def mqtt_out(url: str, credentials: Credentials, *, plain: bool, sparkplug: str = "") -> list[WayOut]:
     """Return the outputs to an MQTT broker at `mqtt[s]://HOST[:PORT]/PREFIX`.
 
-    `sparkplug` is GROUP/NODE of an edge node. With `sparkplug`, JSON messages are sent only if `url` has a prefix.
-    Raises `AccessError` or `OSError` if an address, a name or a file cannot be used.
+    `sparkplug` is GROUP/NODE of an edge node of Sparkplug. With `sparkplug`, JSON messages are sent only if `url` has a
+    prefix. `AccessError` or `OSError` is raised if an address, a name or a file cannot be used.
     """
     expected = "mqtt[s]://HOST:PORT/PREFIX"
     host, port, prefix, tls = _address("--mqtt-out", url, ("mqtt", "mqtts"), expected, plain=plain)

@@ -16,12 +16,13 @@ from plow_twin.dashboard.link import Link
 from plow_twin.telemetry.values import Group, Newest
 from plow_twin.telemetry.way import State
 
-#: Largest number of points in the queue, ten minutes of all numeric groups at 1 Hz. If the queue is full, the oldest
-#: points are dropped.
+#: Largest number of points in the queue. At 1 Hz, the queue covers ten minutes of all numeric groups. If the queue is
+#: full, the oldest points are dropped.
 _WAITING: Final = 2000
 _AT_ONCE: Final = 500
 _ANSWER_MS: Final = 5000
-#: Wait [s] after the first failed attempt to write, which doubles with each failure, and its upper limit [s].
+#: Waiting time after a failed attempt to write [s]. The first constant is the time after the first failure. The time
+#: doubles with each failure up to the second constant.
 _FIRST_WAIT_S: Final = 1.0
 _LONGEST_WAIT_S: Final = 30.0
 
@@ -29,8 +30,8 @@ _LONGEST_WAIT_S: Final = 30.0
 class Influx:
     """Writer of lines `plow_twin_<group>,head=... name=value,... stamp` to a bucket of InfluxDB.
 
-    `ca` is the certificate file of the authority that certifies the database. With None, the authorities of the system
-    are trusted.
+    `ca` is the file with the certificate of the authority that certifies the database. If `ca` is None, the authorities
+    of the system are trusted.
     """
 
     def __init__(self, url: str, org: str, bucket: str, token: str, ca: str | None) -> None:
@@ -67,7 +68,7 @@ class Influx:
             self.state.connected, self.state.trouble, self._wait_s = True, "", 0.0
 
     async def close(self, patience_s: float) -> None:
-        """Try once more to write the queued lines. The remaining lines are counted as lost."""
+        """Try to write the queued lines one last time. Lines that cannot be written are counted as lost."""
         if self.state.connected and patience_s:
             await self.turn()
         self.state.lost += len(self._waiting)
@@ -76,7 +77,8 @@ class Influx:
     def _fail(self, error: Any, count: int) -> None:
         """Record a failure.
 
-        Lines are dropped if the database has rejected their content; otherwise they stay in the queue.
+        If the database has rejected the content of lines, the lines are dropped. After any other failure, they stay in
+        the queue.
         """
         self.state.connected = False
         status = getattr(error, "status", None)

@@ -16,8 +16,8 @@ from plow_twin.live.bridge.paho_client import end_of, make_client, refusal, use_
 from plow_twin.telemetry.values import UNITS, Group, Newest
 from plow_twin.telemetry.way import State, TelemetryError
 
-#: Largest number of messages in the queue, ten minutes of all numeric groups at 1 Hz. If the queue is full, the oldest
-#: messages are dropped.
+#: Largest number of messages in the queue. At 1 Hz, the queue covers ten minutes of all numeric groups. If the queue is
+#: full, the oldest messages are dropped.
 _WAITING: Final = 2000
 _UNACKNOWLEDGED: Final = 20
 #: Keep-alive interval [s]. After 1.5 intervals without a message, the connection to the broker is treated as broken.
@@ -25,7 +25,7 @@ _KEEPALIVE_S: Final = 10
 
 
 class Message(NamedTuple):
-    """A message. If it is retained, the broker also sends it to later subscribers."""
+    """A message. The broker stores a retained message, and sends it to clients that subscribe later."""
 
     topic: str
     payload: bytes
@@ -39,15 +39,16 @@ class Broker:
     Parameters
     ----------
     tls
-        The files `ca`, `certificate` and `key`. With None, the connection is not encrypted.
+        Paths of the files `ca`, `certificate` and `key`. If `tls` is None, the connection is not encrypted.
     will
         Function that returns the message that the broker publishes if the next connection breaks.
     on_connected
-        Function that returns the messages to send, ahead of the queue, after each connection.
+        Function that returns the messages that are sent before the queue after each connection.
     waiting
-        Largest length of the queue. Further messages displace the oldest messages, which are counted as lost.
+        Largest length of the queue. If the queue is full, the oldest messages are dropped and counted as lost.
     keeps
-        If True, the queue survives a break of the connection. Otherwise its messages are dropped and counted as lost.
+        Whether the queued messages are kept when the connection breaks. If False, the messages are dropped and counted
+        as lost.
     """
 
     def __init__(
@@ -69,7 +70,8 @@ class Broker:
         self._most, self._keeps = waiting, keeps
         self._waiting: deque[Message] = deque()
         self._unacknowledged: set[int] = set()
-        #: Held while messages are numbered and queued, so that their order is that of their numbers.
+        #: Lock that is held while messages are numbered and queued, so that messages are queued in the order of their
+        #: numbers.
         self.lock = threading.RLock()
         self.client = make_client(client_id, clean=True)
         self._set_will()
@@ -152,9 +154,9 @@ class Broker:
 
 
 class MqttOut:
-    """Output of JSON to the topics `<prefix>/<group>`, which are retained except for `peaks`.
+    """Output of JSON messages to the topics `<prefix>/<group>`. All messages except `peaks` are retained.
 
-    The topic `<prefix>/online` is true or false. `options` are the arguments of `Broker`.
+    The messages on the topic `<prefix>/online` are true or false. `options` are the arguments of `Broker`.
     """
 
     def __init__(self, prefix: str, **options: Any) -> None:
@@ -177,7 +179,7 @@ class MqttOut:
         """Do nothing, because the connection has its own thread."""
 
     async def close(self, patience_s: float) -> None:
-        """Send the queued messages, and the message that the twin is offline."""
+        """Send the queued messages, followed by the message that the twin is offline."""
         await self._broker.close(self._gone, patience_s)
 
 

@@ -22,15 +22,15 @@ def send_node(
     stopped: Callable[[], bool],
     on_error: Callable[[str], object],
 ) -> int:
-    """Send the results of a node until `stopped` returns True. Return the number of messages that were lost on the way.
+    """Send the results of a node until `stopped` returns True. Return the number of lost messages.
 
-    `scene` is needed if the file of the node's scene cannot be read on this machine. `on_error` receives a text
-    whenever the receiver of an output stops or resumes accepting messages.
+    The argument `scene` is needed if the scene file of the node cannot be read on this machine. The function `on_error`
+    receives a text whenever the receiver of an output stops or resumes accepting messages.
 
     Raises
     ------
     DashboardError
-        There is no such node.
+        The node does not exist.
     SceneError
         The scene cannot be read.
     TelemetryError, ModuleNotFoundError

@@ -1,4 +1,4 @@
-"""An output of a twin: its process, the feed to this process, and its part of the diagnostics."""
+"""An output of a twin. It consists of a process, of a feed to the process, and of a part of the diagnostics."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from plow_twin.live.part import Part
 from plow_twin.telemetry.access import WayOut
 from plow_twin.telemetry.way import TelemetryError
 
-#: Longest time [s] to open an output. Most of this time is the import of its library.
+#: Longest time in which an output must open [s]. Most of the time is needed to import the library of the output.
 _START_S: Final = 60.0
 
 
 class Outlet(Beside):
-    """A running output, as a context manager that ends its process.
+    """Context manager that runs an output in a separate process.
 
-    `facts` and `answer` are the arguments of `Feed`. `on_error` receives a text whenever the receiver of the output
-    stops or resumes accepting messages. If the output cannot be opened, `TelemetryError` is raised, or
-    `ModuleNotFoundError` if its library is missing.
+    The arguments `facts` and `answer` are described in `Feed`. The function `on_error` receives a text whenever the
+    receiver of the output stops or resumes accepting messages. `TelemetryError` is raised if the output cannot be
+    opened. `ModuleNotFoundError` is raised if the library of the output is missing.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class Outlet(Beside):
             raise TelemetryError(failed)
 
     def turn(self) -> None:
-        """Send an update, and report a change in whether the receiver accepts messages."""
+        """Send an update. If the receiver has stopped or resumed accepting messages, report the change."""
         self.feed.turn()
         self._report()
 
@@ -62,7 +62,7 @@ class Outlet(Beside):
             self._trouble = trouble
 
     def part(self) -> Part:
-        """Return level, message and values for the diagnostics."""
+        """Return the level, the message and the values for the diagnostics."""
         report = self.feed.report
         values = {"address": self.address, "connected": str(report["connected"]).lower()}
         values |= {key: str(report[key]) for key in ("sent", "lost")}
@@ -84,7 +84,7 @@ class Outlet(Beside):
 
 
 def _is_there(name: str) -> bool:
-    """Return whether a module can be imported, without importing it."""
+    """Return whether a module can be imported. The module is not imported."""
     try:
         return find_spec(name) is not None
     except ModuleNotFoundError:

@@ -1,7 +1,7 @@
-"""The process of one output, run as `python -m plow_twin.telemetry.process LINK`. The first message names the output.
+"""The process of one output, which is started by `python -m plow_twin.telemetry.process LINK`.
 
-While the receiver does not answer, a limited number of updates is queued. Further updates are dropped and counted, so
-that the twin is never delayed.
+The first message on the link contains the description of the output. While the receiver does not answer, updates are
+queued. If the queue is full, updates are dropped and counted, so that the twin is never delayed.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ WAYS: Final = {
 }
 #: Increment of `nice`, so that the twin has priority.
 _NICE: Final = 5
-#: Longest time [s] between two checks of the output's state. Changes of the state are reported.
+#: Longest time between two checks of the state of the output [s]. Changes of the state are reported.
 _REPORT_S: Final = 0.5
-#: Time [s] at the end in which the receiver can take the queued messages.
+#: Time in which the receiver can take the queued messages at the end [s].
 _END_S: Final = 2.0
 
 
@@ -41,7 +41,7 @@ def _report(way: Way) -> dict[str, Any]:
 
 
 async def serve(link: Link, way: Way, newest: Newest) -> None:
-    """Pass on updates until the twin requests the end, or has ended."""
+    """Pass updates to the output until the twin requests the end, or has ended."""
     sent, ends = _report(way), False
     link.send(sent)
     while not (ends or link.broken):

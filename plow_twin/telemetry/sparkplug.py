@@ -1,7 +1,10 @@
-"""Sparkplug B over MQTT: birth with all metrics, data with changed metrics, death, and rebirth on request.
+"""Output by Sparkplug B over MQTT.
+
+A birth message contains all metrics, and a data message contains the changed metrics. A death message ends the session.
+A new birth message is sent on request.
 
 The messages have the format of `sparkplug_b.proto` of Eclipse Tahu. The format is built here from the published field
-numbers, because that file has another licence.
+numbers, because the licence of `sparkplug_b.proto` differs from the licence of this package.
 
 References
 ----------
@@ -24,7 +27,7 @@ from plow_twin.telemetry.values import UNITS, Group, Newest, Value
 _UINT64, _STRING, _UINT32, _BOOL = 4, 9, 13, 8
 _DOUBLE, _MESSAGE = 1, 11
 _OPTIONAL, _REPEATED = 1, 3
-#: Name, number and type of each field, and the message type of a nested field.
+#: Name, number and type of each field. A nested field has a message type in addition.
 _FIELDS: Final = {
     "Payload": (
         ("timestamp", 1, _UINT64, ""), ("metrics", 2, _MESSAGE, "Metric"), ("seq", 3, _UINT64, ""),
@@ -55,7 +58,7 @@ def _messages() -> tuple[Any, Any]:
                 added.type_name = f".plow_twin.sparkplug.{of}"
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
-    # protobuf before 4.22 has a class for this purpose instead of the function `GetMessageClass`
+    # protobuf before 4.22 does not have the function `GetMessageClass`
     class_of = getattr(message_factory, "GetMessageClass", None) or message_factory.MessageFactory(pool).GetPrototype
     return tuple(class_of(pool.FindMessageTypeByName(f"plow_twin.sparkplug.{name}")) for name in ("Payload", "Metric"))
 
@@ -64,7 +67,7 @@ Payload, Metric = _messages()
 
 
 class Sparkplug:
-    """An edge node with metrics `<group>/<name>`; the `options` are the arguments of `Broker`."""
+    """An edge node with metrics `<group>/<name>`. `options` are the arguments of `Broker`."""
 
     def __init__(self, group: str, node: str, **options: Any) -> None:
         self._topic = f"spBv1.0/{group}/{{}}/{node}"
@@ -74,7 +77,7 @@ class Sparkplug:
         self._rebirth = False
         self._newest = Newest()
         self._sent: dict[tuple[str, str], Value] = {}
-        # the next birth contains all newest values, so messages queued during a break are dropped
+        # messages that are queued during a break are dropped, because the next birth contains all newest values
         self._broker = Broker(will=self._next_death, on_connected=self._born, keeps=False, **options)
         self._broker.client.on_message = self._asked
         self.state = self._broker.state
@@ -99,7 +102,7 @@ class Sparkplug:
         return group._replace(values=values)
 
     async def turn(self) -> None:
-        """Send the birth again if a rebirth was requested."""
+        """Send a new birth message if a rebirth was requested."""
         if self._rebirth:
             self._rebirth = False
             with self._broker.lock:
@@ -159,7 +162,7 @@ def _payload(groups: Mapping[str, Group], *, with_units: bool) -> Any:
 
 
 def _typed(value: Value) -> tuple[int, str, Any]:
-    """Return the type number of a value, and the name and content of the message field for it."""
+    """Return the type number of a value, the name of the message field for it, and the content of the field."""
     if value is None:
         return _DOUBLE_TYPE, "is_null", True
     if isinstance(value, str):

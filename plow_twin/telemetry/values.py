@@ -1,4 +1,4 @@
-"""The newest numbers and texts of a twin, in groups that are equal on all outputs."""
+"""The newest numbers and texts of a twin, in groups. All outputs have the same groups."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 
 from plow_twin.live.part import number_of
 
-#: A value, or None if it is unknown.
+#: A value, or None if the value is unknown.
 Value = float | int | str | None
 
 _POINTS: Final = ("", "/p05", "/p95")
@@ -27,7 +27,7 @@ UNITS: Final = {"clearance": "m", "wear": "m", "peaks": "N"}
 class Group(NamedTuple):
     """Values in SI units that are sent together. `held` is True if the load had no new samples.
 
-    `time_s` is the stamp that the model has reached, in s since 1970, or 0 before the first stamp.
+    `time_s` is the stamp that the model has reached [s since 1970]. Before the first stamp, `time_s` is 0.
     """
 
     time_s: float
@@ -38,9 +38,10 @@ class Group(NamedTuple):
 class Newest:
     """The newest values of all groups, from the updates of a feed.
 
-    `clearance` and `wear` contain values [m] with their 5 % and 95 % points. `peaks` contains the largest forces [N]
-    since the last update, and `life` contains P10, P50 and P90 of the forecast. The other groups are `flags`, `status`
-    and `alarms`. After the first update, each group contains all of its names.
+    The groups `clearance` and `wear` contain values [m] and the 5 % and 95 % points of the values. The group `peaks`
+    contains the largest forces since the last update [N]. The group `life` contains the 10 %, 50 % and 90 % points of
+    the forecast. The groups `flags`, `status` and `alarms` contain states of the twin. After the first update, each
+    group contains all of its names.
     """
 
     def __init__(self) -> None:

@@ -18,8 +18,14 @@ class TelemetryError(PlowTwinError):
 class State:
     """State of an output.
 
-    `sent` counts the messages, points or updates that the receiver has accepted, and `lost` those that were dropped.
-    `trouble` states why the receiver accepts no messages, or is empty.
+    Attributes
+    ----------
+    sent : int
+        Number of messages, points or updates that the receiver has accepted.
+    lost : int
+        Number of messages, points or updates that were dropped.
+    trouble : str
+        Reason why the receiver accepts no messages. The text is empty if it accepts messages.
     """
 
     connected: bool = False

@@ -1,4 +1,5 @@
-// Charts of the selected time span: peaks of the pads, clearances with their intervals, and extremes of the load.
+// Draws charts of the selected time span. They show the peaks of the pads, the clearances with their intervals, and
+// the extremes of the load.
 
 /* global uPlot */
 const COLORS = ["#0072b2", "#56b4e9", "#e69f00", "#b8a600", "#d55e00", "#ff9e69", "#009e73", "#6edcb9"];

@@ -1,4 +1,4 @@
-// The operator's screen. It stores the data of the server, and draws them while the page is visible.
+// The operator's screen. It stores the data from the server, and draws the data while the page is visible.
 
 import {Section, forceColor, wearColor} from "./section.js";
 import {Charts} from "./charts.js";
@@ -18,7 +18,7 @@ const state = {facts: null, parts: {}, events: [], seconds: [], motion: null, ne
 let section = null, charts = null, socket = null, wait = 500;
 const token = {value: sessionStorage.getItem("token") ?? ""};
 
-// the token follows # in the address, so that the browser never sends it
+// the token follows # in the address, so that the browser never sends the token
 if (location.hash.startsWith("#token=")) {
   token.value = decodeURIComponent(location.hash.slice(7));
   sessionStorage.setItem("token", token.value);

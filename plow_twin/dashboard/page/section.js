@@ -1,4 +1,4 @@
-// The cross-section as SVG: frame, head with widened gaps, pads coloured by force and wear, and the load.
+// Draws the cross-section as SVG. It shows the frame, the head with widened gaps, the pads and the load.
 
 const SVG = "http://www.w3.org/2000/svg";
 const MM = 1000;
@@ -16,8 +16,8 @@ const mixed = (from, to, share) => {
 };
 const CALM = [150, 160, 168], BLUE = [0, 114, 178], AMBER = [230, 159, 0], RED = [200, 0, 30], PURPLE = [88, 40, 150];
 
-// Colour of a force [N]: from grey to amber at the warning threshold, and red above the error threshold.
-// Without thresholds, the colour goes from grey to blue at the force `largest`.
+// Returns the colour of a force [N]. The colour changes from grey at 0 to amber at the warning threshold, and is red
+// above the error threshold. If there are no thresholds, it changes from grey at 0 to blue at the force `largest`.
 export function forceColor(force, [warn, error], largest) {
   if (error > 0 && force >= error) return mixed(RED, RED, 1);
   if (warn > 0 && force >= warn) return mixed(AMBER, AMBER, 1);
@@ -27,10 +27,10 @@ export function forceColor(force, [warn, error], largest) {
 
 export const wearColor = (depth, largest) => mixed([205, 210, 214], PURPLE, largest > 0 ? depth / largest : 0);
 
-// The walls (top, right, bottom, left), each given by the indices of the two pads at its ends.
+// Walls in the order top, right, bottom, left. A wall is given by the indices of the two pads at its ends.
 const WALLS = [[0, 2], [3, 5], [4, 6], [7, 1]];
 
-// The intersection of two lines, each given by two points.
+// Returns the intersection of two lines. A line is given by two points.
 function crossing([[ax, ay], [bx, by]], [[cx, cy], [dx, dy]]) {
   const [ux, uy, vx, vy] = [bx - ax, by - ay, dx - cx, dy - cy];
   const share = ((cx - ax) * vy - (cy - ay) * vx) / (ux * vy - uy * vx);
@@ -45,7 +45,7 @@ export class Section {
     const [width, height] = this.half = facts.frame.map((side) => 0.5 * MM * side);
     const small = Math.min(width, height);
     const gap = MM * Math.max(...facts.clearance);
-    // with this factor, the clearance fills a third of the frame's smaller side
+    // the factor is chosen so that the clearance fills a third of the smaller side of the frame
     this.factor = gap > 0 ? Math.max(1, 2 * small / 3 / gap) : 1;
     const [w, h] = [width, height].map((side) => side + 0.62 * small);
     svg.setAttribute("viewBox", `${-w} ${-h} ${2 * w} ${2 * h}`);
@@ -69,8 +69,8 @@ export class Section {
     return found;
   }
 
-  // A pad is drawn inside the frame along its wall, beginning at the corner. The outer stripe shows force, the inner
-  wear.
+  // A pad is drawn inside the frame along its wall, beginning at the corner. The outer stripe shows the force, and the
+  // inner stripe shows the wear.
   pad(pad, small) {
     const [length, depth] = [0.42 * small, 0.075 * small];
     const stripe = (from) => {

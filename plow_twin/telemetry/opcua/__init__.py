@@ -1,1 +1,1 @@
-"""OPC UA server for the results: a device type based on the OPC UA mining model, and alarms as conditions."""
+"""OPC UA server for the results. It has a device type from the OPC UA mining model, and alarms as conditions."""

@@ -23,7 +23,7 @@ _LIMIT: Final = {"warn": "High", "error": "HighHigh"}
 
 @dataclass
 class Condition:
-    """The condition of one alarm: its event generator, and its state at the newest event."""
+    """The condition of one alarm. It contains the event generator, and the state of the alarm at the newest event."""
 
     events: Any
     node_id: ua.NodeId
@@ -34,7 +34,7 @@ class Condition:
 
     @property
     def event_id(self) -> bytes:
-        """Identifier of the newest event, which a client uses to acknowledge it."""
+        """Identifier of the newest event, with which a client acknowledges the event."""
         found = self.events.event.EventId
         return bytes(found.Value) if isinstance(found, ua.Variant) else b""
 
@@ -44,8 +44,8 @@ class Conditions:
 
     def __init__(self, server: Server, model: Model) -> None:
         self._server, self._model = server, model
-        #: Function that requests the twin to acknowledge its alarms, and returns whether the request was sent; None if
-        #: it is not allowed.
+        #: Function that requests the twin to acknowledge its alarms, and returns whether the request was sent. It is
+        #: None if clients may not acknowledge alarms.
         self.acknowledge: Callable[[], bool] | None = None
         self._conditions: dict[str, Condition] = {}
         self._values: Mapping[str, Value] = {}
@@ -86,7 +86,7 @@ class Conditions:
             before = condition.level, condition.acknowledged
             condition.level = str(values[f"{name}_level"] or "none")
             raised = values[f"{name}_time"]
-            # an alarm without a time is not latched, so there is nothing to acknowledge
+            # an alarm without a time is not latched and need not be acknowledged
             if raised != condition.raised:
                 condition.raised, condition.acknowledged = raised, raised is None
             if (condition.level, condition.acknowledged) != before:

@@ -1,4 +1,7 @@
-"""The OPC UA information model: the type of a plough head's twin, derived from mining equipment, and its instance."""
+"""The OPC UA information model. It has a type for the twin of a plough head, and one instance of the type.
+
+The type is derived from the type of mining equipment in the companion specification.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from plow_twin.telemetry.values import UNITS, Group
 
 NAMESPACE: Final = "https://plow-twin.readthedocs.io/opcua"
 _NODESETS: Final = Path(__file__).with_name("nodesets")
-#: Nodeset files. Each file comes after the files that it needs.
+#: Nodeset files. Files that are needed by a file precede the file.
 _FILES: Final = ("Opc.Ua.Di", "Opc.Ua.Machinery", "Opc.Ua.Mining.General")
 _DI, _MINING = "http://opcfoundation.org/UA/DI/", "http://opcfoundation.org/UA/Mining/General/"
 _FUNCTIONAL_GROUP, _DEVICE_SET, _EQUIPMENT, _IDENTIFICATION = 1005, 5001, 1002, 1003
@@ -90,7 +93,7 @@ class Model:
             if name in UNITS and "/" not in key:
                 await instantiate(folder, interval, node_id, browse_name, instantiate_optional=False)
                 node = self._server.get_node(node_id)
-                # without a modelling rule, the instance would have no points
+                # the points need a modelling rule, because the instance contains only nodes with a modelling rule
                 for point in _POINTS:
                     await self._server.get_node(self.node_id(f"{begin}.{key}.{point}")).set_modelling_rule(True)
                 await self._set_unit(node, UNITS[name])

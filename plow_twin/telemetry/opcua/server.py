@@ -1,4 +1,4 @@
-"""OPC UA server for the twin's results, as read-only variables with stamp and status."""
+"""OPC UA server for the results of the twin, which are read-only variables with a stamp and a status."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _GOOD: Final = ua.StatusCode()
 
 
 class OneUser(UserManager):
-    """User manager that admits one named user, or all clients if the name is empty."""
+    """User manager that admits one user or, if the name of the user is empty, all clients."""
 
     def __init__(self, user: str, password: str) -> None:
         self._user, self._password = user, password
@@ -54,9 +54,18 @@ class OneUser(UserManager):
 class OpcUaServer:
     """Output as an OPC UA server, to which clients connect.
 
-    With `certificate` and `key`, all connections are signed and encrypted. `trusted` is a folder with the certificates
-    of the admitted clients or of their authorities. With None, all clients are admitted. `user` and `password` are the
-    credentials of the only user; if they are empty, clients need no login.
+    Parameters
+    ----------
+    certificate
+        Certificate of the server. With a certificate and a key, all connections are signed and encrypted.
+    key
+        Private key of the server.
+    trusted
+        Folder with the certificates of the admitted clients or authorities. With None, all clients are admitted.
+    user
+        Name of the only user. If the name is empty, clients need no login.
+    password
+        Password of the user.
     """
 
     def __init__(
@@ -111,7 +120,7 @@ class OpcUaServer:
         self.state.sent += 1
 
     async def turn(self) -> None:
-        """Update the connection state: connected means that at least one client is connected."""
+        """Update the state of the connection. The state is connected if at least one client is connected."""
         listening = self._server.bserver
         self.state.connected = bool(listening is not None and listening.clients)
 
