@@ -85,7 +85,7 @@ def read_yaml(path: Path, name: str, sections: str) -> tuple[Any, list[Problem]]
 
 
 def load_yaml(text: str, name: str, sections: str, *, most_values: float = math.inf) -> tuple[Any, list[Problem]]:
-    """Return a document, or None if it is unreadable, and its problems. `name` is its name in messages."""
+    """Return a document and its problems. An unreadable document is None. Messages call the document `name`."""
     try:
         excess = _excess(text, most_values)
         if excess is not None:

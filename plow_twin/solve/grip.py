@@ -42,8 +42,8 @@ from plow_twin.solve.state import (
 #: relative to the terms of the function at the start of the step. `_ROUNDING_OVER_STEP` is relative to the largest term
 #: over the step.
 _ROUNDING, _ROUNDING_OVER_STEP = 1e-10, 1e-13
-#: Rounding error of a corner's position along its wall, divided by `Params.leverage`, and of its slip rate, divided by
-#: `Params.threshold[0]`.
+#: Rounding error of a corner's position along its wall, divided by `Params.leverage`. The rounding error of its slip
+#: rate, divided by `Params.threshold[0]`, has the same value.
 _FINEST = 4e-15
 
 

@@ -47,7 +47,7 @@ _ROWS: Final = MAX_ORDER + 1
 _EIGHT: Final = (PAIR_COUNT, WIDTH)
 _OF_PAIRS: Final = (PAIR_COUNT, _ROWS, WIDTH)
 
-#: Eight columns of derivatives: their dependence on parameters, and their series over a step.
+#: Eight columns of derivatives, with their dependence on parameters and their series over a step.
 COLUMNS: Final = np.dtype(
     [
         ("series", "f8", (6, _ROWS, WIDTH)),

@@ -199,7 +199,7 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
     first = fused(of_rate, deeper, of_depth * depth) + constant
     kept = below(zero, first)
     if fraction is not None:
-        # a pair that separates within the step penetrates at its start, so its guard function keeps its first value
+        # a pair that separates within the step penetrates at the start of the step, so the first value is not changed
         kept |= below(zero, exact_row(lanes.begin, 0))
     first = choose(kept, first, zero)
     set_row(guard, 0, first)

@@ -283,7 +283,7 @@ def go_past_an_instant(params, lanes) -> None:
 
 @kernel()
 def _leave(members, lanes, w, order, lane, code, t) -> None:
-    """Remove the scene from a lane and store its status. If it has reached its end, write the remaining output rows."""
+    """Remove the scene from a lane and store its status. If the scene has reached its end, write its last rows."""
     member = lanes.member[lane]
     p, state, totals = members.params[member], members.states[member], members.totals[member]
     find_peaks(lanes, w, order - 1)
