@@ -581,7 +581,8 @@ class _Regressed:
 class _Near:
     """Matrices of a regression on m features of n draws, in which draws near the measured features have large weights.
 
-    distance, weight : (n,) squared distance of each draw from the measured features, and its weight
+    distance : (n,) squared distance of each draw from the measured features
+    weight : (n,) weight of each draw
     scale : (m,) scatter of the features
     basis : (n, m + 1) design matrix
     inverse : (m + 1, m + 1) inverse of the normal matrix

@@ -36,7 +36,8 @@ class History:
     """Estimated clearances at several values of the travel.
 
     travel : (n,) travel along the face in m since the first row; it must not decrease
-    clearance, deviation : (n, 2) horizontal and vertical clearance, and their standard deviations, in m
+    clearance : (n, 2) horizontal and vertical clearance in m
+    deviation : (n, 2) standard deviations of the clearances in m
     """
 
     travel: Array
@@ -61,8 +62,10 @@ class History:
 class Coefficient:
     """Posterior of the wear coefficient, and the state at the end of the history.
 
-    value, weight : (m,) values of k_s in m^2/N on a grid, and their probabilities
-    clearance, deviation : (2,) clearances and their standard deviations in m
+    value : (m,) values of the wear coefficient k_s in m^2/N on a grid
+    weight : (m,) probability of each value
+    clearance : (2,) horizontal and vertical clearance in m
+    deviation : (2,) standard deviations of the clearances in m
     depth : (8,) wear depth of each pad in m, from the simulated wear path
     """
 

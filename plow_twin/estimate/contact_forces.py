@@ -82,7 +82,8 @@ class Felt:
     """Penetration and contact force of the fitted motion at the times of the measured forces.
 
     swing : (n,) index of the swing of each row, -1 outside all swings
-    penetration, force : (n, 8) in m and N, NaN outside all swings
+    penetration : (n, 8) penetration of each pair in m, NaN outside all swings
+    force : (n, 8) force of each pair in N, NaN outside all swings
     """
 
     swing: NDArray[np.int64]

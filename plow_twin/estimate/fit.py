@@ -145,7 +145,8 @@ class Piece:
     """A part of the normal equations, for the shared unknowns and for one or two consecutive swings.
 
     swing : index of the first swing
-    rows, weighted : (m, SIZE + 6) or (m, SIZE + 12) the Jacobian, and the Jacobian multiplied by the weights
+    rows : (m, SIZE + 6) or (m, SIZE + 12) Jacobian
+    weighted : Jacobian multiplied by the weights, in the shape of `rows`
     residual : (m,) residuals
     """
 
@@ -218,7 +219,8 @@ class _Rows:
     """Assignment of poses to swings, for stamps that are `shift` s late.
 
     swing : (n,) index of the swing of each pose, -1 outside all swings
-    inside, times : (k,) indices of the poses that lie in swings, and the model times of these poses in s
+    inside : (k,) indices of the poses that lie in swings
+    times : (k,) model times of these poses in s
     inner : (s + 1,) index in `inside` of the first row of each swing
     asked : times in s at which a simulation returns the state, which include the ends of linked swings
     ends : indices in `asked` of the ends of linked swings

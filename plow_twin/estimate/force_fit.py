@@ -44,8 +44,10 @@ class JointFit:
     """Result of the joint fit of poses and contact forces.
 
     used : properties of the load cells, or the reason why the forces were not used
-    shared, covariance : (SIZE,), (SIZE, SIZE) shared unknowns and their covariance; None if the forces were not used
-    model, sensor : evidence against the model, and evidence against the sensor
+    shared : (SIZE,) shared unknowns; None if the forces were not used
+    covariance : (SIZE, SIZE) covariance of the shared unknowns; None if the forces were not used
+    model : reasons why the model is suspect
+    sensor : reasons why the sensor is suspect
     """
 
     used: ForcesUsed
@@ -78,7 +80,8 @@ class _At:
 class _Block:
     """Normal equations of a swing, from which its starting state has been eliminated.
 
-    normal, score : (b, b), (b,) matrix and right-hand side for the unknowns of the border, which are all other unknowns
+    normal : (b, b) matrix for the unknowns of the border
+    score : (b,) right-hand side for the unknowns of the border
     state : (6,) step of the starting state if the border's unknowns do not change
     answer : (6, b) derivative of the starting state's step with respect to the steps of the border's unknowns
     root : (6, 6) Cholesky factor of the covariance of the starting state

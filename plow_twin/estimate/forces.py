@@ -53,8 +53,10 @@ class Forces:
     start : time in s at which the span of peaks and impulses begins
     t : (n,) times in s
     force : (3, n, 8) force of each pair at the times `t` in N
-    peak, impulse : (3, 8) largest force in N and impulse in N s of each pair from `start` to the end
-    members, left_out : numbers of members that are within the range of the model, and that have left this range
+    peak : (3, 8) largest force of each pair in N from `start` to the end
+    impulse : (3, 8) impulse of each pair in N s from `start` to the end
+    members : number of members that are within the range of the model
+    left_out : number of members that have left the range of the model
     """
 
     start: float

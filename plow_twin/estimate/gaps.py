@@ -84,7 +84,8 @@ class GapsFit:
     """Clearances and poses computed from measured gaps.
 
     poses : poses computed from the gaps; empty if theta was taken from measured poses
-    clearance, deviation : (2,) horizontal and vertical clearance, and their standard deviations, in m
+    clearance : (2,) horizontal and vertical clearance in m
+    deviation : (2,) standard deviations of the clearances in m
     groups : clearance between each two facing pads with sensors
     used : number of messages that were used
     contradiction : largest mean residual of a sensor in units of its constant error; 0 if no sensor is redundant

@@ -51,7 +51,8 @@ class Path:
 
     exposure : (n,) rising exposures in 1/N, from 0
     depth : (n, 8) wear depth of each pad in m
-    force, deviation : (n, 8) mean normal force of each pad in N, and standard error of the mean
+    force : (n, 8) mean normal force of each pad in N
+    deviation : (n, 8) standard error of the mean force in N
     error : estimate of the largest error of a depth in m at the end of the path
     """
 

@@ -91,7 +91,8 @@ class Cell:
 
     rows : number of rows in which the pair of the cell is in or near contact
     gain : measured force divided by true force
-    offset, noise : median and standard deviation of the readings during flight in N
+    offset : median of the readings during flight in N
+    noise : standard deviation of the readings during flight in N
     left_over : share of the force that neither the motion nor the noise explains
     """
 

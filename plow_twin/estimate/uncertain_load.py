@@ -46,7 +46,8 @@ _FEWEST = 40
 class Compared:
     """Result of the comparison of a measured motion with motions under uncertain loads.
 
-    clearance, deviation : (2,) clearances and standard deviations in m
+    clearance : (2,) horizontal and vertical clearance in m
+    deviation : (2,) standard deviations of the clearances in m
     touched : (2,) whether the head touched both horizontal walls, and whether it touched both vertical walls
     ln_depth : mean and deviation of the logarithm of the penetration in m under the reference force
     ln_damping : mean and deviation of the logarithm of the damping

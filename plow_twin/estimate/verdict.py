@@ -35,7 +35,8 @@ MOMENTS = 60
 class Verdict:
     """Faults of the model and of the sensor that the tests have found.
 
-    model, sensor : messages about faults of the model and of the sensor
+    model : messages about faults of the model
+    sensor : messages about faults of the sensor
     figures : statistics of the tests
     by_scale : whether wrong scale factors are the only fault of the sensor
     broken : whether the sensor has failed or the measurements contradict each other, so that no estimate is possible

@@ -42,7 +42,8 @@ MOST_KEPT = 600_000
 class Window:
     """Measurements in the window [start_ns, end_ns), with times in s after `start_ns`.
 
-    samples, poses : number of received load samples, and number of received poses plus received rows of gaps
+    samples : number of received load samples
+    poses : number of received poses plus number of received rows of gaps
     lost : number of rows that are left out
     gaps : measured gaps; None without gaps
     """

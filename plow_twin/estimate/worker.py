@@ -59,12 +59,15 @@ ForkingPickler.register(MappingProxyType, lambda view: (_view, (dict(view),)))
 class Found:
     """Result of the estimate of one window.
 
-    start_ns, end_ns : beginning and end of the window [ns]
-    samples, poses : numbers of load samples and of poses in the window
+    start_ns : beginning of the window [ns]
+    end_ns : end of the window [ns]
+    samples : number of load samples in the window
+    poses : number of poses in the window
     guess : first guess of the fit
     estimate : the estimate
     wall_s : duration of the computation in s
-    skipped, restarts : number of windows that were skipped, and number of restarts, before this window
+    skipped : number of windows that were skipped before this window
+    restarts : number of restarts before this window
     text : the whole answer as JSON, with `forces` and `forecast` if requested
     also : the answers `forces` and `forecast` as JSON values, if requested
     """
