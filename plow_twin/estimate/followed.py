@@ -31,8 +31,8 @@ Array = NDArray[np.float64]
 WINDOW_S, INTERVAL_S = 32.0, 10.0
 #: Nanoseconds per second, by definition.
 _NS: Final = 1e9
-#: Upper bound in s on the duration of the parts in which the load is processed. With this bound, the rows of all
-#: members fit into the processor's cache.
+#: Upper bound in s on the duration of the part of the load that is processed in one call. With this bound, the rows of
+#: all members fit into the processor's cache.
 _PART_S: Final = 0.02
 
 

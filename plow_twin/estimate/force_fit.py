@@ -78,7 +78,7 @@ class _At:
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """Normal equations of a swing, from which its starting state has been eliminated.
+    """Normal equations of a swing for the *border*, which consists of all unknowns except the starting states.
 
     normal : (b, b) matrix for the unknowns of the border
     score : (b,) right-hand side for the unknowns of the border

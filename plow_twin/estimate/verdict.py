@@ -319,7 +319,7 @@ def _changes(problem: Problem, fit: Fit, columns: NDArray[np.intp]) -> Iterator[
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Normal equations of one swing for the shared unknowns, from which its starting state has been eliminated.
+    """Normal equations of one swing for the unknowns of the whole window; the starting state has been eliminated.
 
     normal : (SIZE, SIZE) matrix, the information of the swing
     score : (SIZE,) right-hand side

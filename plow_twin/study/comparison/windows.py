@@ -1,4 +1,4 @@
-"""Time windows of a run, each about one load period long, with the load and the quantities of each pair."""
+"""Time windows of a run, with the load and the quantities of each pair. A window is about one load period long."""
 
 from __future__ import annotations
 
