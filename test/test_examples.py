@@ -12,7 +12,7 @@ from scenes import ROOT
 
 SAID = {
     "first_scene": r"top_left_top +largest +[1-9][\d.]* kN, +\d+ makes",
-    "live_twin": r"restored and advanced by 1000 samples in one call: [0-9a-f]{16}, the same bits",
+    "live_twin": r"restored and advanced by 1000 samples in one call: [0-9a-f]{16}, bit-identical",
     "own_contact_law": r"0\.50 +0\.\d+ +0\.5000",
     "sweep": r"20\.0 mm( +\d+\.\d){5}",
     "calibration": r"stiffness 3\.1e\+07 N/m",

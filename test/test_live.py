@@ -758,7 +758,7 @@ print(os.sched_getaffinity(0) == {one})
         (["twice.csv"], 1, "column 'fx' occurs more than once"),
         (["load.csv", "--map", "twice.yaml"], 2, "the key twice, in lines 1 and 2"),
         (["junk.csv"], 1, "\\x1b"),
-        (["mqtt://localhost:1"], 1, "expected one that names the topics"),
+        (["mqtt://localhost:1"], 1, "expected a mapping that assigns the topics"),
     ],
 )
 def test_a_wrong_call_names_the_expectation(

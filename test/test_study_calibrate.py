@@ -169,7 +169,7 @@ def test_the_command_fits_a_recording_and_marks_the_fitted_numbers(
     for wrong, message in (
         (["--unknown", "contact.stiffness=1:2:lag"], "LOW:HIGH"),
         (["--unknown", "contact.stifness=1:2"], "nearest: contact.stiffness"),
-        (["--target", "paper"], "expected one of them"),
+        (["--target", "paper"], "expected either --target or --recording"),
         (["--t-end", "1"], "--t-end: got it with --recording"),
         (["--unknown", "contact.law=flores,hu_gou"], "contact.law: got 'hu_gou', expected one of"),
         (["--set", "contact.law=hertz"], "contact.damping: got 0.43"),
