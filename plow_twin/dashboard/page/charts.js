@@ -9,8 +9,8 @@ const ink = () => getComputedStyle(document.documentElement).getPropertyValue("-
 const grid = () => getComputedStyle(document.documentElement).getPropertyValue("--line");
 const faded = (color) => `${color}33`;
 
-// Returns columns: the time of each second, and the values that `read` returns for it. Missing seconds interrupt a
-line.
+// Returns columns of numbers. The first column contains the time of each second. Each column after the first contains
+// values that `read` returns for the seconds. Missing seconds interrupt a line.
 function columns(seconds, count, read) {
   const found = Array.from({length: count + 1}, () => []);
   let before = null;
