@@ -1,4 +1,4 @@
-"""The program `excitation_publisher`, which publishes the load of a scene as samples on the topic `excitation`.
+"""The program `excitation_publisher`: a scene's load as samples on `excitation`, in real time or as fast as possible.
 
 With `--sensor`, the program publishes synthetic measurements on `head_pose`, in addition to the load. They are the pose
 of a head in a wider guide, with the noise of a sensor, so that the true clearance is known. With `--cutting`, a
