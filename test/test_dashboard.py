@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import struct
@@ -29,6 +30,7 @@ from waiting import until
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from plow_twin import dashboard
 from plow_twin.dashboard.access import PageAccess
 from plow_twin.dashboard.feed import Feed
 from plow_twin.dashboard.history import SPAN_S, History
@@ -486,6 +488,14 @@ def _check_readable(page: browser.Page) -> None:
         page.call("Emulation.setDeviceMetricsOverride", width=width, height=800, deviceScaleFactor=1, mobile=False)
         assert page.evaluate("document.documentElement.scrollWidth") <= width
     page.call("Emulation.clearDeviceMetricsOverride")
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node is installed")
+def test_the_scripts_of_the_page_have_no_syntax_error() -> None:
+    scripts = sorted((Path(cast(str, dashboard.__file__)).parent / "page").glob("*.js"))
+    assert len(scripts) >= 4
+    for script in scripts:
+        subprocess.run(["node", "--check", str(script)], check=True)
 
 
 @pytest.mark.skipif(browser.CHROMIUM is None, reason="no Chromium is installed")
