@@ -492,7 +492,7 @@ def _check_readable(page: browser.Page) -> None:
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node is installed")
 def test_the_scripts_of_the_page_have_no_syntax_error() -> None:
-    scripts = sorted((Path(cast(str, dashboard.__file__)).parent / "page").glob("*.js"))
+    scripts = sorted((Path(dashboard.__file__).parent / "page").glob("*.js"))
     assert len(scripts) >= 4
     for script in scripts:
         subprocess.run(["node", "--check", str(script)], check=True)
