@@ -17,7 +17,7 @@ from plow_twin.solve.state import new_work
 
 
 def swaying(drift: tuple[float, float, float] = (0.0, 0.0, 0.0), amplitude: float = 1e-3, omega: float = 20.0) -> Scene:
-    """Return a weightless head that drifts while a load moves it to and fro by `amplitude` [m]."""
+    """Return a weightless head that drifts while a load moves it back and forth by `amplitude` [m]."""
     scene = preset("bench_kv")
     m, inertia = scene.head.mass_kg, scene.head.inertia_kg_m2
     force, moment = np.array([m, 0.5 * m]) * amplitude * omega**2, inertia * amplitude * omega**2

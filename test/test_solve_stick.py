@@ -158,7 +158,7 @@ def test_a_block_on_a_moving_belt_sticks_and_slips_for_ever() -> None:
 
 
 def test_a_load_below_the_limit_is_held_without_creep() -> None:
-    """Under a load of up to 0.9 mu N to and fro, the displacement is F / k, without creep in 20 periods."""
+    """Under a load of up to 0.9 mu N back and forth, the displacement is F / k, without creep in 20 periods."""
     amplitude, omega = 0.9 * MU * MASS * G, 2.0 * math.pi
     load = Harmonic("pull", (amplitude, 0.0), omega_rad_s=omega)
     scene = replace(block(0.0, 0.0), friction=HELD, loads=(load,))
