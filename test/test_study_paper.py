@@ -245,8 +245,8 @@ def test_the_page_has_the_run_s_numbers(study: PaperStudy) -> None:
     fitted = [entry for entry in study.rows if entry.inputs == FITTED]
     agree = sum(entry.verdict is Verdict.AGREES for entry in fitted)
     said = (
-        f"Of {len(study.rows)} statements {yes} agree: {agree} of the {len(fitted)} that R1 was fitted to, "
-        f"and {yes - agree} of the other {len(study.rows) - len(fitted)}."
+        f"Of {len(study.rows)} statements, {yes} agree. R1 was fitted to {len(fitted)} of the {len(study.rows)} "
+        f"statements. Of these {len(fitted)}, {agree} agree."
     )
     assert said in " ".join(text.split())
     for entry in study.rows:
