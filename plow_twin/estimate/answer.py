@@ -6,8 +6,6 @@ import json
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-import numpy as np
-
 from plow_twin.estimate import tuning
 from plow_twin.estimate.estimate import Guess, estimate_window
 from plow_twin.estimate.forces import ForcesError, forces_of
@@ -78,7 +76,7 @@ def answer(scene: Scene, window: Window, guess: Guess, asked: Asked) -> Answer:
 def _forces(scene: Scene, result: Estimate, load: Load, asked: Asked) -> dict[str, Any]:
     if State.PRIOR in (result.horizontal_state, result.vertical_state):
         raise ForcesError("estimate: got only the prior, expected an estimated clearance")
-    if not np.ptp(load.wrench, axis=0).any():
+    if load.constant:
         raise ForcesError("load: got the same value throughout, expected a measured load")
     period = load.period()
     settle, end = _SETTLE_PERIODS * period, float(load.t[-1])

@@ -1020,9 +1020,7 @@ def _well_measured(poses: Poses) -> Poses | None:
 def _is_dead(load: Load, poses: Poses) -> bool:
     """Return whether the measured load is constant although the head moves, which shows a failed load sensor."""
     late = filled(poses)[len(poses.t) // 2 :, poses.measured]
-    return not np.ptp(load.wrench, axis=0).any() and bool(
-        (late.std(axis=0) > tuning.OUTLYING * noise_level(late)).any()
-    )
+    return load.constant and bool((late.std(axis=0) > tuning.OUTLYING * noise_level(late)).any())
 
 
 def _is_idle(scene: Scene, load: Load, poses: Poses) -> bool:

@@ -189,6 +189,11 @@ class Load:
         """Return a load of zero between two times in s, in place of a load that was not measured."""
         return Load(np.array([start, end]), np.zeros((2, 3)))
 
+    @property
+    def constant(self) -> bool:
+        """Whether all samples are equal, as without a measurement or behind a failed sensor."""
+        return not np.ptp(self.wrench, axis=0).any()
+
     def between(self, start: float, end: float) -> Load:
         """Return the samples that determine the load in the closed interval [start, end]."""
         first = max(int(np.searchsorted(self.t, start, side="right")) - 1, 0)
