@@ -1,11 +1,10 @@
-"""Normal force of a pair. The functions compute a single value of the force, or its power series in time.
+"""Normal force of a pair, as a single value or as a power series in time.
 
     additive laws     F = K d^n + C psi(d) d',  psi = 1 (Kelvin-Voigt) or u^2 (3 - 2 u), u = min(d / ramp, 1)
     all other laws    F = K d^n (1 + lambda d')
 
-Equation 6 of the paper, the original contact law, is lost. The laws above replace this equation. `contact_laws`
-computes lambda from the restitution. The solver determines whether a pair is in contact. It sets the force to zero
-where the law would pull.
+Equation 6 of the paper, the original contact law, is lost; these laws replace it. `contact_laws` computes lambda from
+the restitution.
 """
 
 from __future__ import annotations
@@ -31,8 +30,8 @@ def free_force(
 ) -> float:
     """Return the contact law's force F in N for the penetration d in m and its rate d' in m/s.
 
-    F is negative where the law would pull. `damping_factor` is lambda in s/m, and `viscous` is C in N s/m. Either
-    lambda or C is zero. `ramp` in m is zero for a law without a ramp.
+    F is negative where the law would pull. `damping_factor` is lambda in s/m and `viscous` is C in N s/m; one of them
+    is zero. `ramp` in m is zero for a law without a ramp.
     """
     elastic = stiffness * (penetration if exponent == 1.0 else max(penetration, 0.0) ** exponent)
     if ramp > 0.0 and penetration < ramp:
@@ -51,7 +50,7 @@ def normal_force(
     viscous: float,
     ramp: float,
 ) -> float:
-    """Return the contact force in N. It is `free_force`, or 0 without penetration and where the law would pull."""
+    """Return the contact force in N: `free_force`, or 0 without penetration and where the law would pull."""
     if penetration <= 0.0:
         return 0.0
     return max(0.0, free_force(penetration, rate, stiffness, exponent, damping_factor, viscous, ramp))
@@ -72,9 +71,8 @@ def power_term(
 ) -> float:
     """Return coefficient k of base(t)^exponent for one column. `base` and `power` are power series of shape (n, 8).
 
-    Row k of a series contains the coefficients of order k. The recurrence is
-    b_0 k P_k = sum_j (exponent j - (k - j)) b_j P_{k-j} (Knuth, TAOCP 2, sec. 4.7). If the lowest order of the base is
-    t^shift, the recurrence is applied to base / t^shift, and the power starts with t^(shift exponent).
+    The recurrence is b_0 k P_k = sum_j (exponent j - (k - j)) b_j P_{k-j} (Knuth, TAOCP 2, sec. 4.7). If the lowest
+    order of the base is t^shift, the recurrence is applied to base / t^shift.
     """
     offset = int(shift * exponent)
     if k < offset:
@@ -91,7 +89,7 @@ def power_term(
 @kernel(fast=True, inline="code")
 def power_terms(base: NDArray[np.float64], power: NDArray[np.float64], k: int, exponent: float) -> Any:
     """Return P_k base[0] for the eight columns, where P_k is coefficient k >= 1 of base^exponent (no shift)."""
-    # the terms of the newest orders are added last, so the processor can start the sum before they are available
+    # the newest orders are added last, so that the sum can start before they are available
     even, odd = splat(0.0), splat(0.0)
     weight = (exponent + 1.0) * (k - 1) - k
     for j in range(k - 1, 2, -2):
@@ -110,8 +108,7 @@ def power_terms(base: NDArray[np.float64], power: NDArray[np.float64], k: int, e
 def root_terms(newest: Any, root: NDArray[np.float64], k: int) -> Any:
     """Return 2 r_0 r_k for k >= 1, where r is the square root of a series b, for eight series. `newest` contains b_k.
 
-    The recurrence is 2 r_0 r_k = b_k - sum_{j=1}^{k-1} r_j r_{k-j}. The terms j and k - j are equal, so each product is
-    computed once.
+    The recurrence is 2 r_0 r_k = b_k - sum_{j=1}^{k-1} r_j r_{k-j}; the terms j and k - j are equal.
     """
     rest, products = newest, splat(0.0)
     half = k // 2

@@ -4,8 +4,7 @@ Most laws have the form F = K d^n (1 + lambda d'), where d is the penetration an
 laws differ in the damping number D = lambda v0 that they derive from the restitution e. v0 is the speed at first touch.
 The additive laws add C d' to K d^n. C acts fully from the first touch (Kelvin-Voigt), or increases over a ramp.
 
-A new law is an entry of `_LAWS`, or a call of `add_law` from outside the package. The solver reads only the damping
-number and the options of a law.
+A new law is an entry of `_LAWS`, or a call of `add_law` from outside the package.
 """
 
 from __future__ import annotations
@@ -18,18 +17,18 @@ from typing import Final
 
 from plow_twin.errors import ArgumentError
 
-#: Value of 1 - e below which rounding dominates the residual of the exact law. Below it, D is computed from the first
-#: two terms of its series.
+#: Value of 1 - e below which D is computed from the first two terms of its series, because rounding dominates the
+#: residual.
 _NEARLY_ELASTIC: Final = 1e-5
-#: Upper bound of D = lambda v0. Some laws have an infinite D at a restitution of 0.
+#: Upper bound of D = lambda v0, which some laws make infinite at a restitution of 0.
 DAMPING_NUMBER_CAP: Final = 1e3
 
 
 def exact_damping_number(restitution: float) -> float:
     """Return the damping number D for which an impact has exactly the restitution e.
 
-    D solves D (1 + e) = ln((1 + D) / (1 - D e)). This equation is the first integral of the free impact under F = K d^n
-    (1 + lambda d'), for any K, n and mass; cf. Hunt and Crossley, J. Appl. Mech. 42 (1975) 440.
+    D solves D (1 + e) = ln((1 + D) / (1 - D e)), the first integral of a free impact under F = K d^n (1 + lambda d');
+    cf. Hunt and Crossley, J. Appl. Mech. 42 (1975) 440.
     """
     if restitution >= 1.0:
         return 0.0

@@ -1,9 +1,8 @@
 """Regularised Coulomb friction of a pair, T = mu N tanh(s' / v_s), and a test for Painleve's case.
 
-s' is the rate at which the corner of the frame slides along the wall of the head. The friction T pulls the wall along
-with the corner. Under a steady load T below mu N, the corner creeps at v_s atanh(T / (mu N)) instead of sticking.
-`solve.grip` implements friction with stick, which needs additional states. Source: Andersson, Soederberg and
-Bjoerklund, Tribol. Int. 40 (2007) 580, eq. 5.
+s' is the rate at which the corner of the frame slides along the wall of the head. Under a steady load T below mu N, the
+corner creeps at v_s atanh(T / (mu N)) instead of sticking; `solve.grip` implements friction with stick. Source:
+Andersson, Soederberg and Bjoerklund, Tribol. Int. 40 (2007) 580, eq. 5.
 """
 
 from __future__ import annotations
@@ -30,13 +29,12 @@ def friction_force(normal: float, slip_rate: float, coefficient: float, speed: f
 def painleve_coefficients(scene: Scene) -> NDArray[np.float64]:
     """Return the friction coefficient mu of each pair, shape (8,), above which Painleve's case is possible.
 
-    The value is inf for a pair where Painleve's case is impossible. In Painleve's case, a sliding corner is pressed
-    into the wall by its own friction: in d'' = -p N, the factor p = 1/m + a^2/I - mu |a b|/I is negative. The lengths a
-    and b are the arms of N and of T about the centre of mass at q = 0. With p < 0, the equations of motion of rigid
-    bodies have no solution or several solutions.
+    In Painleve's case, a sliding corner is pressed into the wall by its own friction: in d'' = -p N, the factor p = 1/m
+    + a^2/I - mu |a b|/I is negative. The lengths a and b are the arms of N and of T about the centre of mass at q = 0.
+    The value is inf where Painleve's case is impossible.
 
-    Compliant contact has exactly one solution: N grows with the rate sqrt(-p K) until the slip stops. This growth is
-    called impact without collision. Source: Genot and Brogliato, Eur. J. Mech. A 18 (1999) 653.
+    Compliant contact has exactly one solution: N grows with the rate sqrt(-p K) until the slip stops. Source: Genot and
+    Brogliato, Eur. J. Mech. A 18 (1999) 653.
     """
     c, s, (x, y) = 1.0, 0.0, scene.head.com_offset_m
     normal, along = (rows.T @ np.array([c, s, x, y]) for rows in (arm_rows(scene), slip_arm_rows(scene)))

@@ -11,7 +11,7 @@ In these coordinates every penetration and every arm is linear. Relative to the 
     p_x =  c Cx + s Cy - X + rx        p_y = -s Cx + c Cy - Y + ry
 
 where (rx, ry) is the offset of G from the centre of the cavity in head axes. The penetration past a wall with outward
-normal n at distance H is n . p - H. Its rate is n . dp/dt, positive inward.
+normal n at distance H is n . p - H.
 
 A head that carries corners (`carries: corners`) is a block in a fixed cavity. Its state is resolved in world axes. Its
 corner c = (cx, cy) is at
@@ -20,8 +20,8 @@ corner c = (cx, cy) is at
 
 so the equations of both kinds of head have the same form, with different coefficients.
 
-For a rounded corner, C is the centre of its arc. The radius is subtracted from the distance of each wall. Friction acts
-at the touching point, which is one radius away from C (`roll`).
+For a rounded corner, C is the centre of its arc, and the radius is subtracted from the distance of each wall. Friction
+acts at the touching point, one radius away from C (`roll`).
 """
 
 from __future__ import annotations
@@ -39,8 +39,7 @@ if TYPE_CHECKING:
 
 #: Number of components of the state: X, Y, VX, VY, omega, c, s, theta.
 STATE_SIZE = 8
-#: Two arrays, shape (8,) each. The first array is 1 for pairs with a wall normal along x, and 0 for all other pairs.
-#: The second array is 1 for pairs with a wall normal along y.
+#: 1 for pairs with a wall normal along x or along y, and 0 for all other pairs, shape (8,) each.
 _ALONG_X, _ALONG_Y = np.abs(NORMAL_X), np.abs(NORMAL_Y)
 
 
@@ -60,10 +59,9 @@ _ARC_SIDES = 6
 
 
 def outline(sides: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
-    """Return a closed polygon, shape (n, 2), of a rectangle about the origin with rounded corners.
+    """Return a rectangle about the origin with rounded corners as a closed polygon, shape (n, 2).
 
-    The polygon runs clockwise from the top left. `sides` contains width and height, shape (2,), in the unit of
-    `radius`.
+    `sides`, shape (2,), contains width and height in the unit of `radius`.
     """
     angles = np.linspace(math.pi, 0.5 * math.pi, _ARC_SIDES + 1 if radius > 0.0 else 1)
     points = []
@@ -76,10 +74,7 @@ def outline(sides: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
 
 
 def roll(scene: Scene) -> float:
-    """Return the slip of a rounded corner along its wall when the head turns about the arc's centre [m/rad].
-
-    It is subtracted from the signed arm of friction.
-    """
+    """Return the slip of a rounded corner along its wall per angle of the head about the arc's centre [m/rad]."""
     return corner_radius(scene) * (1.0 if scene.head.carries == "corners" else -1.0)
 
 
@@ -112,15 +107,15 @@ def penetration_rows(scene: Scene) -> NDArray[np.float64]:
 
 
 def penetrations_at_centre(scene: Scene) -> NDArray[np.float64]:
-    """Return the last row of `penetration_rows`, shape (8,). It is the only row that depends on the clearance."""
+    """Return the last row of `penetration_rows`, shape (8,), the only row that depends on the clearance."""
     offset_x, offset_y = scene.head.com_offset_m
     return NORMAL_X * offset_x + NORMAL_Y * offset_y - (wall_distances(scene) - corner_radius(scene))
 
 
 def _of_places(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return coefficients of positions for the head of the scene, given those for a head that carries walls.
+    """Convert coefficients of positions for a head that carries walls to those for the head of the scene.
 
-    If the head carries corners, the rotation R replaces R^T and the position of the head has the opposite sign.
+    If the head carries corners, R replaces R^T and the position of the head has the opposite sign.
     """
     if scene.head.carries == "corners":
         rows[1:4] *= -1.0
@@ -128,7 +123,7 @@ def _of_places(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _of_arms(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return coefficients of arms for the head of the scene, given those for a head that carries walls.
+    """Convert coefficients of arms for a head that carries walls to those for the head of the scene.
 
     If the head carries corners, the arms do not depend on the position of the head.
     """
@@ -146,7 +141,7 @@ def arm_rows(scene: Scene) -> NDArray[np.float64]:
 def slip_rows(scene: Scene) -> NDArray[np.float64]:
     """Return the coefficients of each corner's position t . p along its wall, shape (4, 8): rows for c, s, X, Y.
 
-    The constant term of t . p is omitted. The tangent t is the wall's outward normal n, rotated by +90 degrees.
+    The tangent t is the wall's outward normal n, rotated by +90 degrees.
     """
     return _of_places(scene, _along_tangent(scene))
 
@@ -195,7 +190,7 @@ def body_states(states: NDArray[np.float64], offset: tuple[float, float]) -> NDA
 
 
 def tumbles(scene: Scene) -> bool:
-    """Return whether the head may turn beyond 45 degrees. Only a square block without wear may do so."""
+    """Return whether the head may turn beyond 45 degrees, which only a square block without wear may do."""
     alike = scene.frame.width_m == scene.frame.height_m and scene.wear is None
     return scene.head.carries == "corners" and alike
 
@@ -207,8 +202,8 @@ def state_of(
 ) -> NDArray[np.float64]:
     """Convert pose and rate of the centre of the cavity or block, shape (3,) each, to the solver's state, shape (8,).
 
-    The state of a head that carries walls consists of body coordinates. For a head that carries corners, position and
-    velocity are in world axes. If that head tumbles, c and s belong to the angle modulo quarter turns.
+    The state of a head that carries walls is in body coordinates, that of a head that carries corners in world axes. If
+    a block tumbles, c and s belong to the angle modulo quarter turns.
     """
     if scene.head.carries == "walls":
         return body_state(q, v, scene.head.com_offset_m)
@@ -220,7 +215,7 @@ def state_of(
 
 
 def states_of(scene: Scene, states: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Convert poses and rates, shape (s, 6), to the solver's states, shape (s, 8). `state_of` describes the states."""
+    """Convert poses and rates, shape (s, 6), to the solver's states, shape (s, 8), as `state_of` does."""
     if scene.head.carries == "walls":
         return body_states(states, scene.head.com_offset_m)
     return np.array([state_of(scene, row[:3], row[3:]) for row in states]).reshape(-1, STATE_SIZE)
@@ -239,15 +234,14 @@ def largest_angle(scene: Scene) -> float:
 
 
 def length_scale(scene: Scene) -> float:
-    """Return the reference length in m for tolerances, which is the smallest clearance that is not negligible.
+    """Return the reference length in m for tolerances: the smallest clearance above 1e-4 of the frame's diagonal.
 
-    A clearance below 1e-4 of the frame's diagonal is negligible. Without any clearance above this limit, the reference
-    length is 1e-4 of the diagonal.
+    Without such a clearance, the reference length is 1e-4 of the diagonal.
     """
     floor = 1e-4 * math.hypot(scene.frame.width_m, scene.frame.height_m)
     return min((c for c in (scene.clearance.horizontal_m, scene.clearance.vertical_m) if c > floor), default=floor)
 
 
 def half_diagonal(scene: Scene) -> float:
-    """Return half the diagonal of the frame in m, a factor that converts angles to lengths."""
+    """Return half the diagonal of the frame in m, which converts angles to lengths."""
     return 0.5 * math.hypot(scene.frame.width_m, scene.frame.height_m)

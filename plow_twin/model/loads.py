@@ -1,4 +1,4 @@
-"""Loads of a scene in the form of the solver, which is one list of harmonics and one piecewise linear wrench.
+"""Loads of a scene as the solver reads them: one list of harmonics and one piecewise linear wrench.
 
 A load (Fx, Fy) has a constant arm (x, y) in world axes. Its moment about the centre of the cavity is M = x Fy - y Fx in
 every pose (paper, section 2). Gravity is treated separately.
@@ -21,9 +21,8 @@ Array = NDArray[np.float64]
 class Pieces:
     """A piecewise linear wrench: `start + slope (t - knots[i])` on [knots[i], knots[i + 1]).
 
-    `knots` [s], shape (n,), increases strictly. `start`, shape (n, 3), contains Fx and Fy in N and M in N m at each
-    knot. `slope`, shape (n, 3), contains the rates of the wrench per second. Before the first knot, the wrench is the
-    first row of `start`. The last piece has no end.
+    `knots` [s], shape (n,), increases strictly. `start`, shape (n, 3), contains Fx, Fy [N] and M [N m] at each knot,
+    and `slope`, shape (n, 3), their rates per second. Before the first knot, the wrench is constant.
     """
 
     knots: Array
@@ -78,7 +77,7 @@ def wrench_of(force: tuple[float, float], moment: float, at: tuple[float, float]
 
 
 def load_direction(load: Harmonic | Constant) -> Array:
-    """Return the wrench of a load per unit of force, shape (3,), or per unit of moment if the force is zero."""
+    """Return the wrench of a load per unit of its force, or of its moment without a force, shape (3,)."""
     size = float(np.hypot(*load.force_n)) or abs(load.moment_n_m) or 1.0
     return wrench_of(load.force_n, load.moment_n_m, load.at_m) / size
 

@@ -1,7 +1,7 @@
 """The eight pairs in their fixed order. A pair is one corner of the frame (the slide) and one wall of the cavity.
 
-The corners, seen from the front, are ordered: top left, top right, bottom right, bottom left. Each corner can touch two
-walls of the head's cavity. The pair with the horizontal wall comes first.
+The corners, seen from the front, are top left, top right, bottom right, bottom left. Each corner can touch two walls;
+the pair with the horizontal wall comes first.
 """
 
 from __future__ import annotations

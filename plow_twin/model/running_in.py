@@ -5,10 +5,8 @@ Then
 
     h = z + h0 ln(r - (r - 1) exp(-z / h0))        z = h + h0 ln((1 + (r - 1) exp(-h / h0)) / r)
 
-After running-in, h exceeds z by h0 ln r. Under a constant force F, z grows with the sliding distance s as z = k_s F s /
-A. The coefficient approaches k_s as exp(-s / s0) with s0 = h0 A / (k_s F), the exponential transient of Queener, Smith
-and Mitchell, Wear 8 (1965) 391. The coefficient depends only on the depth. Running-in therefore continues from a saved
-depth, and starts from zero with new pads.
+Under a constant force F, z grows with the sliding distance s as z = k_s F s / A, and the coefficient approaches k_s as
+exp(-s / s0) with s0 = h0 A / (k_s F), the exponential transient of Queener, Smith and Mitchell, Wear 8 (1965) 391.
 """
 
 from __future__ import annotations
@@ -31,7 +29,7 @@ def without_running_in(wear: Wear, depth: Array) -> Array:
 
 
 def with_running_in(wear: Wear, steady: Array) -> Array:
-    """Return the depth h [m] of a pad for the depth z [m] (`steady`). The function inverts `without_running_in`."""
+    """Return the depth h [m] of a pad for the depth z [m] (`steady`), the inverse of `without_running_in`."""
     if wear.running_in_depth_m is None or wear.running_in_ratio == 1.0:
         return steady
     ratio, h0 = wear.running_in_ratio, wear.running_in_depth_m

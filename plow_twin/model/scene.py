@@ -1,7 +1,7 @@
 """The constants of one head in one guide, as frozen dataclasses in SI units.
 
-The field names are the keys of the scene file. The metadata of a field contains its unit, its meaning and its range.
-The checks in this module, the schema of the scene file and its documentation are derived from the metadata.
+The field names are the keys of the scene file. The metadata of a field contains its unit, meaning and range, from which
+the checks, the schema of the scene file and its documentation are derived.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def _choice(doc: str, choices: Collection[str], default: Any = ...) -> Any:
 
 @dataclass(frozen=True)
 class Head:
-    """The moving body. It is a plough head with a cavity around the frame, or a block inside a fixed cavity."""
+    """The moving body: a plough head with a cavity around the frame, or a block inside a fixed cavity."""
 
     mass_kg: float = _quantity("kg", "mass", gt=0.0)
     inertia_kg_m2: float = _quantity("kg m^2", "moment of inertia about the centre of mass", gt=0.0)
@@ -127,8 +127,8 @@ class Clearance:
 class Contact:
     """Normal contact. All pairs have the same law with the same parameters.
 
-    A scene gives one of `damping` and `restitution`. Under a law without damping, a scene gives none of the two. Under
-    the default law, an impact has exactly the given restitution.
+    A scene gives either `damping` or `restitution`, or neither under a law without damping. Under the default law, an
+    impact has exactly the given restitution.
 
     The restitution can decrease with the impact speed w = v (m' / m)^p:
 
@@ -146,7 +146,7 @@ class Contact:
     """
 
     law: str = _choice("contact law", LAWS, "exact_restitution")
-    # the dataclass needs a default here; NaN is not admissible, so every scene has to give the stiffness
+    # the dataclass needs a default; NaN is not admissible, so every scene has to give the stiffness
     stiffness: float = _quantity("N/m^exponent", "K in F = K d^n (...)", math.nan, gt=0.0)
     exponent: float = _quantity("1", "n in F = K d^n (...)", 1.0, ge=1.0, le=4.0)
     damping: float | None = _quantity(
@@ -188,9 +188,8 @@ class Friction:
     """Tangential friction of all pairs, by one of two laws.
 
     Without `stick_stiffness_n_m`, friction is regularised Coulomb friction: T = mu N tanh(slip rate / regularisation
-    speed). Under a small load, a corner creeps instead of sticking. With `stick_stiffness_n_m`, a spring and a damper
-    connect a corner to the wall until their force exceeds the `static_coefficient` times N. Beyond this force, the
-    corner slips with T = mu N.
+    speed), so a corner creeps instead of sticking. With `stick_stiffness_n_m`, a spring and a damper connect a corner
+    to the wall until their force exceeds `static_coefficient` times N. Then the corner slips with T = mu N.
 
     References
     ----------
@@ -301,7 +300,7 @@ Load = Harmonic | Constant | Table
 
 @dataclass(frozen=True)
 class Initial:
-    """State at t = 0. It consists of the pose of the cavity's centre relative to the frame's centre, and its rate."""
+    """State at t = 0: the pose of the cavity's centre relative to the frame's centre, and its rate."""
 
     q: tuple[float, float, float] = _quantity("m, m, rad", "x, y, theta", (0.0, 0.0, 0.0))
     v: tuple[float, float, float] = _quantity("m/s, m/s, rad/s", "rates of q", (0.0, 0.0, 0.0))
@@ -405,7 +404,7 @@ PARTS: Final[Mapping[str, type]] = {**SECTIONS, **OPTIONAL_PARTS}
 
 
 def check(scene: Scene) -> Iterator[Problem]:
-    """Yield every problem of a scene. Conflicts between fields are checked only if each field is valid by itself."""
+    """Yield every problem of a scene. Conflicts between fields are checked only if each field is valid."""
     found = list(_check_fields(scene, ""))
     yield from found
     if not found:
@@ -499,14 +498,14 @@ def must_be_given(spec: Field[Any]) -> bool:
 
 
 def describe(spec: Field[Any]) -> str:
-    """Return a description of the admissible numbers, e.g. `a finite number > 0 [kg]`."""
+    """Return the admissible numbers as text, e.g. `a finite number > 0 [kg]`."""
     signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
     bounds = [f"{sign} {spec.metadata[name]:g}" for name, sign in signs.items() if name in spec.metadata]
     return f"a finite number {' and '.join(bounds)}".rstrip() + f" [{spec.metadata['unit']}]"
 
 
-#: Largest admissible damping factor lambda [s/m] in 1 + lambda d'. A larger factor would stop a head within the depth
-#: sqrt(2 m / (K lambda)), which double precision resolves with few digits.
+#: Largest admissible damping factor lambda [s/m]. A larger factor would stop a head within a depth sqrt(2 m / (K
+#: lambda)) that double precision resolves with few digits.
 MOST_DAMPING_FACTOR: Final = 1e9
 
 
@@ -523,7 +522,7 @@ def _check_wear(wear: Wear, contact: Contact) -> Iterator[Problem]:
 
 
 def fastest_travel(wear: Wear | None, contact: Contact) -> float:
-    """Return the largest speed along the face in m/s, A / (k_s C) with the damping C. Without C or wear, return inf.
+    """Return the largest speed along the face in m/s, A / (k_s C) with the damping C, or inf without C or wear.
 
     Above this speed, a force wears the pad faster than it moves the head, so no contact can last.
     """
@@ -633,7 +632,7 @@ def _check_loads(loads: tuple[Load, ...]) -> Iterator[Problem]:
             yield from _check_table(f"loads[{index}]", load)
 
 
-#: Shortest time in s between two samples of a table. The solver cannot take shorter steps.
+#: Shortest time in s between two samples of a table, which is the shortest step of the solver.
 LEAST_SPACING_S: Final = 1e-100
 
 
