@@ -506,7 +506,7 @@ def of_table(drops: Drops) -> dict[str, Any]:
     marks = dict(square.marks)
     marks["clearance.vertical_m"] = replace(marks["clearance.vertical_m"], deviation=0.01)
     true, t = square.clearance.vertical_m, np.arange(drops.pose.shape[1]) / RATE_HZ
-    nothing = Load(t[[0, -1]], np.zeros((2, 3)))
+    nothing = Load.unmeasured(t[-1], t[0])
     known = []
     for pose in drops.pose:
         clearance = replace(square.clearance, vertical_m=true + 0.01 * rng.standard_normal())
@@ -532,7 +532,7 @@ def of_table(drops: Drops) -> dict[str, Any]:
 def of_heights(drops: Drops) -> dict[str, Any]:
     """Return the spread of the table's height between drops, from the heights at rest and at impacts."""
     square, t = load_scene("measured_square"), np.arange(drops.pose.shape[1]) / RATE_HZ
-    nothing = Load(t[[0, -1]], np.zeros((2, 3)))
+    nothing = Load.unmeasured(t[-1], t[0])
     places, rests, hits = [], [], []
     for pose in drops.pose:
         motion = MARKER.state_of_block(np.concatenate([pose, np.zeros_like(pose)], axis=1))[:, :3] - [0.0, 1.0, 0.0]

@@ -301,7 +301,8 @@ def by_range(unknowns: Unknowns, poses: Poses) -> Bounced:
 
     The penetration at each of two opposite walls is assumed to be uniformly distributed between 0 and `tuning.FITTED`.
     """
-    eye = MotionFeatures(unknowns, poses, float(poses.t[-1] - poses.t[0]))
+    span = float(poses.t[-1] - poses.t[0])
+    eye = MotionFeatures(unknowns, poses, span)
     yielding = tuning.FITTED / math.sqrt(6.0)
     middle, softness, damping, _ = tuning.HARD_DRAWN
     return Bounced(
@@ -316,7 +317,7 @@ def by_range(unknowns: Unknowns, poses: Poses) -> Bounced:
         0.0,
         0.0,
         -math.inf,
-        *hidden_by_geometry(unknowns, poses, float(poses.t[-1] - poses.t[0]), eye.features(eye.q)[:2]),
+        *hidden_by_geometry(unknowns, poses, span, eye.features(eye.q)[:2]),
     )
 
 

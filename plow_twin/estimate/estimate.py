@@ -686,7 +686,7 @@ def warm_up(scene: Scene) -> None:
     """Compile the kernels that a scene needs, or load them from the cache; a block needs no kernel."""
     if scene.head.carries == "corners":
         return
-    load = Load(np.array([0.0, 1.0]), np.zeros((2, 3)))
+    load = Load.unmeasured(1.0)
     other = with_other_law(Unknowns(scene))
     for one in (scene, *variants(scene), *(() if other is None else (other.scene,))):
         Forward(one, load).run(

@@ -72,7 +72,7 @@ _NO: Final = np.zeros(1, bool)
 _NO_DIGESTS: Final = np.zeros(0, np.int64)
 _UNMOVED: Final = np.zeros(6)
 #: A zero load and an empty set of poses, by definition.
-_NO_LOAD: Final = Load(np.array([0.0, 1.0]), np.zeros((2, 3)))
+_NO_LOAD: Final = Load.unmeasured(1.0)
 _NO_POSES: Final = Poses(np.zeros(0), np.zeros((0, 3)))
 _LENGTH: Final = struct.Struct("<q")
 #: Key of the harmonics of the load in the JSON of an estimate.
