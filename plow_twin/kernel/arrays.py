@@ -1,7 +1,7 @@
 """Functions by which kernels view, copy, search and check arrays and records.
 
-These helpers compile faster than numba's own code. For example, the compilation of numba's assignment to a slice
-includes the formatting of an error message. This formatting takes 2 s in each process that compiles a twin.
+They compile faster than numba's own code: numba's assignment to a slice alone takes 2 s in each process that compiles a
+twin, because it includes the formatting of an error message.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from numba.extending import intrinsic
 
 from plow_twin.kernel.compiler import kernel
 
-#: Metadata that mark a template as specific to the processor. A template is numba's rule for the types of an operation.
-#: Numba tries templates for the processor before all general templates, which saves a fifth of the compile time.
+#: Metadata of numba's templates (typing rules of operations) that numba tries before the general templates. The order
+#: saves a fifth of the compile time.
 _FIRST: Final = {"target": "cpu"}
 
 
@@ -35,12 +35,9 @@ class _SetArrayItem(SetItemBuffer):
 
 
 def _unowned(typingctx: Any, array: Any) -> Any:
-    """Return a view of an array without a reference count. The caller must keep the memory alive.
+    """Return a view of an array without a reference count, or None for None. The caller must keep the memory alive.
 
-    If the argument is None, the function returns None.
-
-    With a reference count, each call that receives the array would increment and decrement the count atomically. These
-    operations would take a seventh of a run's time.
+    Counting the references in each call would take a seventh of a run's time.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -60,7 +57,7 @@ unowned = cast("Callable[[Any], Any]", intrinsic(_unowned))
 def _copy_record(typingctx: Any, target: Any, source: Any) -> Any:
     """Copy a record to a record of the same type.
 
-    Numba's assignment loads the record as an array of bytes. LLVM would need 0.8 s to split this array into bytes.
+    Numba's assignment loads the record as an array of bytes, which takes LLVM 0.8 s to compile.
     """
     if not isinstance(target, types.Record) or target != source:
         return None
@@ -109,7 +106,7 @@ def all_finite(numbers: Any) -> bool:
 
 @kernel()
 def count_up_to(rising: Any, limit: float) -> int:
-    """Return how many numbers are at most `limit`. The numbers must be sorted in ascending order."""
+    """Return how many of the ascending numbers are at most `limit`."""
     low, high = 0, rising.size
     while low < high:
         middle = (low + high) // 2

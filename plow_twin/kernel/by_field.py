@@ -1,4 +1,4 @@
-"""Choice of a kernel at compile time by the fields of a record. Only the chosen kernel is compiled."""
+"""Choice of a kernel at compile time by the fields of a record."""
 
 from __future__ import annotations
 

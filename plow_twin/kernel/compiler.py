@@ -32,9 +32,8 @@ _said: list[str] = []
 def _load_numba() -> None:
     """Load numba's tables of types and of code without importing SciPy's linear algebra.
 
-    The import of SciPy's linear algebra takes 0.15 s, a third of the start time. Numba would import SciPy's linear
-    algebra only to check that BLAS is available. Compiled functions that call BLAS import SciPy's linear algebra
-    themselves.
+    Numba would import SciPy's linear algebra only to check that BLAS is available, which takes a third of the start
+    time.
     """
     found = linalg.ensure_blas
     linalg.ensure_blas = lambda: None
@@ -77,8 +76,7 @@ def kernel(
         function with inlined source can return records. Its compilation takes longer, and its sums are reordered if the
         caller is `fast`.
     entry : bool
-        Whether the function can be called from Python. The wrapper for calls from Python takes a tenth of the compile
-        time.
+        Whether the function can be called from Python, which adds a tenth to the compile time.
     """
     options: dict[str, Any] = {"fastmath": set(FASTMATH)} if fast else {}
     if inline == "source":
@@ -95,8 +93,8 @@ def kernel(
         cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
         if cache_file is not None:
             cache_file._source_stamp = SOURCE_DIGEST
-            # numba compares the version before it unpickles the index. If the index were unpickled first, a type that
-            # the sources no longer contain would raise an error.
+            # numba compares the version before it unpickles the index, which would fail on a type that the sources no
+            # longer contain
             cache_file._version = f"{numba.__version__} {SOURCE_DIGEST}"
             if inline != "source" and not entry:
                 keep_from_python(dispatcher)
@@ -107,9 +105,9 @@ def kernel(
 
 
 def for_kernels(entry: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a copy of an entry for calls from kernels. An entry is a kernel that Python calls.
+    """Return a copy of an entry (a kernel that Python calls) for calls from kernels.
 
-    If a kernel called the entry itself, numba would generate additional machine code for the entry, which is never run.
+    If a kernel called the entry itself, numba would generate machine code for the entry that is never run.
     """
     function = getattr(entry, "py_func", None)
     if function is None:
@@ -122,10 +120,7 @@ def for_kernels(entry: Callable[..., Any]) -> Callable[..., Any]:
 
 @contextmanager
 def _read_only_cache() -> Iterator[None]:
-    """Make numba accept a disk cache in the package's folder that cannot be written.
-
-    Another user may have filled this cache, for example during the installation of the package.
-    """
+    """Make numba accept a read-only disk cache in the package's folder, for example from the installation."""
     locator: Any = caching._CacheLocator
     found = locator.ensure_cache_path
     locator.ensure_cache_path = lambda its: None
@@ -136,7 +131,7 @@ def _read_only_cache() -> Iterator[None]:
 
 
 def kept(function: Callable[..., Any], **options: Any) -> Any:
-    """Return numba's dispatcher with a disk cache. If the cache cannot be written, a warning is issued once."""
+    """Return numba's dispatcher with a disk cache. Warn once if the cache cannot be written."""
     compiler = numba.njit(cache=True, nogil=True, error_model="numpy", **options)
     try:
         dispatcher = compiler(function)
@@ -152,12 +147,9 @@ def kept(function: Callable[..., Any], **options: Any) -> Any:
 def share(cache_file: Any) -> None:
     """Make numba's disk cache of a function safe for processes that compile at the same time.
 
-    Numba names the files of machine code by numbers from the index, and writes the index first. If two processes
-    compile different signatures, the code of one signature could therefore be stored under the other signature.
-
-    This function makes the name of a file a hash of its content, and the file is written before the index. If two
-    processes write at the same time, an entry of the index can be lost. The signature of a lost entry is compiled a
-    second time.
+    Numba numbers the files of machine code by the index, and writes the index first. Two processes could therefore
+    store the code of one signature under another signature. Here the name of a file is a hash of its content, and the
+    file is written before the index. Of two simultaneous entries in the index, one may be lost and compiled again.
 
     Parameters
     ----------
@@ -172,7 +164,7 @@ def share(cache_file: Any) -> None:
         with cache_file._open_for_write(cache_file._data_path(name)) as file:
             file.write(code)
         overloads = cache_file._load_index()
-        # an index that belongs to different sources is loaded as empty, and its compiled files are deleted
+        # the index of other sources is loaded as empty; delete its compiled files
         if not overloads and Path(cache_file._index_path).exists():
             for old in Path(cache_file._cache_path).glob(f"{glob.escape(stem)}*.nbc"):
                 if old.name != name:
@@ -200,10 +192,9 @@ def _save_or_warn(cache: Any) -> None:
 
 
 def for_arguments(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
-    """Return the kernel compiled for the types of the given arguments. The result does not check the types of its
-    arguments.
+    """Return the kernel compiled for the types of the given arguments, without a check of its arguments.
 
-    Numba's check of nested tuples and records takes longer than the computation of one sample by a twin.
+    Numba's check of nested tuples and records takes longer than a twin's advance by one sample.
     """
     compile_for = getattr(function, "compile", None)
     if compile_for is None:

@@ -1,9 +1,8 @@
-"""Two compilers for numba. The first compiles kernels for calls from kernels, and the second for calls from Python.
+"""Two numba compilers: `LinkedCompiler` for kernels that only kernels call, `EntryCompiler` for calls from Python.
 
-LLVM optimises a kernel together with every kernel that it calls. By default, numba would in addition optimise each
-called kernel alone and generate machine code for it, which takes a quarter of the compile time. The first compiler
-omits these steps and returns LLVM code that callers can link. Both compilers use numba's extension point (numba's
-manual, "Customizing the Compiler"). Each compiler has its own class of code library.
+LLVM optimises a kernel together with every kernel that it calls. By default, numba also optimises each called kernel
+alone and generates machine code for it, which takes a quarter of the compile time. `LinkedCompiler` omits these steps
+(numba's manual, "Customizing the Compiler").
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ _ENVIRONMENT = "_ZN08NumbaEnv"
 
 
 class LinkedLibrary(JITCodeLibrary):
-    """Code of a kernel that its callers link. Machine code is generated only for the variables that numba sets."""
+    """LLVM code of a kernel that its callers link. Only numba's global variables become machine code."""
 
     def __init__(self, codegen: Any, name: str) -> None:
         super().__init__(codegen, name)
@@ -34,7 +33,7 @@ class LinkedLibrary(JITCodeLibrary):
         self.fast = False
 
     def add_ir_module(self, ir_module: llvmlite.ir.Module) -> None:
-        """Add the functions of a module, and store the names of the functions that callers use."""
+        """Add a module, and store the names of the functions that callers use."""
         super().add_ir_module(ir_module)
         defined = (function for function in ir_module.functions if not function.is_declaration)
         self._exported += [function.name for function in defined if not function.linkage]
@@ -50,7 +49,7 @@ class LinkedLibrary(JITCodeLibrary):
             self._dynamic_globals += library._dynamic_globals
             environments |= _environments(library._final_module)
         for name in self._exported:
-            # this linkage gives each caller its own copy of the kernel, which LLVM can delete after inlining
+            # each caller gets its own copy of the kernel, which LLVM can delete after inlining
             whole.get_function(name).linkage = "linkonce_odr" if self.fast else "weak_odr"
         self._shared_module = whole
         self._final_module = _variables(self._codegen._create_empty_module(self.name), environments)
@@ -74,12 +73,12 @@ def _variables(module: llvmlite.ir.Module, names: set[str]) -> llvm.ModuleRef:
 
 
 class EntryLibrary(JITCodeLibrary):
-    """Code of a kernel that Python calls. It contains its own copy of every kernel that it calls.
+    """Code of a kernel that Python calls, with its own copy of every kernel that it calls.
 
-    If entries shared copies, all entries would use the copies of the entry that is loaded first. These copies were
-    optimised for the first entry, so the last bits of results would depend on the order of loading. The copies become
-    internal before LLVM's optimisation, so that LLVM inlines kernels with one caller. Copies of `fast` kernels become
-    internal only after the optimisation, because inlining may change the order of their sums.
+    Shared copies would be optimised for the entry that is loaded first, so the last bits of results would depend on the
+    order of loading. The copies become internal before LLVM's optimisation, so that LLVM inlines kernels with one
+    caller. Copies of `fast` kernels become internal only afterwards, because inlining may change the order of their
+    sums.
     """
 
     def _optimize_final_module(self) -> None:
@@ -112,7 +111,7 @@ class _LowerForLinking(NativeLowering):
         state.flags.no_compile = True
         super().run_pass(state)
         state.library.finalize()
-        # numba finds the function by this object when it compiles callers; the object is never called
+        # numba finds the function by this object, which is never called
         entry_point = object()
         state.targetctx.insert_user_function(entry_point, state.cr.fndesc, [state.library])
         state["cr"] = state.cr._replace(cfunc=entry_point)
@@ -179,11 +178,7 @@ def keep_from_python(dispatcher: Any) -> None:
 
 
 def for_any_value(dispatcher: Any) -> None:
-    """Make numba ignore the values of arguments, so that it compiles a kernel once for their types.
-
-    By default, numba compiles a kernel once more for each constant that a caller passes, even if the code is never
-    called.
-    """
+    """Make numba compile a kernel once for the types of its arguments, not again for each constant argument."""
     fold = dispatcher._compiler.fold_argument_types
 
     def fold_without_values(arguments: Any, named: Any) -> Any:

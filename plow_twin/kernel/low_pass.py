@@ -8,7 +8,7 @@ import numpy as np
 
 from plow_twin.kernel.compiler import kernel
 
-#: Shortest interval in s between two rows. A shorter interval is replaced by this value, because it is a divisor.
+#: Lower bound in s of the interval between two rows, which is a divisor.
 _SHORTEST: Final = 1e-6
 
 
@@ -16,10 +16,9 @@ _SHORTEST: Final = 1e-6
 def lagged(tau, edges, starts, places, rates, memory, t, q, v):
     """Return the filter's output and its rates, shape (n, 3) each. The time constant `tau` is in s.
 
-    The rows are divided into swings, which are parts of the motion with their own initial state. Swing m consists of
-    the rows edges[m]:edges[m + 1] of the times `t`, poses `q` and rates `v`. The initial state of the swing at time
-    starts[m] is the pose places[m], the rates rates[m] and the filter output memory[m]. Between rows, the pose is
-    interpolated by a cubic, for which the filter is integrated exactly.
+    A swing is a part of the motion with its own initial state. Swing m consists of the rows edges[m]:edges[m + 1] of
+    the times `t`, poses `q` and rates `v`. It begins at the time starts[m] with the pose places[m], the rates rates[m]
+    and the filter output memory[m]. The filter is integrated exactly for a cubic pose between rows.
     """
     out, rate = np.empty_like(q), np.empty_like(q)
     for swing in range(len(starts)):
@@ -30,7 +29,7 @@ def lagged(tau, edges, starts, places, rates, memory, t, q, v):
                 h = max(t[row] - before, _SHORTEST)
                 mean = (u1 - u0) / h
                 third = 6.0 * (v0 + v1 - 2.0 * mean) / (h * h)
-                # particular solution u - tau u' + tau^2 u'' - tau^3 u''' of the cubic u(t) at both ends of the interval
+                # particular solution u - tau u' + tau^2 u'' - tau^3 u''' at both ends of the interval
                 first = u0 - tau * (v0 - tau * ((6.0 * mean - 4.0 * v0 - 2.0 * v1) / h - tau * third))
                 last = u1 - tau * (v1 - tau * ((2.0 * v0 + 4.0 * v1 - 6.0 * mean) / h - tau * third))
                 y = last + (y - first) * np.exp(-h / tau)

@@ -1,8 +1,8 @@
-"""First root and maximum of a polynomial on an interval. The method (Bernstein form) misses no root.
+"""First root and maximum of a polynomial on an interval, by the Bernstein form, which misses no root.
 
-The values of a polynomial lie between its smallest and its largest Bernstein coefficient. The number of sign changes of
-the coefficients is an upper bound of the number of roots. The bounds of the values and of the number of roots become
-sharper when the interval is halved (Farouki, Comput. Aided Geom. Des. 29 (2012) 379).
+The smallest and the largest Bernstein coefficient bound the values of a polynomial, and the number of sign changes of
+the coefficients bounds the number of roots. Both bounds become sharper when the interval is halved (Farouki, Comput.
+Aided Geom. Des. 29 (2012) 379).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def to_bernstein(g: Array, n: int, h: float, inverse_binomial: Array, b: Array) 
 @kernel()
 def sum_to_bernstein(b: Array, n: int) -> None:
     """Convert g_k h^k / C(n, k) in each of b's eight columns to the Bernstein coefficients of g on [0, h], in place."""
-    # the loop combines two sweeps, which halves the number of stores
+    # two sweeps at a time, with half the stores
     for r in range(1, n + 1, 2):
         before = exact_row(b, r)
         once = before + exact_row(b, r - 1)
@@ -50,7 +50,7 @@ def sum_to_bernstein(b: Array, n: int) -> None:
 
 @kernel(inline="code")
 def _halve(left: Array, right: Array, n: int) -> None:
-    """Halve an interval with the coefficients `left`. Write its left half to `left`, and its right half to `right`."""
+    """Halve the interval of the coefficients `left`: its halves are written to `left` and `right`."""
     for r in range(n + 1):
         right[n - r] = left[n]
         for j in range(n, r, -1):
@@ -77,7 +77,7 @@ def _crossing(g: Array, n: int, low: float, high: float, start: float) -> float:
         if not (low <= new <= high):
             new = 0.5 * (low + high)
         elif abs(change) <= 1e-6 * new and abs(bend * change) <= 1e-3 * abs(slope):
-            # Halley's method converges cubically, so the next change would be of the order of the cube of this change
+            # Halley's method converges cubically, so the next change is negligible
             return new
         if abs(new - x) <= 2e-16 * high or high - low <= 2e-16 * high:
             return new
@@ -96,8 +96,8 @@ def first_root(g: Array, n: int, h: float, w) -> float:
 def first_root_within(g: Array, n: int, h: float, w) -> float:
     """Return the root of `first_root`, given the Bernstein coefficients in `w.halves[0]`.
 
-    An interval without a negative Bernstein coefficient has no root. An interval with exactly one sign change has
-    exactly one root. An interval with several sign changes is halved, and its left half is searched first.
+    An interval without a negative Bernstein coefficient has no root. An interval with one sign change has one root. An
+    interval with several sign changes is halved.
     """
     b, bounds = w.halves, w.bounds
     bounds[0, 0], bounds[0, 1] = 0.0, h
@@ -125,7 +125,7 @@ def first_root_within(g: Array, n: int, h: float, w) -> float:
             top -= 1
         else:
             middle = 0.5 * (low + high)
-            # push the left half on top of the right half, so that the left half is searched first
+            # the left half is on top, so that it is searched first
             for k in range(n + 1):
                 b[top + 1, k] = b[top, k]
             _halve(b[top + 1], b[top], n)
@@ -148,7 +148,7 @@ def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
     """Return the larger of `floor` >= 0 and the maximum of g on [0, h], with a relative error of 1e-12.
 
     If the Bernstein coefficients of g' change sign at most once, an interior maximum is the only root of g'. Otherwise
-    intervals are halved until the Bernstein coefficients of g bound the maximum tightly (`_narrowed`).
+    `_narrowed` halves intervals.
     """
     best, slope, b = max(floor, g[0], _value(g, n, h)), w.column[1], w.halves
     steepest, power = 0.0, 1.0
@@ -156,7 +156,7 @@ def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
         power *= h
         steepest += k * abs(g[k]) * power
     if abs(g[1]) >= steepest:
-        # g is monotonic on [0, h], so its maximum is at an end of the interval
+        # g is monotonic on [0, h]
         return best
     for k in range(n):
         slope[k] = (k + 1) * g[k + 1]
@@ -175,10 +175,7 @@ def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
 
 @kernel()
 def _narrowed(g: Array, n: int, h: float, best: float, w) -> float:
-    """Return the larger of `best` and the maximum of g on [0, h].
-
-    Intervals whose largest Bernstein coefficient exceeds `best` are halved.
-    """
+    """Return the larger of `best` and the maximum of g on [0, h], by halving intervals that may exceed `best`."""
     b = w.halves
     to_bernstein(g, n, h, w.binomial[n], b[0])
     top = 0

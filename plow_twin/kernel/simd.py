@@ -1,8 +1,7 @@
 """A type for kernels that represents eight numbers as one SIMD vector. A lane is one of the eight positions.
 
-The compiler does not always vectorise a loop over eight columns. With this type, `row`, `set_row`, `splat` and `total`
-are single operations, and + - * / act on all eight numbers. If the processor's vectors are shorter, the compiler splits
-each operation.
+The operators + - * / act on all eight numbers. The compiler splits the operations if the processor's vectors are
+shorter.
 """
 
 from __future__ import annotations
@@ -19,12 +18,12 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 _WIDTH = 8
 _VECTOR = ir.VectorType(ir.DoubleType(), _WIDTH)
 _BITS = ir.VectorType(ir.IntType(64), _WIDTH)
-#: Flags that allow LLVM to fuse and reorder sums, the same as for `kernel(fast=True)`.
+#: Flags that allow LLVM to fuse and reorder sums, as for `kernel(fast=True)`.
 _FLAGS = ("contract", "reassoc", "nsz", "arcp")
 
 
 def _operation(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return an operation for kernels from a function that emits its code. Calls omit the parameter `typingctx`."""
+    """Return an operation for kernels from a function that emits its code."""
     operation: Callable[..., Any] = intrinsic(function)
     return operation
 
@@ -40,7 +39,7 @@ class Lanes(types.Type):
 
 
 class ExactLanes(Lanes):
-    """Eight float64 numbers whose operations are rounded as written. The bits do not depend on the surrounding code."""
+    """Eight float64 numbers whose operations are rounded as written, independent of the surrounding code."""
 
     flags = ()
 
@@ -79,16 +78,13 @@ def row(typingctx: Any, array: Any, index: Any) -> Any:
 
 @_operation
 def exact_row(typingctx: Any, array: Any, index: Any) -> Any:
-    """Return the same numbers as `row`, with the type `ExactLanes`."""
+    """Return `row` with the type `ExactLanes`."""
     return exact_lanes(array, index), _load
 
 
 @_operation
 def gathered(typingctx: Any, array: Any, index: Any, places: Any) -> Any:
-    """Return eight elements of a contiguous array of shape (n, 8).
-
-    The tuple `places` contains the offsets of the eight elements from the start of row `index`, counted in elements.
-    """
+    """Return eight elements of a contiguous array of shape (n, 8), by their offsets `places` from row `index`."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         row_index = context.cast(builder, arguments[1], signature.args[1], types.intp)
@@ -134,7 +130,7 @@ def splat(typingctx: Any, value: Any) -> Any:
 
 @_operation
 def exact_splat(typingctx: Any, value: Any) -> Any:
-    """Return the same vector as `splat`, with the type `ExactLanes`."""
+    """Return `splat` with the type `ExactLanes`."""
     return exact_lanes(value), _splat
 
 
@@ -153,7 +149,7 @@ def pack(typingctx: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any,
 
 
 def permutation(*places: int) -> Callable[..., Any]:
-    """Return an operation that permutes lanes. Lane i of its result is lane places[i] of its argument."""
+    """Return an operation whose result contains lane places[i] of its argument in lane i."""
 
     @_operation
     def permuted(typingctx: Any, value: Any) -> Any:
@@ -191,9 +187,9 @@ def total(typingctx: Any, value: Any) -> Any:
 
 @_operation
 def three_totals(typingctx: Any, first: Any, second: Any, third: Any) -> Any:
-    """Return a vector that contains the sums of three vectors in lanes 2, 3 and 4, and 0 in the other lanes.
+    """Return a vector of three vectors' sums in lanes 2, 3 and 4, and 0 in the other lanes.
 
-    The three sums share vector additions, so this operation is faster than three calls of `total`.
+    It is faster than three calls of `total`.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -221,7 +217,7 @@ def three_totals(typingctx: Any, first: Any, second: Any, third: Any) -> Any:
 
 @_operation
 def below(typingctx: Any, left: Any, right: Any) -> Any:
-    """Return an integer whose bit i is set if left < right in lane i. A NaN in lane i leaves bit i unset."""
+    """Return an integer whose bit i is set if left < right in lane i. A NaN leaves bit i unset."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         found = builder.fcmp_ordered("<", *arguments)
@@ -257,7 +253,7 @@ def transpose(typingctx: Any, target: Any, source: Any) -> Any:
         rows = [builder.load(place(1, i), align=8) for i in range(_WIDTH)]
         distance = 1
         while distance < _WIDTH:
-            # in each block of size 2 * distance, exchange the two off-diagonal blocks of size distance
+            # exchange the two off-diagonal blocks of size `distance` in each block of twice the size
             low = [i if i & distance == 0 else _WIDTH + i - distance for i in range(_WIDTH)]
             high = [i + distance if i & distance == 0 else _WIDTH + i for i in range(_WIDTH)]
             for i in range(_WIDTH):
@@ -303,7 +299,7 @@ def _called(builder: Any, name: str, arguments: Any) -> Any:
 
 @_operation
 def fused(typingctx: Any, factor: Any, other: Any, term: Any) -> Any:
-    """Return factor * other + term for each lane. The result is rounded once if the processor has fused operations."""
+    """Return factor * other + term, rounded once if the processor has fused operations."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return _called(builder, "fmuladd", arguments)
@@ -348,7 +344,7 @@ def exponent_of(typingctx: Any, value: Any) -> Any:
 
 @_operation
 def significand_of(typingctx: Any, value: Any) -> Any:
-    """Return the significand in [1, 2) of the positive number in each lane: the number divided by 2^`exponent_of`."""
+    """Return the significand in [1, 2) of the positive number in each lane."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         bits = builder.and_(builder.bitcast(arguments[0], _BITS), _each(2**52 - 1))
@@ -359,7 +355,7 @@ def significand_of(typingctx: Any, value: Any) -> Any:
 
 @_operation
 def power_of_two(typingctx: Any, exponent: Any) -> Any:
-    """Return 2 to the power of the integer in each lane. The integers are float64, from -1022 to 1023."""
+    """Return 2 to the power of the integer in each lane, a float64 from -1022 to 1023."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         number = builder.add(builder.fptosi(arguments[0], _BITS), _each(1023))
@@ -371,7 +367,7 @@ def power_of_two(typingctx: Any, exponent: Any) -> Any:
 def _elementwise(operation: Callable[..., Any], emit: str) -> None:
     @infer_global(operation)
     class _Typing(AbstractTemplate):
-        # numba tries templates of the processor first; its list of general templates of an operator has twenty entries
+        # numba tries templates of the processor before its twenty general templates of an operator
         metadata = {"target": "cpu"}  # noqa: RUF012
 
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
