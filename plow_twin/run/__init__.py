@@ -1,1 +1,1 @@
-"""Functions and classes for users of the library. They compute whole motions and advance live twins."""
+"""Simulation of whole motions, and live twins that are advanced in time."""

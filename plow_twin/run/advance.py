@@ -1,4 +1,4 @@
-"""Results of advances for one time, for many times or for many twins. A result is a view of the rows of a kernel."""
+"""Results of advances for one time, for many times or for many twins, as views of the kernel's rows."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Number = TypeVar("Number", bound=np.generic)
 
 
 class _Column(Generic[Number]):
-    """A field of the rows, as an array that shares the rows' memory."""
+    """A field of the rows as an array, without a copy."""
 
     def __init__(self, name: str = "") -> None:
         self._name = name
@@ -32,7 +32,7 @@ class _Column(Generic[Number]):
 
 
 class _View:
-    """Columns of one row or of many rows. Even the column of a single row is an array."""
+    """Columns of one row or of many rows."""
 
     __slots__ = ("rows",)
 
@@ -112,7 +112,7 @@ class Advance(_View):
 
 
 class _Rows(_View):
-    """Columns of many rows. The status is an array of integers."""
+    """Columns of many rows, where the status is an array of integers."""
 
     __slots__ = ()
 
@@ -138,7 +138,7 @@ class AdvanceSeries(_Rows):
     t = _Column[np.float64]()
 
     def __getitem__(self, index: int) -> Advance:
-        # without a copy, the advance would keep the memory of all rows alive
+        # a view would keep the memory of all rows
         return Advance(self.rows[index].copy())
 
 

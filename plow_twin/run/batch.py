@@ -1,4 +1,4 @@
-"""Many live twins that are advanced together under sampled loads. Scenes with equal terms share one compiled call."""
+"""Many live twins that are advanced together under sampled loads."""
 
 from __future__ import annotations
 
@@ -45,15 +45,14 @@ _Array = NDArray[np.float64]
 _NO_MARKS = np.zeros(0, np.int64)
 #: Size of a cache line in bytes.
 _LINE = 64
-#: Largest number of values for which a check of each value in Python is faster than one call of numpy.
+#: Largest number of values that Python checks faster than numpy.
 _FEW = 32
-#: Terms without effect if their parameters are zero. A scene without such a term can run with compiled code that
-#: includes the term.
+#: Terms without effect if their parameters are zero. Compiled code with such a term can run a scene without it.
 _OPTIONAL = ("hysteretic", "wear", "sliding", "running_in", "offset", "free", "slip")
 
 
 def _signature(parts: Parts, scene: Scene) -> tuple[bool, ...]:
-    """Return which terms and options the compiled code of a scene contains."""
+    """Return which terms and options a scene has."""
     return (*(part is not None for part in (*parts.terms, parts.implicit)), *options(scene))
 
 
@@ -88,9 +87,8 @@ class TwinBatch:
     have the state before the call.
 
     Each SIMD vector advances eight twins if no scene has a ramp, wear, friction, a support, locks, an offset centre of
-    mass or overdamped contact. The bits of such a twin's results do not depend on the other twins of the batch. The
-    results agree with those of a `Twin` within the tolerance. In batches with any of these terms, a twin gives results
-    that are bit-identical to a `Twin` with the same terms.
+    mass or overdamped contact. The results agree with those of a `Twin` within the tolerance, and do not depend on the
+    other twins of the batch. In all other batches, the results are bit-identical to a `Twin` with the same terms.
     """
 
     def __init__(
@@ -115,7 +113,7 @@ class TwinBatch:
             self._params[index] = compiled.params
         self._stick = terms.stick
         self._states = new_records(state_type(self._compiled[0].parts.terms), len(scenes))
-        #: states before the last call; the next call writes its states to this memory
+        #: states before the last call, and memory for the states of the next call
         self._before = new_records(self._states.dtype, len(scenes))
         #: last samples of the load: shape (m, 3), or (1, 3) if all twins have the same sample
         self._wrench = np.zeros((1, 3))
@@ -367,7 +365,7 @@ class TwinBatch:
         return hashlib.blake2b(self.snapshot(), digest_size=8).hexdigest()
 
     def _run(self, times: NDArray[np.float64], samples: NDArray[np.float64]) -> NDArray[np.void]:
-        """Advance all twins under samples of shape (m or 1, n, 3), and return their rows, shape (m, n)."""
+        """Advance all twins under samples, shape (m or 1, n, 3), and return their rows, shape (m, n)."""
         in_lanes = self._workers[0].lanes is not None
         shape = len(self), len(times)
         rows = _rows_to_fill(*shape) if in_lanes else np.zeros(shape, ROW)
@@ -393,7 +391,7 @@ class TwinBatch:
             return rows
         before, after, begun = self._states, self._before, list[Future[None]]()
         if any(one.lanes is None or one.lanes.stale for one in self._workers):
-            # records are copied as bytes, because numpy would copy a record field by field
+            # as bytes, because numpy would copy a record field by field
             after.view(np.uint8)[:] = before.view(np.uint8)
         try:
             self._states, self._before = after, before
@@ -414,7 +412,7 @@ class TwinBatch:
         return rows
 
     def _reload(self) -> None:
-        """Make the lanes reload the states from their records at the next advance, because the records have changed."""
+        """Make the lanes reload the changed states from their records at the next advance."""
         for worker in self._workers:
             if worker.lanes is not None:
                 worker.lanes.reload()
@@ -430,7 +428,7 @@ class TwinBatch:
         return joined
 
     def _stop(self, begun: Sequence[Future[None]]) -> None:
-        """Stop the other threads, each at the end of its slice of work."""
+        """Stop the other threads at the end of their slices of work."""
         for worker in self._workers:
             worker.pace.stopped = True
         wait(begun)
@@ -449,7 +447,7 @@ def _all_finite(numbers: NDArray[np.float64]) -> bool:
 
 
 def _rows_to_fill(twins: int, times: int) -> NDArray[np.void]:
-    """Return uninitialised rows of `ADVANCE`, aligned with cache lines. Lanes write every field of these rows."""
+    """Return uninitialised rows of `ADVANCE`, aligned with cache lines."""
     memory = np.empty(twins * times * ADVANCE.itemsize + _LINE, np.uint8)
     return np.ndarray((twins, times), ADVANCE, memory.data, -memory.ctypes.data % _LINE)
 
@@ -472,7 +470,6 @@ class _Worker(NamedTuple):
         return _Worker(parts, work, new_records(TOTALS, 1), Pace(state_type(terms), stiff, max_wall_s), None)
 
     def with_lanes(self, batch: TwinBatch, terms: Terms, members: range) -> _Worker:
-        """Return a copy of this worker with lanes for the twins `members`."""
         found = LaneTwins(batch._params, terms, members, self.work, batch._max_steps)
         return self._replace(lanes=found)
 

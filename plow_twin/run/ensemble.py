@@ -1,4 +1,4 @@
-"""Runs of many scenes on all cores. The scenes can have different clearances, stiffnesses, loads and initial states.
+"""Runs of many scenes on all cores.
 
 Scenes whose only terms are their contact law and harmonic loads share SIMD vectors (`solve.lanes`). All other scenes
 run one by one.
@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Ensemble:
-    """Motions of m scenes, which are called members.
+    """Motions of m scenes (members).
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ def simulate_many(
     Returns
     -------
     Ensemble
-        Rows, statistics and status of each member. A member that fails does not stop the call.
+        Rows, statistics and status of each member.
 
     Raises
     ------
@@ -130,7 +130,7 @@ def simulate_many(
     first, others = run.tasks(threads)
     with ThreadPoolExecutor(threads) as pool:
         try:
-            # the first member without lanes runs before the others, because it compiles the kernels
+            # run the first member without lanes alone, because it compiles the kernels
             for task in first:
                 task()
             for done in [pool.submit(task) for task in others]:
@@ -145,15 +145,14 @@ def simulate_many(
     return ensemble
 
 
-#: Smallest number of members that a thread takes at a time. Lanes are empty while the last members of a share end. With
-#: fewer members, these empty lanes would take too large a part of the time.
+#: Smallest number of members that a thread takes at a time. Some lanes are empty while the last members end.
 _LEAST_SHARE = 64
-#: Number of shares per thread. With several small shares, all threads end at about the same time.
+#: Number of shares per thread. With several shares, all threads end at about the same time.
 _SHARES = 4
 
 
 class _Run:
-    """Data that the threads of an ensemble's run share."""
+    """Data that the threads of an ensemble share."""
 
     def __init__(
         self,
@@ -171,7 +170,7 @@ class _Run:
         self.stopped, self.done = threading.Event(), 0
 
     def tasks(self, threads: int) -> tuple[list[Callable[[], None]], list[Callable[[], None]]]:
-        """Return two lists of tasks: tasks to run first, one after another, and tasks that the threads share."""
+        """Return the tasks to run first, one after another, and the tasks that the threads share."""
         groups: dict[object, list[int]] = {}
         alone: list[Callable[[], None]] = []
         for index, one in enumerate(self._compiled):
@@ -215,7 +214,7 @@ class _Run:
                 self._on_progress(self.done)
 
     def _run_lanes(self, run: LaneRun, share: NDArray[np.int64]) -> None:
-        """Run some members in lanes. The scenes of these members must fit the lanes (`fits_lanes`)."""
+        """Run some members, whose scenes must fit (`fits_lanes`), in lanes."""
         waiting = share
         while len(waiting):
             self._look()

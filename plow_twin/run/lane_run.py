@@ -1,4 +1,4 @@
-"""Runs of scenes in the lanes of SIMD vectors, in slices of work. Steps of other methods use the loop for one scene."""
+"""Runs of scenes in the lanes of SIMD vectors, in slices of work."""
 
 from __future__ import annotations
 
@@ -18,13 +18,12 @@ from plow_twin.solve.state import EVENT, HARMONIC, STATE, TOTALS, Status, Work, 
 
 #: Number of steps of each lane in the first slice.
 _FIRST_SLICE: Final = 256
-#: Largest number of steps in the loop for one scene, when a lane needs a step of another method. A call of this loop
-#: costs as much as some thirty steps.
+#: Number of steps in the loop for one scene when a lane needs another method. A call costs some thirty steps.
 _OTHER_STEPS: Final = 32
 
 
 class LaneRun:
-    """Run of those members of an ensemble that use lanes.
+    """Run of the members of an ensemble that use lanes.
 
     Parameters
     ----------
@@ -68,7 +67,7 @@ class LaneRun:
         )  # fmt: skip
 
     def go_on(self, waiting: NDArray[np.int64], work: Work, lanes: np.record) -> NDArray[np.bool_]:
-        """Advance members by a slice of work in empty lanes. Return whether each member has finished."""
+        """Advance members by a slice of work, and return whether each member has finished."""
         one, begin = self._compiled[waiting[0]], _time.perf_counter()
         terms = one.parts.terms
         run_lanes(

@@ -1,4 +1,4 @@
-"""Live twins in SIMD lanes, advanced in slices of work. Advances that lanes do not support are made one by one."""
+"""Live twins in SIMD lanes, advanced in slices of work."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from plow_twin.solve.lanes.advance import OTHERS, Load, Samples, advance_lanes
 from plow_twin.solve.lanes.record import BLOCK, WIDTH, new_lanes, powers
 from plow_twin.solve.state import TOTALS, Terms, new_records
 
-#: Total number of steps of all lanes in a slice of work. A slice takes about a millisecond.
+#: Total number of steps of all lanes in a slice of work, which takes about a millisecond.
 _SLICE: Final = 256
 
 _Array = NDArray[np.float64]
@@ -51,12 +51,12 @@ class LaneTwins:
         self.clear()
 
     def clear(self) -> None:
-        """Empty the lanes after a call that was stopped before its end."""
+        """Empty the lanes after a stopped call."""
         self._lanes, self._totals = new_lanes(), np.zeros(WIDTH, TOTALS)
         self.reload()
 
     def reload(self) -> None:
-        """Mark all twins to be loaded from their records at the next advance, because the records have changed."""
+        """Load all twins from their changed records at the next advance."""
         self._noted[:] = -1
         self.stale = True
 
@@ -69,10 +69,10 @@ class LaneTwins:
         pace: Pace,
         alone: Callable[[int, int], None],
     ) -> None:
-        """Advance all twins to all times. `alone` advances one twin to one of these times without lanes.
+        """Advance all twins to all times, and write the new states to `states`.
 
-        The arguments `load` and `rows` are those of `Samples`. `states` receives the new states of all twins. If
-        `stale` is set, it must contain the current states before the call.
+        `load` and `rows` are those of `Samples`. `alone` advances one twin to one time without lanes. If `stale` is
+        set, `states` must contain the current states.
         """
         self._place[:], self.stale = 0, False
         terms = self._terms

@@ -1,4 +1,4 @@
-"""Runs of the compiled loop in slices. Limits, progress and Ctrl-C are handled between slices."""
+"""Runs of the compiled loop in slices, between which limits, progress and Ctrl-C are handled."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 _FIRST_LOG: Final = 4096
 #: Default number of steps after which a run ends with an error.
 BUDGET: Final = 10**8
-#: `_SLICE_S`: target computing time in s of a slice. `_FIRST_SLICE`, `_FIRST_SLICE_IMPLICIT`: number of steps in the
-#: first slice of a scene without and with implicit steps.
+#: `_SLICE_S`: intended computing time of a slice in s. `_FIRST_SLICE`, `_FIRST_SLICE_IMPLICIT`: steps of the first
+#: slice without and with implicit steps.
 _SLICE_S: Final = 0.02
 _FIRST_SLICE, _FIRST_SLICE_IMPLICIT = 2048, 64
 
@@ -43,7 +43,7 @@ class Motion:
     sums: BalanceSums | None = None
     #: number of rows written
     first: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
-    #: time in s reached by fixed steps, which do not update the state's `time`
+    #: time reached in s by fixed steps, which do not update the state's `time`
     fixed_time: float | None = None
 
     @property
@@ -60,7 +60,7 @@ class Motion:
     def start(compiled: CompiledScene, q: Array, v: Array, outputs: bool = False) -> Motion:
         """Return a motion at the initial state with the output rows q and v, shape (n, 3) each.
 
-        `outputs` adds arrays for the pairs and for a frame on springs.
+        `outputs` adds rows for the pairs and for a frame on springs.
         """
         eight = (len(q), PAIR_COUNT)
         penetration, force = (np.zeros(eight), np.zeros(eight)) if outputs else (None, None)
@@ -78,9 +78,9 @@ def run_events(
     budget: int,
     look: Callable[[Motion], None] | None = None,
 ) -> tuple[int, int]:
-    """Advance a motion to `t_end` by Taylor series with event detection. Return its `Status` and the number of rows.
+    """Advance a motion to `t_end` by Taylor series with event detection, and return its `Status` and number of rows.
 
-    The function `look` is called between slices of the run. The division into slices does not change the results.
+    `look` is called between slices, which do not change the results.
     """
     size = _FIRST_SLICE if compiled.parts.implicit is None else _FIRST_SLICE_IMPLICIT
     while True:
@@ -100,7 +100,7 @@ def run_events(
 
 
 def next_slice(size: int, took_s: float) -> int:
-    """Return the number of steps of the next slice. The last slice had `size` steps and took the time `took_s`."""
+    """Return the number of steps of the next slice, after a slice of `size` steps that took `took_s`."""
     return min(BUDGET, max(1, int(size * min(4.0, max(0.1, _SLICE_S / max(took_s, 1e-6))))))
 
 
@@ -119,7 +119,7 @@ def run_fixed(
     done, size = np.zeros(1, np.int64), _FIRST_SLICE
     while True:
         begin = _time.perf_counter()
-        # each slice ends with an output row, even between output times; the next slice overwrites this row
+        # a slice may end with an output row between output times, which the next slice overwrites
         allowed = min(steps, budget, steps if look is None else int(done[0]) + size)
         code = int(fixed_step.integrate_fixed(
             compiled.params, compiled.parts, motion.state, motion.totals, motion.log, z, done, allowed, dt, euler,

@@ -1,4 +1,4 @@
-"""Calls of kernels in slices of work. Limits and Ctrl-C are handled between slices."""
+"""Calls of kernels in slices of work, between which limits and Ctrl-C are handled."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from plow_twin.solve.state import PACE, first_of, new_records
 
 #: Default wall-clock time in s after which a call ends with an error.
 MOST_SECONDS: Final = 3600.0
-#: Number of steps in a slice of a scene without and with implicit steps. An explicit step takes microseconds, an
-#: implicit step up to a millisecond.
+#: Number of steps in a slice without and with implicit steps, which take microseconds and up to a millisecond.
 _SLICE, _SLICE_IMPLICIT = 2048, 64
 
 
@@ -23,7 +22,7 @@ class OutOfTimeError(Exception):
 
 
 class Pace:
-    """Runs kernels in slices within the time limit of a call. One object is used for successive calls.
+    """Runs kernels in slices within the time limit of a call.
 
     Parameters
     ----------
@@ -38,12 +37,12 @@ class Pace:
     def __init__(self, state_type: np.dtype[np.void], implicit: bool, max_wall_s: float) -> None:
         self._records = new_records(PACE, 1)
         self.record = first_of(self._records)
-        #: the record as an argument of kernels; for `record`, numba would look up an attribute in slow Python code
+        #: the record as an argument of kernels, which numba reads faster than `record`
         self.argument = self._records[0]
         #: number of failed advances in the last call, shape (1,), as a view of the record
         self.failed = self._records["failed"]
         self.record.slice = _SLICE_IMPLICIT if implicit else _SLICE
-        # numpy copies a record field by field, which takes five times as long as a copy of its bytes
+        # a copy of bytes, because numpy copies a record field by field, five times as slowly
         self._bytes = self._records.view(np.uint8).data
         self._start = self._bytes.tobytes()
         self.saved = new_records(state_type, 1)
@@ -67,7 +66,7 @@ class Pace:
 
 def check_limits(max_steps: int, max_wall_s: float) -> None:
     """Raise `ArgumentError` if a limit is not valid."""
-    # a float is rejected, because numba would compile the kernels again for this type
+    # numba would compile the kernels again for a float
     if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or not max_steps >= 1:
         raise ArgumentError(f"max_steps: got {max_steps!r}, expected an integer >= 1")
     if not max_wall_s > 0.0:

@@ -1,9 +1,9 @@
 """Growth of errors along a motion, and the time up to which the tolerance is met.
 
-The columns of the fundamental matrix are solutions of the linearised equations (`solve.tangents`). If `solve.tangents`
-does not support a term of the scene, the columns are finite differences between the motion and its shadows. A shadow is
-a second motion that starts with a small displacement from the motion and lasts for a short stretch of time. Each shadow
-has its own events, so the columns include the jumps at touches and separations (saltation).
+The columns of the fundamental matrix are solutions of the linearised equations (`solve.tangents`). For terms that
+`solve.tangents` does not support, they are finite differences between the motion and its shadows. A shadow is a second
+motion that starts with a small displacement and lasts for a short stretch of time. It has its own events, so the
+columns include the jumps at touches and separations (saltation).
 """
 
 from __future__ import annotations
@@ -38,18 +38,16 @@ _STRETCHES: Final = 200
 #: Change of a parameter relative to its value, unless the parameter is a length.
 _RELATIVE_CHANGE: Final = 1e-6
 #: `_CLEAR_OF_WALLS`: smallest distance from each wall at the beginning of a stretch, divided by the displacement of the
-#: shadows. The displacement is reduced if necessary. If it would become too small, the previous stretch continues, at
-#: most `_MOST_MERGED` times in succession.
+#: shadows. If the displacement would become too small, the previous stretch continues, at most `_MOST_MERGED` times.
 _CLEAR_OF_WALLS: Final = 100.0
 _MOST_MERGED: Final = 20
 #: Largest number of solver steps of a shadow in one stretch.
 _SHADOW_BUDGET: Final = 10**7
-#: `_EQUATIONS_TOLERANCE`: tolerance of the motion along which the equations are linearised. With this tolerance, the
-#: error of the derivatives is some 1e-6 times the growth of errors. If this error exceeds `_LARGEST_ERROR`, the
-#: tolerance of the run is used.
+#: `_EQUATIONS_TOLERANCE`: tolerance of the motion along which the equations are linearised. If the resulting error of
+#: the derivatives, some 1e-6 times the growth of errors, exceeds `_LARGEST_ERROR`, the tolerance of the run is used.
 _EQUATIONS_TOLERANCE, _LARGEST_ERROR = 1e-6, 1e-2
-#: `_FIRST_SLICE`: number of steps before the first check of the time limit. `_MOST_WITHOUT_IMPLICIT`: largest number of
-#: explicit steps in a scene that may need implicit steps.
+#: `_FIRST_SLICE`: steps before the first check of the time limit. `_MOST_WITHOUT_IMPLICIT`: largest number of explicit
+#: steps in a scene that may need implicit steps.
 _FIRST_SLICE, _MOST_WITHOUT_IMPLICIT = 2048, 200_000
 #: Largest growth for which the error of a motion stays within ten tolerances (`docs/solver.md`).
 TRUSTED_GROWTH: Final = 1e4
@@ -268,7 +266,7 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
         stretches = _by_shadows(scene, t_end, tol, parameters)
     totals, rows, growth, logs = follow(stretches)
     if tol < _EQUATIONS_TOLERANCE and _EQUATIONS_TOLERANCE * growth.max() > _LARGEST_ERROR:
-        # at the coarse tolerance the derivatives are too inaccurate, so they are computed again at the run's tolerance
+        # compute the derivatives again, at the tolerance of the run
         stretches = _by_equations(scene, t_end, tol, parameters) or stretches
         totals, rows, growth, logs = follow(stretches)
     times, ends = _ends(t_end), stretches.ends
@@ -358,7 +356,7 @@ def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str
 
 
 def _ends(t_end: float) -> Array:
-    """Return the times [s] at which stretches may end. Uneven spacing prevents alignment with a period of the load."""
+    """Return the times [s] at which stretches may end, with uneven spacing against alignment with the load's period."""
     ends = np.arange(1, _STRETCHES + 1, dtype=np.float64)
     ends[:-1] += 0.4 * (np.mod(ends[:-1] * 0.5 * (math.sqrt(5.0) - 1.0), 1.0) - 0.5)
     ends *= t_end / _STRETCHES
@@ -367,7 +365,7 @@ def _ends(t_end: float) -> Array:
 
 
 def scale_of(compiled: CompiledScene) -> Array:
-    """Return the scales of coordinates and rates, shape (6,), relative to which the clearance is 1."""
+    """Return the scales of coordinates and rates, shape (6,), in which the clearance is 1."""
     params, length = compiled.params, geometry.length_scale(compiled.scene)
     place = np.array([1.0, 1.0, 1.0 / float(params.radius)]) * length
     scale: Array = np.concatenate([place, place * float(params.velocity_tolerance / params.position_tolerance)])
@@ -379,9 +377,7 @@ def displacement_beside(
 ) -> float | None:
     """Return the largest displacement of shadows, relative to the clearance, for the start of a stretch.
 
-    A stretch does not begin during an elastic contact. The contact would turn a displacement into a velocity larger
-    than any error of the solver. If overdamped contact holds the head, a displacement decays slowly, so a small
-    displacement is sufficient.
+    A stretch does not begin during an elastic contact, which would turn a displacement into a large velocity.
 
     Parameters
     ----------
@@ -390,17 +386,15 @@ def displacement_beside(
     length : float
         Reference length of displacements in m.
     held : bool
-        Whether overdamped contact holds the head.
+        Whether overdamped contact holds the head, so that a small displacement suffices because it decays slowly.
     reads_speed : bool
-        Whether the damping of a contact depends on the speed at first touch. A displacement during the contact does not
-        change this speed.
+        Whether the damping of a contact depends on the speed at first touch.
 
     Returns
     -------
     float or None
-        Displacement, or None if no stretch can begin. There are two conditions. Each pair must be at least
-        `_CLEAR_OF_WALLS` times the smallest admissible displacement away from its wall. If `reads_speed` is True, no
-        pair may be in contact.
+        Displacement, or None if no stretch can begin: a pair is too close to its wall (`_CLEAR_OF_WALLS`), or in
+        contact with `reads_speed`.
     """
     if reads_speed and bool((penetration > 0.0).any()):
         return None
@@ -424,9 +418,8 @@ def _beside(
 ) -> list[State]:
     """Return a state, a shadow for each free coordinate, a shadow for each rate, and a shadow for each changed scene.
 
-    `moved` contains the displacements of the shadows for coordinates and rates. Shadows of changed scenes are not
-    displaced. The damping factors of these shadows were set at their own touches, and are taken from the states
-    `before`.
+    `moved` contains the displacements of the shadows for coordinates and rates. Shadows of changed scenes have the
+    damping factors of their own touches, from the states `before`.
     """
     start = _pose_and_rate(_follow(compiled, state, float(state.time), work))
     states = [state]

@@ -1,4 +1,4 @@
-"""Simulation of a scene from its initial state. The result contains the motion as arrays."""
+"""Simulation of a scene from its initial state."""
 
 from __future__ import annotations
 
@@ -172,8 +172,7 @@ def simulate(
         `max_steps` or `max_wall_s` was reached. The attribute `result` of the error contains the motion up to the
         limit.
     RunInterrupted
-        The user pressed Ctrl-C. The attribute `result` of the error contains the motion up to the interruption. The
-        class of the error is a subclass of `KeyboardInterrupt`.
+        The user pressed Ctrl-C. The attribute `result` of the error contains the motion up to the interruption.
     """
     check_times(t_end, output_dt, method, dt)
     check_limits(max_steps, max_wall_s)
@@ -272,15 +271,14 @@ def output_times(t_end: float, output_dt: float | None) -> Array:
     return times if t_end - times[-1] <= 1e-9 * output_dt else np.append(times, t_end)
 
 
-#: Scratch space of the last run, which the next run reuses. If two runs overlap, the second run allocates its own
-#: scratch space. Runs overlap in several threads, or if `on_progress` starts a run.
+#: Scratch space of the last run, which the next run reuses. A run that overlaps another run allocates its own.
 _spare: Final[deque[Work]] = deque(maxlen=1)
 #: Combinations of terms, options and method whose kernels this process has compiled or loaded.
 _ready: set[tuple[object, ...]] = set()
 
 
 def _make_ready(compiled: CompiledScene, energy_balance: bool, method: Method, dt: float | None) -> float:
-    """Compile or load the kernels of a run by a run of length 0. Return the time in s, or 0 if they are loaded."""
+    """Compile or load the kernels by a run of length 0, and return the time in s, or 0 if they are loaded already."""
     parts = compiled.parts
     loads = parts.harmonics is None, parts.segments is None, None if parts.implicit is None else parts.implicit.dtype
     kind = parts.terms, *loads, options(compiled.scene), method == "events", energy_balance
@@ -362,7 +360,7 @@ def _result(
 def statistics_of(totals: Totals, duration: float) -> dict[str, dict[str, float]]:
     """Return the statistics of each pair over a motion of a given duration in s, as in `Result.statistics`."""
     table = {}
-    # each field is read only once, because access to a field of a record is slow
+    # access to a field of a record is slow
     sums = [totals[name].tolist() for name in ("peak", "impulse", "time_in_contact", "makes")]
     for name, peak, impulse, contact, makes in zip(PAIR_NAMES, *sums, strict=True):
         table[name] = {

@@ -1,4 +1,4 @@
-"""Columns of the linearised equations (`solve.tangents`). Each column is a displacement or a change of a parameter."""
+"""Columns of the linearised equations (`solve.tangents`): displacements and changes of parameters."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "f
 def fits_tangents(compiled: CompiledScene) -> bool:
     """Return whether the linearised equations support all terms of a scene. Exponents must be integers or 1.5.
 
-    The linearised equations have no implicit steps. A law with a restitution is supported nevertheless, because it
-    needs implicit steps only for slow touches.
+    A law with a restitution is supported although it needs implicit steps for slow touches.
     """
     terms, contact = compiled.parts.terms, compiled.scene.contact
     there = {name for name, term in zip(Terms._fields, terms, strict=True) if term is not None}
@@ -39,7 +38,7 @@ def is_curved(terms: Terms) -> int | None:
 def columns_beside(
     compiled: CompiledScene, changed: Sequence[tuple[CompiledScene, float]]
 ) -> tuple[NDArray[np.void], _Array, _Array]:
-    """Return the columns for displacements of the state, and for changes of one parameter each.
+    """Compute the columns for displacements of the state, and for changes of one parameter each.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""The live twin of one head, which is advanced in time under sampled or analytic loads. Its state can be saved."""
+"""The live twin of one head, which is advanced in time under sampled or analytic loads."""
 
 from __future__ import annotations
 
@@ -45,12 +45,11 @@ __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 
 #: Default number of steps after which an advance fails.
 DEFAULT_BUDGET = 50_000_000
-#: Compiled kernels by signature and kind, which determine the argument types of a kernel. The kernels are stored here
-#: because numba's dispatch takes milliseconds.
+#: Compiled kernels by signature and kind, which determine the argument types. Numba's own look-up takes milliseconds.
 _entries: dict[tuple[Any, ...], Callable[..., bool]] = {}
 _NO_DIGESTS = np.zeros(0, np.int64)
 _THE_ONE = np.zeros(1, np.int64)
-#: Smallest admissible number of evaluations of an advance. Four Runge-Kutta steps need this number.
+#: Smallest admissible number of evaluations of an advance, enough for four Runge-Kutta steps.
 LEAST_EVALUATIONS = 16
 
 
@@ -82,8 +81,8 @@ class Twin:
     A call raises `LimitError` after `max_wall_s`, and `RunInterrupted` after Ctrl-C. After such an error, the twin has
     the state after the last complete advance. The attribute `result` of the error contains the rows up to this advance.
 
-    The motion does not depend on the output times. However, each sample ends a step of the solver, so only equal
-    samples give bit-identical results.
+    The motion does not depend on the output times. Each sample ends a step of the solver, so only equal samples give
+    bit-identical results.
     """
 
     def __init__(
@@ -231,7 +230,7 @@ class Twin:
         rows: NDArray[np.void] | None,
         digest_after: NDArray[np.int64] = _NO_DIGESTS,
     ) -> Advanced:
-        """Advance to given times. All other methods that advance the twin call this method.
+        """Advance to given times.
 
         Parameters
         ----------
@@ -419,8 +418,8 @@ class Twin:
             return None
         if state.step_size < 0.0:
             return np.array(state.frame)
-        # under the scene's own loads the current time may be within a step, so the series of this step is evaluated (at
-        # the sigma of `dense_output.sigma_at`)
+        # the current time may be within a step: evaluate the series of this step at the sigma of
+        # `dense_output.sigma_at`
         used, beta = float(state.elapsed), float(state.beta)
         sigma = 2.0 * used / (state.alpha + math.sqrt(max(state.alpha**2 + 2.0 * beta * used, 0.0)))
         return frame_at(work.frame, int(state.order), sigma)
@@ -441,14 +440,14 @@ class Twin:
         return int(self._state.bounded)
 
     def _kernel(self, kind: tuple[bool, bool], arguments: tuple[Any, ...]) -> Callable[..., bool]:
-        """Return the kernel for these arguments. The signature and `kind` determine the types of the arguments."""
+        """Return the kernel for these arguments, whose types the signature and `kind` determine."""
         key = self.signature, kind
         if key not in _entries:
             _entries[key] = for_arguments(loop.advance_rows, arguments)
         return _entries[key]
 
     def _digests(self, states: NDArray[np.void], wrench: NDArray[np.float64]) -> list[str]:
-        """Return a digest of each state together with its last sample of the load. `wrench` has shape (m, 3)."""
+        """Return a digest of each state and its last sample of the load, for `wrench` of shape (m, 3)."""
         size = states.itemsize
         rows = np.empty((len(states), size + 32), np.uint8)  # each row has the layout of `snapshot`
         rows[:, :size] = states.view(np.uint8).reshape(len(states), size)
@@ -459,7 +458,7 @@ class Twin:
     def _stopped(
         self, stop: BaseException, count: int, samples: NDArray[np.float64] | None, rows: NDArray[np.void] | None
     ) -> NoReturn:
-        """Restore the state after the last complete advance of the `count` advances, and raise an error."""
+        """Restore the state after the last complete advance, and raise an error."""
         steps, done = self.steps, int(self._pace.record.row)
         self._go_back()
         if samples is not None and done > 0:

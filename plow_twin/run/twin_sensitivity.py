@@ -1,8 +1,7 @@
 """Derivatives of a live twin's motion with respect to its initial state and to parameters.
 
 The derivatives are computed from shadows, which are copies of the twin with a small displacement or a changed
-parameter. The motion is divided into stretches of some 0.1 s. At the start of each stretch, the shadows are set to the
-state of the twin or to a displaced state.
+parameter. Shadows start anew at each stretch of some 0.1 s.
 """
 
 from __future__ import annotations
@@ -32,10 +31,9 @@ from plow_twin.solve.state import Status
 
 Array = NDArray[np.float64]
 
-#: `_STRETCH_S`: length of a stretch in s. `_FAR`: limit of the distance of a shadow from the twin, divided by its
-#: initial displacement; a larger distance ends the stretch.
+#: `_STRETCH_S`: length of a stretch in s. `_FAR`: growth of a shadow's distance from the twin that ends a stretch.
 _STRETCH_S, _FAR = 0.1, 100.0
-#: Longest stretch in s. A stretch exceeds `_STRETCH_S` if a contact prevents the start of the next stretch.
+#: Longest stretch in s, if a contact prevents the start of the next stretch.
 _LONGEST_S = 0.5
 
 
@@ -157,7 +155,7 @@ class TwinSensitivity:
         self._start()
 
     def _start(self, again: bool = True) -> None:
-        """Start a stretch: set all shadows to the twin's state, with or without a small displacement."""
+        """Start a stretch: set all shadows to the twin's state or to a displaced state."""
         size = len(self._free)
         moved = np.zeros((len(self._shadows), 6))
         moved[np.arange(1, 1 + size), self._free] = DISPLACEMENT * self._scale[self._free]
