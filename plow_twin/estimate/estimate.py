@@ -666,8 +666,7 @@ def thinned(load: Load, period: float) -> tuple[Load, bool]:
     A load is broad-band if nearly all its samples move the head. A broad-band load is averaged. A load with samples so
     rare that a broad-band part would not be visible counts as broad-band.
     """
-    samples, load = load, load.believable()
-    rare = load.wrench is not samples.wrench
+    load = load.believable()
     most = tuning.KNOTS[0] * max(1.0, float(load.t[-1] - load.t[0]) / period)
     shares = (5e-4, 1e-3, 2e-3, 4e-3, 8e-3)
     significance = load.significance(shares[0])
@@ -679,7 +678,7 @@ def thinned(load: Load, period: float) -> tuple[Load, bool]:
     broad = len(thin.t) > most
     # the head follows the mean values of a broad-band load
     felt = load.averaged(tuning.KNOTS[1] * int(most)) if len(thin.t) > tuning.KNOTS[1] * most else thin
-    return replace(felt, unknown=load.unknown), broad or rare
+    return replace(felt, unknown=load.unknown), broad or load.rare
 
 
 def warm_up(scene: Scene) -> None:

@@ -157,12 +157,15 @@ class Load:
     unknown : tuple of 3 float
         Spectral density of the unknown part of the load between the samples, in N2 s and (N m)2 s, from the method
         `believable`.
+    rare : bool
+        Whether samples are so rare and uncorrelated that the method `believable` uses only their strong oscillations.
     """
 
     t: Array
     wrench: Array
     deviation: Deviation = UNSTATED
     unknown: Deviation = UNSTATED
+    rare: bool = False
 
     @staticmethod
     def of(t: ArrayLike, wrench: ArrayLike, deviation: Deviation = UNSTATED) -> tuple[Load, int]:
@@ -355,7 +358,7 @@ class Load:
         lines = np.fft.rfft(wrench - mean, axis=0)
         power = np.abs(lines) ** 2 * float(t[1] - t[0]) / len(t)
         strong = np.fft.irfft(np.where(power > 0.5 * tuning.OUTLYING**2 * of_samples, lines, 0.0), len(t), axis=0)
-        return Load(t, np.where(rare, mean + strong, wrench), self.deviation, (fx, fy, moment))
+        return Load(t, np.where(rare, mean + strong, wrench), self.deviation, (fx, fy, moment), rare=True)
 
     def averaged(self, count: int) -> Load:
         """Return the least-squares fit of a piecewise linear load with `count` equidistant knots.
