@@ -1,15 +1,13 @@
-"""Estimate of the clearances from features of the whole motion, for a contact so hard that single poses cannot be
-predicted.
+"""Estimate of the clearances of a hard contact from features of the whole motion.
 
-With a hard contact, the head bounces many times before it rests, so its pose at a given moment cannot be predicted. Two
-kinds of features can be predicted. The first kind is the reach of the corners, which is the distance that a corner
-moves toward a wall. The second kind is the scatter of the pose at each phase of the load. The method is approximate
-Bayesian computation with local-linear adjustment:
+With a hard contact, the head bounces many times before it rests, so its pose at a given moment cannot be predicted. The
+reach of a corner, which is the distance that it moves toward a wall, and the scatter of the pose at each phase of the
+load can be predicted. The method is approximate Bayesian computation with local-linear adjustment:
 
 1. Stiffness, damping and load gains are drawn at random, and the motion is simulated for each draw.
 2. Each simulated motion is observed with the noise and the gaps of the sensor.
 3. For the simulated motions near the measured motion, the difference between clearance and reach is regressed on the
-features. The regression gives the clearance, and the residuals of the regression give the interval.
+features. The regression gives the clearance, and its residuals give the interval.
 
 References: Beaumont, Zhang and Balding, Genetics 162 (2002) 2025; Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012)
 419; Wood, Nature 466 (2010) 1102; Blum and Francois, Stat. Comput. 20 (2010) 63.
@@ -47,41 +45,37 @@ from plow_twin.model import geometry
 
 Array = NDArray[np.float64]
 
-#: Grid of trial values for the bias of theta in rad. It is derived from the prior of the bias and extends over eight
-#: prior deviations to both sides. The best value is refined with a parabola through the points `_NEAR_TURNS`, which
-#: extend over three quarters of the grid spacing to both sides.
+#: Trial values for the bias of theta in rad, over eight prior deviations to both sides. A parabola through the points
+#: `_NEAR_TURNS` refines the best value.
 _TURNS: Final = np.linspace(-0.16, 0.16, 81)
 _FINEST_TURN: Final = 3e-3
 _NEAR_TURNS: Final = np.linspace(-_FINEST_TURN, _FINEST_TURN, 5)
-#: Upper bound on the number of rows that the search for a bias uses, and upper bound on the number of rows that the
-#: refinement of the bias uses.
+#: Upper bounds on the number of rows for the search for a bias and for its refinement.
 _MOST_ROWS, _MOST_NEAR_ROWS = 2000, 1200
-#: Smallest number of rows in a part of a load period. It is derived from the scatter of a mean. The scatter of the mean
-#: of nine values is a third of the scatter of the values.
+#: Smallest number of rows in a part of a load period, derived from the scatter of a mean of nine values, which is a
+#: third of the scatter of one value.
 _FEWEST_OF_PHASE = 9
-#: Grids of trial values for the delay of the sensor in s, derived from the prior of the delay. The grid `_LAGS_S` for
-#: the measured motion extends over two prior deviations to both sides. The grid `_OF_DRAWN_S` for simulated motions
-#: extends over a tenth of the range of `_LAGS_S`. `_NO_LAG` is the index of the delay zero in `_OF_DRAWN_S`.
+#: Trial values for the delay of the sensor in s: `_LAGS_S` for the measured motion, over two prior deviations to both
+#: sides, and `_OF_DRAWN_S` for simulated motions. `_NO_LAG` is the index of the delay zero in `_OF_DRAWN_S`.
 _LAGS_S: Final = np.linspace(-0.1, 0.1, 81)
 _OF_DRAWN_S: Final = np.linspace(-0.01, 0.01, 9)
 _NO_LAG = len(_OF_DRAWN_S) // 2
-#: Distances in rows over which second differences are computed, derived as powers of two. The distances `_CHANGES` are
-#: used for pose and reach in the whole motion. The distances `_CHANGES_BY_PHASE` are used for the pose at each phase of
-#: the load.
+#: Steps in rows of the second differences of pose and reach in the whole motion, and of the pose at each phase of the
+#: load.
 _CHANGES: Final = (1, 2, 4, 8, 16, 32)
 _CHANGES_BY_PHASE: Final = (1, 4)
 #: Paths of the frame's sides in a scene.
 _SIDES: Final = ("frame.width_m", "frame.height_m")
-#: Smallest squared scatter in m2 or rad2. It is a guard against logarithms of zero and divisions by zero.
+#: Smallest squared scatter in m2 or rad2, a guard against logarithms of zero and divisions by zero.
 _NO_SCATTER = 1e-14
 #: Upper bound on the factor by which the work for simulated motions may grow in windows longer than ten load periods.
 _LONGER = 2.0
-#: Lower and upper bound on the drawn penetration in m, first for a hard contact and second for a firm contact.
+#: Lower and upper bound on the drawn penetration in m, for a hard contact and for a firm contact.
 _HARD_BOUNDS, _FIRM_BOUNDS = (8e-7, 6e-4), (2e-6, 2e-2)
 #: Upper bound on the number of iterations in which the noise of a simulated motion is adjusted.
 _NOISE_ROUNDS = 3
 #: Smallest number of draws, derived from the twenty features of a regression, and smallest number of complete poses,
-#: derived from the use of the 99 % quantile of the poses.
+#: derived from their 99 % quantile.
 _FEWEST, _FEWEST_WHOLE = 30, 100
 
 
@@ -106,18 +100,16 @@ class Bounced:
         motions.
     path : float
         Distance of the measured path (mean and scatter of the pose over the load's period) from the path that the drawn
-        motions predict. The distance is given as a normal deviate with respect to the distances that drawn motions
-        have. It is 0 with too few poses.
+        motions predict, as a normal deviate of the distances of drawn motions. It is 0 with too few poses.
     law : float
-        Similarity of the measured motion to motions under the alternative contact law (`unknowns.OTHER_LAW`). It is a
-        normal deviate with respect to motions under the assumed law. It is 0 if there is no alternative law, if too few
-        motions under the alternative law can be simulated, or if the contact is not hard.
+        Similarity of the measured motion to motions under the alternative contact law (`unknowns.OTHER_LAW`), as a
+        normal deviate with respect to motions under the assumed law. It is 0 without a comparison of the laws.
     odds : float
-        Logarithm of the odds of the alternative law against the assumed law. It is minus infinity if the alternative
-        law was not compared, and if the motions are drawn about a given vector.
+        Logarithm of the odds of the alternative law against the assumed law. It is minus infinity without a comparison
+        of the laws, and if the motions are drawn about a given vector.
     unseen : ndarray, shape (2,)
-        Standard deviation of the clearances in m due to quantities that the motion does not show. These quantities are
-        errors of the frame's sides, errors of the sensor's scale factors, and rotations of walls.
+        Standard deviation of the clearances in m due to quantities that the motion does not show: errors of the frame's
+        sides and of the sensor's scale factors, and rotations of walls.
     rounded : ndarray, shape (2,)
         Distance in m by which the clearances are overestimated if the frame's corners have the radius
         `priors.ROUNDING`. It is zero if the scene states the radius or the deviations of the sides.
@@ -139,19 +131,19 @@ class Bounced:
 
 
 def bounces(unknowns: Unknowns, poses: Poses) -> bool:
-    """Return whether the contact is so hard that measured and simulated motions must be compared by their features."""
+    """Return whether the contact is so hard that only features of the motion can be predicted."""
     return _reach_noise(unknowns, _whole(poses)) < tuning.POSSIBLE and _is_narrow(unknowns, poses)
 
 
 def _is_narrow(unknowns: Unknowns, poses: Poses) -> bool:
-    """Return whether the head always stops at the same position up to noise, as at walls that do not yield."""
+    """Return whether the head always stops at the same position up to noise, as at rigid walls."""
     q = _whole(poses)
     reach = _reach(unknowns, q)
     return bool(np.median(reach[2] - reach[0]) < max(tuning.NARROW * _reach_noise(unknowns, q), tuning.FITTED))
 
 
 def _whole(poses: Poses) -> Array:
-    """Return the complete poses or, if there are few, all poses with missing components interpolated linearly."""
+    """Return the complete poses or, if there are few, all poses with missing components interpolated."""
     whole = np.isfinite(poses.q).all(axis=1)
     return poses.q[whole] if whole.sum() > _FEWEST_WHOLE else filled(poses)
 
@@ -163,12 +155,10 @@ def _reach_noise(unknowns: Unknowns, q: Array) -> float:
 
 
 def bias_of_hard(unknowns: Unknowns, poses: Poses) -> Array:
-    """Return the sensor's bias of x, y and theta in m, m, rad if the contact is hard; zeros if the contact is soft.
+    """Return the sensor's bias of x, y and theta in m, m, rad for a hard contact; zeros for a soft contact.
 
-    A hard wall stops both of its corners at the same position. If the measured theta is biased, the two corners seem to
-    stop at two positions. The bias of theta is therefore chosen so that the scatter of the farthest reaches is
-    smallest. The biases of x and y are removed before the search, because the reaches of a rotated head depend on x and
-    y.
+    A hard wall stops both of its corners at the same position. With a bias of theta, they seem to stop at two
+    positions. The bias is therefore chosen so that the scatter of the farthest reaches is smallest.
     """
     q = _whole(poses)
     bias = np.zeros(3)
@@ -182,8 +172,7 @@ def bias_of_hard(unknowns: Unknowns, poses: Poses) -> Array:
 def _near_bias(unknowns: Unknowns, q: Array) -> Array:
     """Return a small bias, shape (3,), in m, m, rad.
 
-    The estimate has an error, which has no effect on the result: the same estimate is applied to drawn motions without
-    bias, so that the comparison shows the error.
+    Its error cancels, because it is also computed for drawn motions, which have no bias.
     """
     q = _few(q, _MOST_NEAR_ROWS)
     bias = np.zeros(3)
@@ -202,9 +191,7 @@ def _few(q: Array, most: int) -> Array:
 
 
 def _off_centre(reach: Array) -> Array:
-    """Return half the difference between left and right reach, and half the difference between bottom and top reach,
-    shape (2,), in m.
-    """
+    """Return half the difference of left and right reach, and of bottom and top reach, in m, shape (2,)."""
     right, left, top, bottom = reach
     return 0.5 * np.array([left - right, bottom - top])
 
@@ -226,11 +213,10 @@ def _widths(unknowns: Unknowns, q: Array, turns: Array) -> Array:
 def compare(
     forward: Forward, unknowns: Unknowns, poses: Poses, period: float, near: Array | None = None, seed: int = 0
 ) -> Bounced | None:  # fmt: skip
-    """Compare the measured motion with drawn motions.
+    """Compare the measured motion with drawn motions. Return None for few drawn motions or a contact that is not hard.
 
-    The result is None if too few drawn motions can be simulated, or if the contact is not hard. By default, the drawn
-    motions have hard contacts. If a vector of unknowns `near` is given, softness and damping are drawn about the values
-    in `near`.
+    By default, the drawn motions have hard contacts. If a vector of unknowns `near` is given, stiffness and damping are
+    drawn about its values.
     """
     eye = MotionFeatures(unknowns, poses, period)
     measured = eye.features(eye.q)
@@ -251,7 +237,7 @@ def compare(
         features = np.array(drawn.features)
         if found is None:
             delay = path_delay(eye, features[:, 5:], drawn.q, measured[5:])
-            # the first motions were drawn without a delay, so their paths are shifted by the estimated delay
+            # the first motions were drawn without a delay
             paths = [eye.paths(q, _OF_DRAWN_S - delay) for q in drawn.q]
             drawn.by_phase = [eye.changes_by_phase(q, -delay) for q in drawn.q]
         else:
@@ -264,7 +250,7 @@ def compare(
         found = regress_near(like, targets, seen)
         moved = measured[:2] + found.value[:2] - centre
         centre = centre + moved
-        # a clearance that still changes has not converged, so its last change is added to its deviation
+        # the last change of a clearance is an error of its convergence
         deviation = np.hypot(found.deviation[:2], moved)
         if near is None and len(features) <= tuning.DRAWS[0] and found.distance > tuning.NOT_HARD:
             return None
@@ -274,7 +260,7 @@ def compare(
             if len(rounds) == 3 and count == tuning.DRAWS[2] and not followed:
                 rounds.append((tuning.DRAWS[3], tuning.DRAWN_CLEARANCE[3]))
     assert found is not None
-    # a large last change indicates a false result, so the deviation is increased further
+    # a large last change indicates a false result
     deviation = np.where(np.abs(moved) > tuning.ASTRAY, np.hypot(deviation, tuning.UNEXPLAINED_HARD), deviation)
     law, odds = 0.0, -math.inf
     if found.value[5] < math.log(tuning.FITTED):
@@ -290,16 +276,16 @@ def compare(
         found.distance,
         path_deviate(eye.paths(eye.q, _LAGS_S), features[:, 5:], paths, measured[5:]),
         law,
-        # the limit of the odds was tuned for draws without `near`, so no odds are returned for draws with `near`
+        # the limit of the odds was tuned for draws without `near`
         odds if near is None else -math.inf,
         *hidden_by_geometry(unknowns, poses, period, measured[:2]),
     )
 
 
 def by_range(unknowns: Unknowns, poses: Poses) -> Bounced:
-    """Return the result for a hard contact from the range of motion alone, for the case that the load was not measured.
+    """Return the result for a hard contact from the range of motion alone, without a measured load.
 
-    The penetration at each of two opposite walls is assumed to be uniformly distributed between 0 and `tuning.FITTED`.
+    The penetration at each wall is assumed to be uniformly distributed between 0 and `tuning.FITTED`.
     """
     span = float(poses.t[-1] - poses.t[0])
     eye = MotionFeatures(unknowns, poses, span)
@@ -324,10 +310,10 @@ def by_range(unknowns: Unknowns, poses: Poses) -> Bounced:
 def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: Array) -> tuple[Array, Array]:
     """Return the attributes `unseen` and `rounded` of `Bounced`.
 
-    `reach`, shape (2,), contains the sum of left and right reach, and the sum of bottom and top reach, in m. A resting
-    head touches the frame at three corners, always at the same angle. An error of a side, a scale factor or a corner
-    therefore changes the reach in the same way as a different clearance. At a rotated wall, the head always touches the
-    same pad, which is displaced by half the rotation. The rotations of opposite walls are independent.
+    `reach`, shape (2,), contains the sum of left and right reach, and the sum of bottom and top reach, in m. The head
+    always rests on three corners at the same angle, so an error of a side, a scale factor or a corner changes the reach
+    like a different clearance. At a rotated wall, it always touches the same pad, which is displaced by half the
+    rotation.
     """
     scene = unknowns.scene
     width, height = (deviation_of(scene, path) for path in _SIDES)
@@ -346,7 +332,7 @@ def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: A
     unseen = np.sqrt(
         np.square([moved(width), moved(0.0, height), *scaled]).sum(axis=0) + (0.25 * turned**2).sum(axis=1)
     )
-    # a stated radius, or a stated deviation of a side, already includes the effect of rounded corners
+    # a stated radius or deviation of a side includes the effect of rounded corners
     known = scene.frame.corner_radius_m is not None or any(is_stated(scene, path) for path in _SIDES)
     across = 0.0 if known else -2.0 * priors.ROUNDING
     return unseen, moved(across, across) if across else np.zeros(2)
@@ -354,10 +340,7 @@ def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: A
 
 @dataclass(frozen=True, eq=False)
 class _Spread:
-    """Mean and standard deviation of the logarithms of penetration and damping for the draws, shape (2,) each.
-
-    `bounds` are the smallest and the largest drawn penetration in m.
-    """
+    """Mean and deviation of the logarithms of penetration and damping of the draws; bounds on the penetration in m."""
 
     mean: Array
     deviation: Array
@@ -381,10 +364,7 @@ class _Spread:
 
 
 class _Drawn:
-    """Motions drawn under one contact law, with their features and the targets of the regression.
-
-    The list `q` of the motions themselves is cleared after use.
-    """
+    """Motions drawn under one contact law, with their features and the targets of the regression."""
 
     def __init__(
         self, forward: Forward, unknowns: Unknowns, eye: MotionFeatures, spread: _Spread, rng: np.random.Generator
@@ -397,10 +377,9 @@ class _Drawn:
         self.q: list[Array] = []
 
     def add(self, count: int, centre: Array, about: float, delay: float, most_work: int) -> None:
-        """Draw `count` motions, observed with a delay of `delay` s, and add them; stop early if the work reaches
-        `most_work`.
+        """Add up to `count` motions, observed with a delay of `delay` s, until the work reaches `most_work`.
 
-        The clearances are drawn with the mean `centre` and the standard deviation `about`, both in m.
+        The clearances have the mean `centre` and the standard deviation `about`, both in m.
         """
         for _ in range(count):
             if self.forward.work > most_work:
@@ -422,8 +401,7 @@ class _Drawn:
         numbers: Array = mean + np.concatenate([self.spread.deviation, np.full(3, tuning.HARD_DRAWN[3])]) * drawn
         numbers[0] = np.clip(numbers[0], *np.log(self.spread.bounds))
         if self.unknowns.scene.contact.law in OTHER_LAW.values():
-            # the damping under the alternative law is drawn as a fraction of the critical damping of the drawn
-            # stiffness
+            # the damping is a fraction of the critical damping of the drawn stiffness
             critical = self.unknowns.critical_damping(self.unknowns.force / math.exp(numbers[0]))
             numbers[1] = math.log(tuning.LAW_DAMPING[1] * critical) + tuning.LAW_DAMPING[2] * drawn[1]
         return numbers
@@ -443,9 +421,8 @@ class _Drawn:
 def _likeliest(features: Array, targets: Array, paths: Array, measured: Array, seen: Array) -> Array:
     """Return the most likely clearances minus the reaches in m, shape (n + 1, 2).
 
-    The first n rows are for the drawn motions, and the last row is for the measured motion. The array `paths` contains
-    the paths of the drawn motions, shape (n, lags, k). The array `seen` is the measured path, shape (lags, k). Only the
-    first half of each path, the mean poses, is used.
+    The rows are for the n drawn motions with the paths `paths`, shape (n, lags, k), and for the measured motion with
+    the path `seen`, shape (lags, k).
     """
     before, after = _NO_LAG - 1, _NO_LAG + 1
     paths, seen = (path[..., : path.shape[-1] // 2] for path in (paths, seen))
@@ -484,10 +461,9 @@ def _of_other_law(
 ) -> tuple[float, float]:  # fmt: skip
     """Return the similarity of the measured motion to motions under the alternative law, and the log odds of this law.
 
-    The goodness of fit does not separate laws with similar motions. The first result comes from a classifier that is
-    trained with draws of both laws (Pudlo et al., Bioinformatics 32 (2016) 859). The second result comes from the ratio
-    of the likelihoods. Both are used, because neither criterion finds all cases. If `by_odds` is set and half of the
-    draws give clear odds, the second half is not drawn, because the similarity is irrelevant.
+    The similarity comes from a classifier that is trained with draws of both laws (Pudlo et al., Bioinformatics 32
+    (2016) 859), the odds from the ratio of the likelihoods. Neither criterion finds all cases. With `by_odds`, clear
+    odds after half of the draws end the comparison.
     """
     other, nothing = drawn.of_other_law(), (0.0, -math.inf)
     if other is None:
@@ -511,8 +487,8 @@ def class_deviate(believed: Array, other: Array, measured: Array) -> float:
     """Return a normal deviate that is large if the features `measured` resemble `other` more than `believed`.
 
     `believed` and `other` contain the features of motions under two laws, one motion per row; `measured` has the shape
-    (m,). A class label is regressed on the features, with the same total weight for both classes. The deviate is the
-    distance of the prediction for `measured` from the cross-validated predictions for the class `believed`.
+    (m,). A class label is regressed on the features. The deviate is the distance of the prediction for `measured` from
+    the cross-validated predictions for the class `believed`.
     """
     features = np.concatenate([believed, other])
     sizes = [len(believed), len(other)]
@@ -530,10 +506,9 @@ def class_deviate(believed: Array, other: Array, measured: Array) -> float:
 def path_deviate(seen: Array, features: Array, drawn: list[Array], measured: Array) -> float:
     """Return the distance of the measured path from the drawn motions as a normal deviate; 0 with too few measurements.
 
-    The distance is compared with the distances that nearby drawn motions have from the remaining drawn motions. A
-    correct model gives distances of the same size.
+    Nearby drawn motions have distances of the same size if the model is correct.
     """
-    # the shape is (n, lags, parts); the paths are compared at several lags, because the delay is not known exactly
+    # shape (n, lags, parts), with several lags because the delay is not known exactly
     paths = np.array(drawn)
     there = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(seen).all(axis=0)
     if there.sum() < tuning.PATH_PHASES:
@@ -549,11 +524,10 @@ def path_deviate(seen: Array, features: Array, drawn: list[Array], measured: Arr
 
 
 def _distance_of_paths(features: Array, paths: Array, measured: Array, seen: Array) -> float:
-    """Return the mean square distance of the path `seen`, (lags, k), from the prediction by the drawn `paths`, (n,
-    lags, k).
+    """Return the mean square distance of the path `seen`, (lags, k), from the drawn `paths`, (n, lags, k).
 
-    The distance is the Mahalanobis distance at the best lag. The covariance of the residuals of the drawn paths is
-    shrunk toward equal variances (Ledoit and Wolf, J. Multivar. Anal. 88 (2004) 365).
+    It is the Mahalanobis distance at the best lag. The covariance of the residuals is shrunk toward equal variances
+    (Ledoit and Wolf, J. Multivar. Anal. 88 (2004) 365).
     """
     near = _Near.to(features, measured)
     value, left = near.left_over(paths[:, _NO_LAG])
@@ -562,7 +536,7 @@ def _distance_of_paths(features: Array, paths: Array, measured: Array, seen: Arr
     left *= np.sqrt(near.weight / near.weight.sum())[:, None] / deviation
     share, size = tuning.SHRINKAGE[1], left.shape[1]
     off = (seen - value) / deviation
-    # A path has more numbers than there are draws, so the smaller matrix L L^T is inverted:
+    # a path has more numbers than there are draws, so the smaller matrix L L^T is inverted:
     # (a L^T L + b I)^-1 = (I - L^T (b/a I + L L^T)^-1 L) / b
     equal = share * float(np.square(left).sum()) / size
     among = left @ left.T + equal / (1.0 - share) * np.eye(len(left))
@@ -608,9 +582,7 @@ class _Near:
         return _Near(distance, weight, scale, basis, inverse, leverage)
 
     def regress(self, targets: Array) -> tuple[Array, Array]:
-        """Return the prediction of `targets` (n, k) at the measured features, shape (k,), and the residuals, shape (n,
-        k).
-        """
+        """Return the prediction of `targets` (n, k) at the measured features, shape (k,), and the residuals (n, k)."""
         beta = self.inverse @ (self.basis.T @ (self.weight[:, None] * targets))
         return beta[0], targets - self.basis @ beta
 
@@ -625,8 +597,7 @@ def regress_near(features: Array, targets: Array, measured: Array) -> _Regressed
     """Return the values and deviations of k targets that a regression predicts for the features `measured`, shape (m,).
 
     The arrays `targets`, shape (n, k), and `features`, shape (n, m), belong to n draws. Draws near `measured` have
-    large weights. If `measured` lies at the edge of the draws, the deviations include the uncertainty of the
-    extrapolation.
+    large weights.
     """
     near = _Near.to(features, measured)
     value, error = near.regress(targets)
@@ -640,8 +611,7 @@ def regress_near(features: Array, targets: Array, measured: Array) -> _Regressed
 def _scatter_at(basis: Array, weight: Array, error: Array, leverage: Array) -> Array:
     """Return the residual variance of a regression at the measured features, shape (k,).
 
-    The variance depends on the features. The logarithm of the squared residuals is therefore regressed on the features,
-    as proposed by Blum and Francois.
+    The logarithm of the squared residuals is regressed on the features (Blum and Francois).
     """
     freed = 1.0 - np.minimum(leverage, 0.9)
     square = error**2 / freed[:, None]
@@ -661,7 +631,7 @@ class _Phases:
 
     rows : (k,) rows in which the component was measured
     inside : (k,) part of the load period of each row
-    size : number of rows in each part, or 1 for an empty part, so that it can be a divisor
+    size : number of rows in each part, at least 1
     known : whether each part has enough rows
     """
 
@@ -672,7 +642,7 @@ class _Phases:
 
 
 class MotionFeatures:
-    """Computation of the features of motions that are observed with the times, the gaps and the noise of the sensor."""
+    """Features of motions that are observed with the times, the gaps and the noise of the sensor."""
 
     def __init__(self, unknowns: Unknowns, poses: Poses, period: float) -> None:
         self._unknowns, self._t = unknowns, poses.t
@@ -680,7 +650,7 @@ class MotionFeatures:
         self.q = filled(poses)
         self.noise = noise_level(self.q)
         self._period, self._parts = period, tuning.PATH_PHASES // 2
-        #: mask of the poses after the first period, which no longer depend on the initial state
+        #: poses after the first period, which no longer depend on the initial state
         self._settled = poses.t - poses.t[0] >= period
         self._whole = self._there.all(axis=1)
         if self._whole.sum() <= _FEWEST_WHOLE:
@@ -699,18 +669,16 @@ class MotionFeatures:
         self, forward: Forward, unknowns: Unknowns, clearance: Array, numbers: Array, delay: float,
         rng: np.random.Generator,
     ) -> Array | None:  # fmt: skip
-        """Return a simulated motion as the sensor would measure it with a delay of `delay` s; None if it cannot be
-        simulated.
+        """Return a simulated motion as a sensor with a delay of `delay` s would measure it; None after a failure.
 
-        `clearance`, shape (2,), is in m. The array `numbers` contains the logarithms of penetration and damping, and
-        three load gains.
+        `clearance`, shape (2,), is in m. `numbers` contains the logarithms of penetration and damping, and three load
+        gains.
         """
         vector = unknowns.nominal()
         vector[[GX, GY]], vector[DAMPING] = clearance, numbers[1]
         vector[GAIN] = np.clip(numbers[2:5], 0.7, 1.3)
         scene = unknowns.scene_of(vector)
-        # `scene_of` limits the stiffness, but the decay of bounces depends on larger values, so the full value is set
-        # here
+        # `scene_of` limits the stiffness, but the decay of bounces depends on larger values
         contact = replace(scene.contact, stiffness=unknowns.force / math.exp(numbers[0]) ** scene.contact.exponent)
         start = np.concatenate([self.q[0], np.zeros(3)])
         start += np.array([1e-3, 1e-3, 4e-3, 0.05, 0.05, 0.2]) * rng.standard_normal(6)
@@ -724,10 +692,9 @@ class MotionFeatures:
         return np.array([self._path(q, lag_s) for lag_s in lags_s])
 
     def _path(self, q: Array, lag_s: float) -> Array:
-        """Return the path of a motion, which is the mean and the logarithm of the scatter of the pose at each phase of
-        the load.
+        """Return mean and logarithmic scatter of the pose at each phase of the load, shape (240,).
 
-        The shape is (240,). The average over all phases is subtracted from the mean. Phases with too few poses are NaN.
+        The average over all phases is subtracted from the mean. Phases with too few poses are NaN.
         """
         out = np.full((2, tuning.PATH_PHASES, 3), np.nan)
         for i, phases in enumerate(self._phases_at(lag_s)):
@@ -755,11 +722,9 @@ class MotionFeatures:
         return self._phases[lag_s]
 
     def _seen(self, q: Array, white: Array) -> Array:
-        """Return a motion with noise, chosen so that its estimated noise level equals the noise level of the
-        measurement.
+        """Add noise to a motion so that its estimated noise level equals that of the measurement.
 
-        Bounces raise the estimated noise level. If the measured level were added as noise, the noise and the reach of
-        the simulated motion would be too large.
+        Bounces raise the estimated noise level, so adding the measured level would be too much.
         """
         noise = self.noise
         for _ in range(_NOISE_ROUNDS):
@@ -799,9 +764,7 @@ class MotionFeatures:
         return np.log(np.concatenate(parts) + 1e-12)
 
     def changes_by_phase(self, q: Array, lag_s: float = 0.0) -> Array:
-        """Return logarithms of second differences of the pose at each phase of the load, for a motion delayed by
-        `lag_s`.
-        """
+        """Return logarithms of second differences of the pose, delayed by `lag_s`, at each phase of the load."""
         phase = ((self._t - self._t[0] - lag_s) / self._period % 1.0 * self._parts).astype(int) % self._parts
         count = np.maximum(np.bincount(phase, minlength=self._parts), 1)
         parts = []
@@ -817,9 +780,7 @@ class MotionFeatures:
         return _reach(self._unknowns, q)
 
     def _by_phase(self, q: Array) -> Array:
-        """Return mean reaches in m, shape (3, 4), over the load phases with the farthest reaches. In these phases the
-        head rests.
-        """
+        """Return mean reaches in m, shape (3, 4), over the load phases in which the head rests (the farthest)."""
         reach, phase = reaches(self._unknowns.scene, q), self._reach_phase
         count = np.bincount(phase, minlength=tuning.PATH_PHASES + 1)
         known = count > 0
@@ -836,10 +797,7 @@ def _second_difference(rows: Array, apart: int) -> Array:
 
 
 def _reach(unknowns: Unknowns, q: Array) -> Array:
-    """Return the reaches toward right, left, top and bottom in m, averaged between the quantiles of `REACH_WINDOWS`.
-
-    The shape is (3, 4).
-    """
+    """Return the reaches to right, left, top and bottom in m between the quantiles of `REACH_WINDOWS`, shape (3, 4)."""
     ordered = np.sort(reaches(unknowns.scene, q), axis=0)
     count = len(ordered)
     windows = [
