@@ -11,13 +11,16 @@ import atexit
 import json
 import os
 import select
+import signal
 import socket
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack, suppress
 from functools import cache
 from pathlib import Path
-from typing import Any
+from threading import Thread
+from typing import IO, Any, Self
 
 ROOT = Path(__file__).resolve().parent.parent
 #: Programs that are forked. Other programs are started, which tests their imports too.
@@ -115,30 +118,85 @@ def _orders() -> socket.socket:
     return ours
 
 
-class Fork(subprocess.Popen[Any]):
-    """A program in a fork."""
+class Fork:
+    """A program in a fork, with the interface of `subprocess.Popen` that tests use."""
 
-    def _execute_child(self, args: Sequence[str], *given: Any) -> None:
-        folder, variables, streams = given[4], given[5], given[9:15]
-        stdin, _, _, stdout, _, stderr = streams
-        theirs = [own if place == -1 else place for own, place in enumerate((stdin, stdout, stderr))]
-        orders = _orders()
-        self._end, their_end = os.pipe()
-        module = "plow_twin.__main__" if args[2] == "plow_twin" else args[2]
-        text = json.dumps([module, args[3:], variables, os.fspath(folder or Path.cwd())]).encode()
-        socket.send_fds(orders, [text], [*theirs, their_end])
-        os.close(their_end)
-        self.pid = int(orders.recv(64))
-        self._child_created = True
-        self._close_pipe_fds(*streams)  # type: ignore[attr-defined]
+    def __init__(
+        self, args: Sequence[str], env: dict[str, str], *, cwd: str | os.PathLike[str] | None = None,
+        stdin: Any = None, stdout: Any = None, stderr: Any = None, text: bool = False,
+    ) -> None:  # fmt: skip
+        self.args, self.returncode = args, None
+        with ExitStack() as theirs:
 
-    def _internal_poll(self, _deadstate: object = None) -> int | None:
+            def stream(number: int, given: Any) -> tuple[int, Any]:
+                """Return the program's end of a stream, and our end of a pipe."""
+                if given is None:
+                    return number, None
+                if given == subprocess.DEVNULL:
+                    return theirs.enter_context(open(os.devnull, "r+b", buffering=0)).fileno(), None
+                if given != subprocess.PIPE:
+                    return given.fileno(), None
+                ends = os.pipe()
+                theirs.callback(os.close, ends[number > 0])
+                mode = ("w" if number == 0 else "r") + ("" if text else "b")
+                return ends[number > 0], open(ends[number == 0], mode)
+
+            inward, self.stdin = stream(0, stdin)
+            outward, self.stdout = stream(1, stdout)
+            errors, self.stderr = (outward, None) if stderr == subprocess.STDOUT else stream(2, stderr)
+            self._end, their_end = os.pipe()
+            theirs.callback(os.close, their_end)
+            module = "plow_twin.__main__" if args[2] == "plow_twin" else args[2]
+            order = json.dumps([module, args[3:], env, os.fspath(cwd or Path.cwd())]).encode()
+            socket.send_fds(_orders(), [order], [inward, outward, errors, their_end])
+            self.pid = int(_orders().recv(64))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for stream in (self.stdin, self.stdout, self.stderr):
+            if stream is not None:
+                stream.close()
+        self.wait()
+
+    def poll(self) -> int | None:
         return self._ended(0.0)
 
-    def _wait(self, timeout: float | None) -> int:
+    def wait(self, timeout: float | None = None) -> int:
         if (code := self._ended(timeout)) is None:
             raise subprocess.TimeoutExpired(self.args, timeout or 0.0)
         return code
+
+    def communicate(self, timeout: float | None = None) -> tuple[Any, Any]:
+        """Close the input and wait for the end. Return the texts of the two output streams."""
+        if self.stdin is not None:
+            self.stdin.close()
+        texts: list[Any] = [None, None]
+
+        def read(number: int, stream: IO[Any]) -> None:
+            texts[number] = stream.read()
+
+        streams = [(number, found) for number, found in enumerate((self.stdout, self.stderr)) if found is not None]
+        readers = [Thread(target=read, args=found, daemon=True) for found in streams]
+        for reader in readers:
+            reader.start()
+        self.wait(timeout)
+        for reader in readers:
+            reader.join(timeout)
+        return texts[0], texts[1]
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            # the program may have ended since
+            with suppress(ProcessLookupError):
+                os.kill(self.pid, number)
+
+    def terminate(self) -> None:
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
 
     def _ended(self, timeout: float | None) -> int | None:
         if self.returncode is None and select.select([self._end], [], [], timeout)[0]:
@@ -147,7 +205,7 @@ class Fork(subprocess.Popen[Any]):
         return self.returncode
 
 
-def start(module: str, arguments: Sequence[str], **options: Any) -> subprocess.Popen[Any]:
+def start(module: str, arguments: Sequence[str], **options: Any) -> subprocess.Popen[Any] | Fork:
     """Start a program as `Popen` does; `env` has the changed variables.
 
     It is forked if it is one of `_FORKED` and no variable was changed that imports may read.
