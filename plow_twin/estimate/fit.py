@@ -1,14 +1,12 @@
 """Least-squares fit of the unknowns, and of the state at the start of each swing, to the measured motion.
 
-The window is divided into *swings*, which are parts of the motion that begin in flight between the walls. In flight,
-the state is known best, and an error of the state has the smallest effect on the later motion. Each swing is simulated
-from its own starting state (multiple shooting), so errors due to the load or to bounces do not accumulate from swing to
-swing. Levenberg-Marquardt steps minimise the sum of Huber's function of the residuals and the terms of the prior.
+The window is divided into *swings*, which are parts of the motion that begin in flight between the walls. Each swing is
+simulated from its own starting state (multiple shooting), so errors due to the load or to bounces do not accumulate.
+Levenberg-Marquardt steps minimise the sum of Huber's function of the residuals and the terms of the prior.
 
-If the load is unknown between its samples, the swings are short, and each swing is *linked* to the next swing. A link
-allows a random jump between the end of a swing and the start of the next swing (weak constraints). The jump has the
-covariance that the unknown load causes. Simulations from displaced starting states give the variance of the prediction
-at each time. This variance is added to the variance of the measurement.
+If the load is unknown between its samples, the swings are short, and each swing is *linked* to the next swing by a
+random jump with the covariance that the unknown load causes (weak constraints). Simulations from displaced starting
+states give the variance of the prediction, which is added to the variance of the measurement.
 
 References: Bock, Recent advances in parameter identification techniques for ODE (1983); Nocedal and Wright, Numerical
 Optimization, ch. 10; Huber, Robust Statistics, ch. 7; Tremolet, Q. J. R. Meteorol. Soc. 132 (2006) 2483.
@@ -42,15 +40,12 @@ Array = NDArray[np.float64]
 NO_PRIOR = 1e-6
 #: Steps of the difference quotients with respect to a starting state, in m, m, rad, m/s, m/s, rad/s.
 _DISPLACED = np.array([2e-4, 2e-4, 1e-3, 5e-3, 5e-3, 3e-2])
-#: Lower bound on the spectral density of an unknown acceleration in m2/s3 and rad2/s3. With the lower bound, the
-#: acceleration causes in one second a change of rate of 0.1 mm/s or 0.1 mrad/s, which neither the solver nor a sensor
-#: can resolve.
+#: Lower bound on the spectral density of an unknown acceleration in m2/s3 and rad2/s3. It changes a rate by 0.1 mm/s or
+#: 0.1 mrad/s in one second, which no sensor resolves.
 _LEAST_DRIFT = 1e-8
-#: Definition of the walls left, right, top and bottom by the indices of two pads. The first pad is the top pad or the
-#: left pad of the wall.
+#: Definition of the walls left, right, top and bottom by the indices of two pads. The first pad is top or left.
 WALLS: Final = ((1, 7), (3, 5), (0, 2), (6, 4))
-#: Definition of the *differences*. A difference is an unknown by which the machine or the sensor differs from the
-#: model:
+#: Definition of the *differences*, the unknowns by which the machine or the sensor differs from the model:
 #:
 #: - `turn_<wall>`: rotation of a wall, expressed as the distance in m by which the first pad in `WALLS` lies farther
 #:   out than the second pad
@@ -62,19 +57,16 @@ DIFFERENCES: Final = ("turn_left", "turn_right", "turn_top", "turn_bottom", "lev
 DIFFERENCE_STEPS: Final = np.array([2e-4, 2e-4, 2e-4, 2e-4, 1e-3, 1e-3, 4e-6])
 #: Step of the difference quotients with respect to the amplitude of a harmonic, in units of half the load's range.
 _HARMONIC_STEP = 5e-3
-#: Factor on the steps of all difference quotients for derivatives that must be accurate. A search needs large steps,
-#: which average over the kinks of the motion. Large steps, however, give wrong derivatives for a change that has no
-#: effect on the motion. An example of such a change is a common factor on mass, inertia, stiffness and load.
+#: Factor on the steps of all difference quotients for accurate derivatives. A search needs large steps, which average
+#: over the kinks of the motion. Large steps give wrong derivatives for a change without effect on the motion, for
+#: example a common factor on mass, inertia, stiffness and load.
 _FINE = 1.0 / 300.0
-#: Smallest number of poses of a swing, derived from the six unknowns of a swing. Two poses, which are six numbers,
-#: would just determine the unknowns.
+#: Smallest number of poses of a swing, derived from its six unknowns, which two poses would just determine.
 FEWEST_OF_SWING = 4
 
 
 def huber_loss(z: Array) -> Array:
-    """Return Huber's function of absolute normalised residuals, which is quadratic up to `tuning.HUBER` and linear
-    beyond.
-    """
+    """Return Huber's function of absolute normalised residuals: quadratic up to `tuning.HUBER`, linear beyond."""
     return np.where(z <= tuning.HUBER, z * z, tuning.HUBER * (2.0 * z - tuning.HUBER))
 
 
@@ -112,8 +104,7 @@ class Point:
     residual : (n, 3) measured minus predicted values, NaN without a measurement
     rate : (n, 3) rates of the predicted measurements
     contact : (s, 8) time in s during which each pair is in contact
-    defect : (s - 1, 6) starting state of a swing minus final state of the previous swing; (0, 6) if swings are not
-    linked
+    defect : (s - 1, 6) starting state of a swing minus final state of the previous swing; (0, 6) without links
     """
 
     shared: Array
@@ -131,8 +122,7 @@ class Point:
 class Linear:
     """Jacobians with respect to the shared unknowns and to the starting state of one swing.
 
-    rows : (n, 3, SIZE + 6) Jacobian of the predicted measurements; the last six columns are for the swing that contains
-    the row
+    rows : (n, 3, SIZE + 6) Jacobian of the predicted measurements; the last six columns are for the row's swing
     ends : (s - 1, 6, SIZE + 6) Jacobian of the ends of linked swings
     """
 
@@ -173,7 +163,7 @@ class Fit:
     variance : (n, 3) variance of each measurement, the inverse of its weight
     jitter : (n, 3) variance of the unpredictable part of the motion
     linear : Jacobians at `point`
-    left : (SIZE + 6 s,) next step of the linearised problem, which would be zero at an optimum
+    left : (SIZE + 6 s,) next step of the linearised problem, zero at an optimum
     gain_left : predicted reduction of the cost by the step `left`
     """
 
@@ -222,7 +212,7 @@ class _Rows:
     inside : (k,) indices of the poses that lie in swings
     times : (k,) model times of these poses in s
     inner : (s + 1,) index in `inside` of the first row of each swing
-    asked : times in s at which a simulation returns the state, which include the ends of linked swings
+    asked : times in s at which a simulation returns the state, including the ends of linked swings
     ends : indices in `asked` of the ends of linked swings
     edges : (s + 1,) index in `asked` of the first time of each swing
     """
@@ -238,9 +228,7 @@ class _Rows:
 
 
 def depth_of(turns: Array) -> Array | None:
-    """Return the outward displacement of each pad in m, shape (8,), from the rotations of the walls; None without
-    rotations.
-    """
+    """Return the outward displacement of each pad in m, shape (8,), by rotations of the walls; None without any."""
     if not turns.any():
         return None
     depth = np.zeros(PAIR_COUNT)
@@ -283,7 +271,7 @@ class Problem:
         self.drift, self.harmonics = drift, harmonics
         #: factor on the steps of the difference quotients
         self.steps = 1.0
-        #: prior deviation of a starting state, shape (6,); it is larger for a component that was never measured
+        #: prior deviation of a starting state, shape (6,), larger for components without measurements
         self.start_spread = tuning.START_SPREAD * np.tile(np.where(window.poses.measured, 1.0, tuning.ASSUMED), 2)
         self.link = np.zeros((0, 6, 6)) if drift is None else link_weights(np.diff(window.starts)[:-1], drift)
         self._memory: Memory | None = None
@@ -324,10 +312,7 @@ class Problem:
         self, shared: Array, several: Array, differences: Array | None = None, push: Array | None = None,
         share: Array | None = None, change: Callable[[Scene], Scene] | None = None, load: Load | None = None,
     ) -> list[Point] | None:  # fmt: skip
-        """Return the motions for k sets of starting states `several`, shape (k, s, 6), computed in one call.
-
-        The result is None as in `evaluate`.
-        """
+        """Return the motions for k sets of starting states `several`, shape (k, s, 6), as `evaluate` does."""
         window, differences = self.window, self.differences if differences is None else differences
         rows = self._rows_at(float(shared[DELAY]) - float(np.sqrt(differences[LAG])))
         scene, forward = self._scene_of(shared), self.forward
@@ -355,7 +340,7 @@ class Problem:
             swing[swing >= window.swings] = -1
             swing[times - window.starts[np.maximum(swing, 0)] > self.horizon] = -1
             inside = np.flatnonzero(swing >= 0)
-            # the times rise, so the rows of a swing are consecutive
+            # the rows of a swing are consecutive
             inner = np.searchsorted(swing[inside], np.arange(window.swings + 1)).astype(np.int64)
             asked, ends, edges = times[inside], np.zeros(0, np.int64), inner
             if len(self.link):  # each swing except the last is simulated up to the start of the next swing
@@ -368,9 +353,7 @@ class Problem:
     def _point(
         self, shared: Array, states: Array, rows: _Rows, q: Array, v: Array, contact: Array, differences: Array
     ) -> Point:
-        """Return a point from poses and rates at the times `rows.asked`, with the lever arm and low pass of the
-        sensor.
-        """
+        """Return a point from poses and rates at the times `rows.asked`, as the sensor measures them."""
         window, lag = self.window, float(np.sqrt(differences[LAG]))
         at_ends = np.hstack((q[rows.ends], v[rows.ends]))
         if len(rows.ends):
@@ -394,8 +377,7 @@ class Problem:
     def cost(self, point: Point, variance: Array) -> float:
         """Return twice the negative logarithm of the posterior, with Huber's function of the residuals.
 
-        A measurement that lies in no swing contributes 1, which is the expected contribution of a measurement in a
-        swing.
+        A measurement outside all swings contributes 1, the expected contribution of a measurement.
         """
         z = np.abs(point.residual) / np.sqrt(variance)
         loss = huber_loss(z)
@@ -408,8 +390,7 @@ class Problem:
     def linearise(self, point: Point) -> Linear:
         """Return the Jacobians of the predicted measurements and of the ends of the swings."""
         rows, ends = np.zeros((len(point.residual), 3, SIZE + OWN)), np.zeros((len(point.defect), 6, SIZE + OWN))
-        # The derivatives with respect to states and gains, which need the unchanged scene, are computed first, because
-        # only the latest scene is cached.
+        # first the derivatives that need the unchanged scene, because only the latest scene is cached
         displaced = self.steps * _DISPLACED
         together = self._evaluate(point.shared, point.states + np.diag(displaced)[:, None])
         for j in range(6):
@@ -477,8 +458,7 @@ class Problem:
             change = moved[index] - point.shared[index]
             other = self.evaluate(moved, point.states) if abs(change) > 0.5 * step else None
             if other is not None:
-                # a residual is measured minus predicted, so the difference of two residuals is a change of the
-                # prediction
+                # residual: measured minus predicted
                 return np.nan_to_num((point.residual - other.residual) / change), (point.defect - other.defect) / change
         return np.zeros_like(point.residual), np.zeros_like(point.defect)
 
@@ -494,14 +474,12 @@ class Problem:
 
 def _by_state(point: Point, other: Point, index: int, moved: float) -> tuple[Array, Array]:
     ends = point.defect - other.defect
-    ends[:, index] += moved  # `other` displaces all swings, so this sum cancels the change of the next swing's start
+    ends[:, index] += moved  # `other` displaces the start of the next swing too
     return np.nan_to_num((point.residual - other.residual) / moved), ends / moved
 
 
 def link_weights(spans: Array, drift: Array) -> Array:
-    """Return the inverse covariance of pose and rate that white acceleration noise causes in each of s spans, (s, 6,
-    6).
-    """
+    """Return the inverse covariance, (s, 6, 6), of pose and rate due to white acceleration noise over s spans."""
     drift = np.maximum(drift, _LEAST_DRIFT)
     weights = np.zeros((len(spans), 6, 6))
     place = np.arange(3)
@@ -514,7 +492,7 @@ def link_weights(spans: Array, drift: Array) -> Array:
 def fit(
     problem: Problem, shared: Array, states: Array, noise: Array, iterations: int, enough: float = 0.3, seed: int = 0
 ) -> Fit | None:
-    """Return the fit that begins at given unknowns; None if the motion with these unknowns cannot be simulated.
+    """Return the fit from given unknowns; None if their motion cannot be simulated.
 
     Parameters
     ----------
@@ -565,13 +543,11 @@ def fit(
 
 
 def pieces(problem: Problem, point: Point, linear: Linear, variance: Array) -> Iterator[list[Piece]]:
-    """Yield for each swing the parts of the normal equations that its measurements and its link to the next swing
-    give.
-    """
+    """Yield for each swing the parts of the normal equations from its measurements and its link to the next swing."""
     z = np.abs(point.residual) / np.sqrt(variance)
     weight = np.nan_to_num(huber_weight(z) / variance) * np.isfinite(point.residual)
     weighted, residual = linear.rows * weight[:, :, None], np.nan_to_num(point.residual)
-    # the times rise, so the rows of a swing are consecutive
+    # the rows of a swing are consecutive
     used = np.flatnonzero(point.swing >= 0)
     edges = np.searchsorted(point.swing[used], np.arange(problem.window.swings + 1))
     for index, (low, high) in enumerate(pairwise(edges.tolist())):
@@ -606,7 +582,7 @@ def freed(swings: int, unknowns: int) -> float:
 
 
 def joint_step(problem: Problem, found: Fit, columns: Array, precision: Array, pull: Array) -> tuple[Array, Array]:
-    """Return the first two results of `whole_step`, which are the step and its covariance."""
+    """Return the step and the covariance of `whole_step`."""
     step, covariance, _ = whole_step(problem, found, columns, precision, pull)
     return step, covariance
 
@@ -614,8 +590,7 @@ def joint_step(problem: Problem, found: Fit, columns: Array, precision: Array, p
 def whole_step(
     problem: Problem, found: Fit, columns: Array, precision: Array, pull: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the linearised step of all unknowns except the starting states, its covariance, and the step of these
-    states.
+    """Return the linearised step of the unknowns, its covariance, and the step of the starting states.
 
     Parameters
     ----------
@@ -630,8 +605,7 @@ def whole_step(
     Returns
     -------
     tuple of ndarray, shapes (SIZE + k,), (SIZE + k, SIZE + k), (s, 6)
-        The starting states are eliminated from the equations. The step of a starting state is 0 in a swing with few
-        poses.
+        The step of a starting state is 0 in a swing with few poses.
     """
     size = SIZE + len(precision)
     normal = np.diag(np.concatenate([1.0 / problem.deviation**2, precision]))
@@ -686,9 +660,8 @@ def _descend(
 def unpredicted(problem: Problem, point: Point, jacobian: Array, seed: int, probes: int = 3) -> Array:
     """Return the variance of the motion that the linearisation does not predict, shape (n, 3).
 
-    Motions with small random displacements of the unknowns are simulated and compared with the prediction of the
-    Jacobian. The difference is small for a smooth motion. After several bounces at a hard contact, it is as large as
-    the motion.
+    Motions with small random displacements of the unknowns are compared with the prediction of the Jacobian. After
+    several bounces at a hard contact, the difference is as large as the motion.
     """
     rng = np.random.default_rng(seed)
     total, count = np.zeros_like(point.residual), np.zeros_like(point.residual)
