@@ -1,13 +1,12 @@
-"""Correction of a fit for the discrepancy between machine and model, which changes the values and widens the intervals.
+"""Correction of a fit for differences between machine and model, which changes the values and widens the intervals.
 
-No machine matches the model exactly. Three kinds of discrepancy are considered:
+Three kinds of differences are considered:
 
-- Further unknowns, each with a prior, are the inertia, the size of the frame, the friction, the exponent, differences
-  between the walls, and errors of the sensor. The further unknowns are estimated in one linearised step from the fit.
-  Bayesian variable selection samples which of the further unknowns differ from the scene. Without evidence of a
-  difference, an unknown has the value of the scene. An unknown that the motion does not determine widens the intervals.
-- The load is assumed to have a constant error in each swing, which is a part of the motion that begins in flight. The
-  size of the errors is estimated from all swings (empirical Bayes).
+- Further unknowns, each with a prior: inertia, size of the frame, friction, exponent, differences between the walls,
+  and errors of the sensor. They are estimated in one linearised step from the fit. Bayesian variable selection samples
+  which of them differ from the scene.
+- The load is assumed to have a constant error in each swing (a part of the motion that begins in flight). The size of
+  the errors is estimated from all swings (empirical Bayes).
 - The remaining residuals are treated as noise. The variance of the measurements is increased if the residuals are
   large, or if they stay correlated for long (tempered likelihood).
 
@@ -40,8 +39,7 @@ from plow_twin.model.scene import Friction, Scene
 
 Array = NDArray[np.float64]
 
-#: Step of the difference quotient for each quantity of a scene, by the path of the quantity. The steps are a fifth to a
-#: half of the prior deviations.
+#: Step of the difference quotient for each quantity of a scene: a fifth to a half of the prior deviation.
 STATED: Final = {
     "head.mass_kg": 0.02,
     "head.inertia_kg_m2": 0.02,
@@ -50,13 +48,12 @@ STATED: Final = {
     "contact.exponent": 0.02,
     "friction.coefficient": 0.01,
 }
-#: Steps of two difference quotients. The first step changes the relative stiffness of a wall. The second step is a
-#: constant load in units of half the load's range.
+#: Steps of the difference quotients with respect to the relative stiffness of a wall and to a constant load, in units
+#: of half the load's range.
 _WALL_STEP, _PUSH_STEP = 0.02, 5e-3
 #: Smallest error of the load in units of half the load's range, a guard against division by zero.
 _LEAST_PUSH = 1e-5
-#: Upper bounds on the number of iterations of expectation-maximisation in three series. The noise is tempered after
-#: each series.
+#: Upper bounds on the iterations of expectation-maximisation before each of three inflations of the noise.
 _ROUNDS = (8, 5, 3)
 #: Upper bound on the number of sweeps of the sampler, and number of initial sweeps that are discarded.
 _SWEEPS, _BURNT = 50, 10
@@ -71,13 +68,12 @@ class Graded:
     Attributes
     ----------
     shared, covariance : ndarray, shape (SIZE,), (SIZE, SIZE)
-        The unknowns of the whole window and their covariance. If the fit passes all checks, the machine is assumed to
-        differ from the scene only in the quantities of the fit.
+        The unknowns of the whole window and their covariance, for a machine that differs from the scene only in the
+        quantities of the fit if the fit passes all checks.
     clearance, clearance_deviation : ndarray, shape (2,)
         Clearances in m and their standard deviations, for a machine that may differ from the scene in any quantity.
     differs : dict of str to (float, float, float)
-        Three numbers for each further quantity: the probability of a difference from the scene, the mean of the
-        difference, and the standard deviation of the difference.
+        Probability, mean and standard deviation of the difference from the scene, for each further quantity.
     load : ndarray, shape (3,)
         Standard deviation of the load's error in a swing, in units of half the load's range.
     inflation : ndarray, shape (3,)
@@ -163,10 +159,9 @@ class _Column:
 
 
 def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
-    """Return the further quantities, and the derivatives of the predicted measurements with respect to a constant load,
-    (n, 3, 3).
+    """Return the further quantities, and the derivatives, (n, 3, 3), of the measurements with respect to a load.
 
-    A quantity is left out if its prior deviation is zero, or if the motion with its changed value cannot be simulated.
+    A quantity without a prior deviation, or whose change leads to a failed simulation, is left out.
     """
     point = found.point
 
@@ -184,7 +179,7 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
             out[path] = _Column(deviation, column)
     sides = [out[path].derivative for path in ("frame.width_m", "frame.height_m") if path in out]
     if len(sides) == 2 and scene.frame.corner_radius_m is None:
-        # at small angles a rounded corner acts like sides that are shorter by twice its radius
+        # at small angles, a radius has the effect of sides that are shorter by twice the radius
         out["corner_radius"] = _Column(ROUNDING, -2.0 * (sides[0] + sides[1]))
     for wall, pads in zip(("left", "right", "top", "bottom"), WALLS, strict=True):
         share, name, step = np.ones(PAIR_COUNT), f"stiffness_{wall}", problem.steps * _WALL_STEP
@@ -219,17 +214,14 @@ def _of_sensor(problem: Problem, point: Point) -> Iterator[tuple[str, Array]]:
 
 
 def variants(scene: Scene) -> tuple[Scene, ...]:
-    """Return the scene with a different exponent and the scene with friction, because both need separately compiled
-    kernels.
-    """
+    """Return the scenes with a different exponent and with friction, which need kernels of their own."""
     return tuple(_moved(scene, path, STATED[path], 1.0) for path in ("contact.exponent", "friction.coefficient"))
 
 
 def _moved(scene: Scene, path: str, step: float, depth: float) -> Scene:
-    """Return the scene with the number at `path` changed by `step`, which is a relative step for mass and inertia.
+    """Return the scene with the number at `path` changed by `step`, which is relative for mass and inertia.
 
-    With a change of the exponent, the stiffness is adjusted so that the force at the penetration `depth` in m does not
-    change.
+    A change of the exponent does not change the force at the penetration `depth` in m.
     """
     part, name = path.split(".")
     if part == "friction":
@@ -248,7 +240,7 @@ class _Linearised:
     """The least-squares problem, linearised at a fit.
 
     The border of the normal equations consists of the unknowns of the whole window and of the further unknowns. Each
-    swing has unknowns of its own, which are the starting state and the error of the load.
+    swing has its own starting state and error of the load.
 
     inflation : (3,) factor on the variance of each component
     load : (3,) standard deviation of the load's error in a swing
@@ -256,14 +248,13 @@ class _Linearised:
 
     def __init__(self, problem: Problem, found: Fit, columns: dict[str, _Column], pushes: Array) -> None:
         every, waves = columns.values(), 0 if problem.harmonics is None else problem.harmonics.amplitude.size
-        # `names` are the names of the further quantities except the harmonics, which are last in the border, at the
-        # slice `waves`
+        # the harmonics are the last further quantities, in the slice `waves` of the border
         self.names = list(columns)[: len(columns) - waves]
         self.waves = slice(SIZE + len(self.names), SIZE + len(columns))
         self._found, self._swing = found, found.point.swing
         further = np.stack([one.derivative for one in every], axis=2)
         self._precision = np.concatenate([problem.deviation, [one.deviation for one in every]]) ** -2.0
-        # `_held` marks the further quantities that the fit includes, with the values `_value`, shape (k,) each
+        # values of the further quantities, and whether the fit includes them, shape (k,) each
         self._value = np.array([one.value or 0.0 for one in every])
         self._held = np.array([one.value is not None for one in every])
         self._pull = np.concatenate([problem.mean - found.shared, -self._value]) * self._precision
@@ -348,8 +339,7 @@ class _Linearised:
         return mean, covariance
 
     def averaged(self, rng: np.random.Generator, prior: float) -> tuple[Array, Array, Array]:
-        """Return the mean of the samples, the covariance of the samples, and the share of samples in which each
-        quantity differs.
+        """Return mean and covariance of the samples, and the share of samples in which each quantity differs.
 
         `prior` is the prior probability of a difference. A quantity that the fit includes differs in all samples.
         """
@@ -357,7 +347,7 @@ class _Linearised:
         known: dict[bytes, float] = {}
 
         def evidence(which: NDArray[np.bool_]) -> float:
-            key = which.tobytes()  # cached, because the sampler visits most sets several times
+            key = which.tobytes()  # the sampler visits most sets several times
             if key not in known:
                 use = np.append(np.arange(SIZE), SIZE + np.flatnonzero(which))
                 lower = np.linalg.cholesky(self._normal[np.ix_(use, use)])
@@ -396,13 +386,9 @@ class _Linearised:
         return freed(count, len(moving)) * float(ratio[moving].mean())
 
     def surprise(self, mean: Array, often: Array) -> float:
-        """Return the mean square of the differences in units of their prior deviations, at least 1.
-
-        The linearisation is inaccurate if the result exceeds 1.
-        """
+        """Return `Graded.surprise`. The linearisation is inaccurate if the result exceeds 1."""
         own = len(self.names)
         z, often = ((self._value + mean[SIZE:]) * np.sqrt(self._precision[SIZE:]))[:own], often[:own]
-        # the weight of a quantity is the share of samples in which it differs from the scene
         return max(1.0, float((z**2 / np.maximum(often, 0.1)).sum() / max(often.sum(), 1.0)))
 
     def named(self, mean: Array, often: Array) -> dict[str, tuple[float, float, float]]:
@@ -414,9 +400,7 @@ class _Linearised:
 
 
 def _lasting(left: Array, swing: NDArray[np.int64], square: float) -> float:
-    """Return the correlation length of residuals in rows, which is the sum over all lags of the correlations of the
-    residuals.
-    """
+    """Return the correlation length of residuals in rows, the sum of their correlations over all lags."""
     rows = 1.0
     for lag in range(1, _LONGEST_LAG):
         one, other = left[:-lag], left[lag:]
