@@ -1,16 +1,13 @@
-"""The follower, which is an ensemble of twins that measured poses and estimates keep close to one machine.
+"""The follower, an ensemble of twins that measured poses and estimates keep close to one machine.
 
-The twins, called members, differ in clearances, contact parameters and load gains. The parameters are drawn from the
-prior at the start, and from each valid estimate as soon as the estimate is finished. Newly drawn members start at the
-poses of the previous members. The module `members` contains the members and the Kalman filter by which measured poses
-move the members.
+The twins (members) differ in clearances, contact parameters and load gains. These parameters are drawn from the prior
+at the start, and anew from each valid estimate. Newly drawn members start at the poses of the previous members. The
+module `members` contains the Kalman filter by which measured poses move the members.
 
 The first member, the median twin, has the median of each parameter and no random noise, so its motion obeys the
-equations of motion. Before the first estimate, the median twin is the nominal twin, and no pose moves it. If poses
-moved the nominal twin and the machine had larger clearances, the poses would press the nominal twin against its walls
-and falsify its forces. Until the first estimate, the poses move the second member, which is a copy of the first member.
-When the first estimate is finished, the median twin is drawn from the estimate and starts at the pose of the second
-member.
+equations of motion. Before the first estimate, the median twin is the nominal twin, and poses move its copy, the second
+member: if the machine had larger clearances, they would press the nominal twin against its walls and falsify its
+forces.
 """
 
 from __future__ import annotations
@@ -51,22 +48,17 @@ Rows = NDArray[np.void]
 
 #: Default number of members, by definition.
 MEMBERS: Final = 128
-#: Lower bound on the time in s between two poses that are used. A pose after a shorter time contributes little
-#: information, but causes the same computing time as any pose.
+#: Lower bound on the time in s between two poses that are used. More poses add little information.
 APART_S: Final = 4e-3
 #: Lower and upper bound on the number of poses from which the noise is computed.
 _NOISE_ROWS: Final = (20, 400)
-#: Upper bound on the number of samples in one call. With this bound, the rows of all members fit into the processor's
-#: cache.
+#: Upper bound on the number of samples in one call, so that the rows of all members fit into the processor's cache.
 _CALL: Final = 20
-#: Rate in 1/s at which the clearances are computed. By definition, it equals the rate at which the clearances are
-#: published.
+#: Rate in 1/s at which the clearances are computed, by definition the rate at which they are published.
 _KNOWN_HZ: Final = 10.0
-#: Upper bound on the number of poses that wait until the model reaches their stamps. A session stores the same number
-#: of poses.
+#: Upper bound on the number of poses that wait until the model reaches their stamps.
 _MOST_DUE: Final = MOST_MEASURED
-#: Constant arrays. By definition, `_YES` and `_NO` are masks of a single row with intervals and without intervals. The
-#: remaining arrays stand for no digests and for clearances that do not change.
+#: Constant arrays by definition: masks of a single row with and without intervals, no digests, unchanged clearances.
 _YES: Final = np.ones(1, bool)
 _NO: Final = np.zeros(1, bool)
 _NO_DIGESTS: Final = np.zeros(0, np.int64)
@@ -99,11 +91,10 @@ class Span:
 
 
 class _Behind(NamedTuple):
-    """Samples that the first member has processed but the remaining members have not, with the rows of the first
-    member.
+    """Samples that only the first member has processed, with its rows.
 
-    `wanted` marks the rows for which intervals are computed. `ends` marks the rows at which a span of peaks and
-    impulses ends. `begins` states whether a span begins with the first row.
+    `wanted` marks the rows for which intervals are computed, and `ends` the last rows of spans of peaks and impulses.
+    `begins` states whether a span begins with the first row.
     """
 
     t: Array
@@ -124,8 +115,7 @@ class Follower:
     scene : Scene
         The nominal scene.
     members : int
-        Number of twins, either 1 or at least 20. A single twin adopts the parameters of estimates, but poses do not
-        move it, and its forces have no intervals.
+        Number of twins, either 1 or at least 20. Poses do not move a single twin, and its forces have no intervals.
     tol : float
         Tolerance of the solver, as for `Twin`.
     start : float
@@ -153,9 +143,9 @@ class Follower:
         self._members, self._seed = members, seed
         self._prior = prior(scene)
         self._speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
-        #: number of poses and estimates added so far, used or not
+        #: number of poses and estimates added so far
         self.added = 0
-        #: whether intervals of the forces are computed for each row instead of only for published rows
+        #: whether intervals of the forces are computed for each row, not only for published rows
         self.every_row = False
         #: whether a single published row is returned before `catch_up` advances all members except the first
         self.defers = False
@@ -165,8 +155,7 @@ class Follower:
         self._ends, self._begins = _NO_DIGESTS, False
         self._span_start = start
         self._wrench = np.zeros(3)
-        #: numbers of poses, in three groups: poses that have moved the members, outliers, and poses dropped from a full
-        #: queue
+        #: numbers of poses that have moved the members, of outliers, and of poses dropped from a full queue
         self.poses_used = self.poses_outlying = self.poses_dropped = 0
         #: number of times that members were drawn, and model time in s of the latest draw from an estimate
         self.drawn, self._since = 0, start
@@ -174,8 +163,7 @@ class Follower:
         self._forget()
 
     def _forget(self) -> None:
-        #: queue of poses and estimates in order of time: time in s, sequence number, and the pose or the estimate
-        #: (JSON)
+        #: poses and estimates in order of time: time in s, sequence number, and the pose or the estimate (JSON)
         self._due: list[tuple[float, int, list[float] | str]] = []
         #: times of recently used poses
         self._used: deque[float] = deque()
@@ -187,12 +175,12 @@ class Follower:
 
     def _draw(self, text: str, time: float, worn: Array) -> None:
         self._text = text
-        #: the estimate that the members follow; None while the members follow the prior
+        #: the estimate that the members follow; None for the prior
         self.estimate = Estimate.from_dict(json.loads(text)) if text else None
         self._load_share = _load_share(text)
         self._known = self._prior if self.estimate is None else _whole(self.estimate, self._prior)
         rng = np.random.default_rng([self._seed, self.drawn])
-        # under an uncertain load, parameters are not corrected, because errors of the load would distort them
+        # errors of an uncertain load would distort learned parameters
         learns = not self._load_share.any()
         self._ensemble = Ensemble(self.scene, self._known, self._members, rng, time, self.tol, worn, learns)
         self._ensemble.set_travel_speed(self._speed)
@@ -248,7 +236,7 @@ class Follower:
         return self._ensemble.first.failure(status)
 
     def like(self, scene: Scene) -> Follower:
-        """Return a follower of the scene `scene` with the settings and the counters of this follower."""
+        """Return a follower of a scene with the settings and the counters of this follower."""
         found = Follower(scene, self._members, tol=self.tol, seed=self._seed)
         found.every_row, found.defers = self.every_row, self.defers
         found.poses_used, found.poses_outlying = self.poses_used, self.poses_outlying
@@ -286,11 +274,9 @@ class Follower:
     def advance_rows(
         self, t: Array, wrench: Array, rows: Rows | None, digest_after: NDArray[np.int64] = _NO_DIGESTS
     ) -> Advanced:
-        """Advance to given times, as `Twin.advance_rows` does. Each row depends on all measurements that were taken
-        before its time.
+        """Advance to given times, as `Twin.advance_rows` does. Each row depends on all measurements before its time.
 
-        If `defers` is set, a row that is published alone is returned before the second and all further members are
-        advanced. The method `catch_up` advances these members.
+        If `defers` is set, a row that is published alone is returned before `catch_up` advances the further members.
         """
         self.catch_up()
         if wrench.shape != (len(t), 3) or not np.isfinite(wrench).all():
@@ -324,9 +310,7 @@ class Follower:
     def _advance_first(
         self, t: Array, wrench: Array, rows: Rows, wanted: NDArray[np.bool_], ends: NDArray[np.bool_]
     ) -> int:
-        """Advance only the median twin and return the number of failed advances; `catch_up` advances the remaining
-        members.
-        """
+        """Advance only the median twin, and return the number of failed advances."""
         failed = self._ensemble.advance_first(t, wrench, rows)
         known = self._clearance.ravel()
         rows["known_clearance"] = known if self.scene.wear is None else known + self._moved(rows["wear_depth"])
@@ -411,9 +395,7 @@ class Follower:
         return hashlib.blake2b(b"".join(state), digest_size=8).hexdigest()
 
     def snapshot(self) -> bytes:
-        """Return the exact state as bytes, which a follower with the same scene, number of members and seed can
-        restore.
-        """
+        """Return the exact state as bytes for a follower with the same scene, number of members and seed."""
         self.catch_up()
         blobs, random = self._ensemble.state()
         noise = np.array(self._noise_rows).reshape(-1, 3)
@@ -461,19 +443,17 @@ class Follower:
     def add_pose(self, t: float, q: ArrayLike, known: float = -math.inf) -> None:
         """Add a pose `q`, shape (3,), that was measured at time `t` in s; a component that was not measured is NaN.
 
-        The pose is used when the model reaches both `t` and the time `known` in s. A pose that is late by at most
-        `LATEST_S` is used at once.
+        The pose is used when the model reaches both `t` and the time `known` in s, or at once if it is late by at most
+        `LATEST_S`.
         """
         self._add(max(t, known), [t, *np.asarray(q, dtype=np.float64).tolist()])
 
     def add_estimate(self, text: str, t: float, start: float = 0.0) -> None:
-        """Add an estimate, the JSON of `Estimate.as_dict`, that takes effect at time `t` in s.
+        """Add an estimate, the JSON of `Estimate.as_dict`, with a window from `start` [s], for use from time `t` [s].
 
-        The window of the estimate begins at time `start` in s.
-
-        The members follow an estimate that contains both clearances. Members that follow the prior also accept an
-        estimate with one clearance. An estimate does not replace an estimate from nearly the same motion that has fewer
-        rough clearances. After a withdrawn estimate, the members follow the prior.
+        The members follow an estimate that contains both clearances or, after the prior, one clearance. An estimate
+        does not replace an estimate from nearly the same motion that has fewer rough clearances. After a withdrawn
+        estimate, the members follow the prior.
         """
         self._add(t, _harmonics_from(text, start))
 
@@ -510,14 +490,13 @@ class Follower:
 
     @property
     def known(self) -> str:
-        """The followed estimate (JSON); empty while the twin follows the prior."""
+        """The followed estimate (JSON); empty for the prior."""
         return self._text
 
     def follow_estimate(self, known: str) -> None:
-        """Follow the estimate `known` (JSON), which is the property `known` of a different follower.
+        """Follow the estimate `known` (JSON) of another follower, without the harmonics of the load.
 
-        The model times of the two followers may have different origins. The phases of the load's harmonics are unknown
-        in this case, so the harmonics are dropped.
+        The phases of the harmonics are unknown, because the origins of the followers' times may differ.
         """
         known = _harmonics_from(known, None)
         if known != self._text:
@@ -556,16 +535,12 @@ class Follower:
             self._noise_rows.append(q)
 
     def _load_error(self) -> Array:
-        """Return the standard deviation of the load's error in N, N, N m, shape (3,). It is zero unless the estimate is
-        rough.
-        """
+        """Return the standard deviation of the load's error in N, N, N m, shape (3,)."""
         found: Array = tuning.LOAD_ERROR_SHARE * self._load_share * 0.5 * (self._range[1] - self._range[0])
         return found
 
     def _sensor(self) -> tuple[Array | None, float]:
-        """Return the noise of the sensor in m, m, rad, and its delay in s. The noise is None if too few poses have been
-        used.
-        """
+        """Return the noise of the sensor in m, m, rad (None after too few poses), and its delay in s."""
         found = self.estimate
         noise: Array | None = None
         if found is not None and found.noise is not None:
@@ -588,8 +563,7 @@ class Follower:
     def span(self) -> Span:
         """Return peaks and impulses since the previous call.
 
-        The result is valid only if no row has been published since the previous call, because a published row ends the
-        span.
+        A published row ends the span, so the result is valid only if no row has been published since then.
         """
         self.catch_up()
         start, self._span_start = self._span_start, self.time
@@ -598,9 +572,7 @@ class Follower:
         return found
 
     def held(self, t: float) -> Rows:
-        """Return the row, shape (1,), that the constant load of the newest sample gives at `t`; the state does not
-        change.
-        """
+        """Return the row, shape (1,), at `t` under the load of the newest sample, without a change of the state."""
         self.catch_up()
         rows = np.zeros(1, ROW)
         self._ensemble.held(t, rows)
@@ -609,18 +581,12 @@ class Follower:
 
 
 def follower(scene: Scene, follow: str, members: int, tol: float) -> Follower:
-    """Return a follower of a scene.
-
-    If `follow` is `full`, the follower has `members` twins, and poses move them. If `follow` is `parameters`, it has a
-    single twin.
-    """
+    """Return a follower with `members` twins if `follow` is `full`, and with a single twin if it is `parameters`."""
     return Follower(scene, members) if follow == "full" else Follower(scene, 1, tol=tol)
 
 
 def _harmonics_from(text: str, start: float | None) -> str:
-    """Return an estimate (JSON) with the phases of the load's harmonics counted from `start` [s]; None removes the
-    harmonics.
-    """
+    """Return an estimate (JSON) with harmonics whose phases count from `start` [s], or without harmonics for None."""
     if _HARMONICS not in text:
         return text
     found = json.loads(text)
@@ -632,10 +598,7 @@ def _harmonics_from(text: str, start: float | None) -> str:
 
 
 def _load_share(text: str) -> Array:
-    """Return the error of the load that a rough estimate (JSON) states, in units of half the load's range, shape (3,).
-
-    The result is zero for other estimates.
-    """
+    """Return a rough estimate's (JSON) error of the load in units of half the load's range, shape (3,), or zero."""
     found = json.loads(text) if text else {}
     rough = State.ROUGH.value in [found.get(axis, {}).get("state") for axis in ("horizontal", "vertical")]
     figures = found.get("figures", {}) if rough else {}
@@ -649,7 +612,7 @@ def _facts(data: bytes) -> tuple[dict[str, Any], int]:
 
 
 def prior(scene: Scene) -> Estimate:
-    """Return the prior of a scene as an estimate, including the damping and the gains of the load."""
+    """Return the prior of a scene as an estimate."""
     units = Units.of(scene, _NO_LOAD)
     unknowns = Unknowns.stated(units.scene(scene), _NO_LOAD, _NO_POSES)
     normal = [Interval.normal(*pair) for pair in zip(unknowns.nominal(), unknowns.deviations(), strict=True)]

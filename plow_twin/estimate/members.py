@@ -1,13 +1,11 @@
-"""The members of a follower. They are twins that are drawn from a prior or an estimate and moved by an ensemble Kalman
-filter.
+"""The twins (members) of a follower, drawn from a prior or an estimate and moved by an ensemble Kalman filter.
 
 The filter uses perturbed observations (Burgers et al., Mon. Weather Rev. 126 (1998) 1719). A late pose corrects the
-present state through the covariance between past and present states. With a hard contact, even a correction of a tenth
-of a millimetre can cause a false impact. A correction is therefore skipped if it would press a member against a wall
-with more than half of the head's weight.
+present state through the covariance between past and present states. With a hard contact, a correction of a tenth of a
+millimetre can cause a false impact, so a correction is skipped if it would press a member against a wall with more than
+half of the head's weight.
 
-Parameters that an estimate hardly determines are estimated from the poses (module `learned`). At each pose, some
-members adopt the present estimates of these parameters.
+Parameters that an estimate hardly determines are learned from the poses (module `learned`).
 """
 
 from __future__ import annotations
@@ -38,17 +36,14 @@ from plow_twin.stream.outputs import clearances
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 
-#: Upper bound on the age in s of a pose that is used. The age includes the delay of the sensor. The motion is stored
-#: for the same time.
+#: Upper bound on the age in s of a pose that is used, including the delay of the sensor.
 LATEST_S: Final = 0.25
 #: Lower bound on the interval in s between stored states of the motion.
 _PATH_S: Final = 2e-3
-#: Upper bound on the number of consecutive outliers that are ignored. If there are more, the head has really moved.
+#: Upper bound on the number of consecutive outliers that are ignored. After more outliers, the head has really moved.
 _MOST_OUTLYING: Final = 5
-#: Lower bound on the number of members that adopt parameters together. Fewer members would be inefficient, because the
-#: fixed cost of a call equals the cost of three members.
+#: Lower bound on the number of members that adopt parameters in one call, which costs as much as three members.
 _AT_ONCE: Final = 8
-#: Slice that selects all members.
 _ALL: Final = slice(None)
 _THETA: Final = DOF_NAMES.index("theta")
 #: Indices of cos(theta), sin(theta), X and Y in the state of the solver, derived from its layout.
@@ -63,7 +58,7 @@ class Ensemble:
     scene : Scene
         The nominal scene.
     known : Estimate
-        The prior, with the clearances of unworn pads, or an estimate, with the present clearances.
+        The prior with the clearances of unworn pads, or an estimate with the present clearances.
     members : int
         Number of twins.
     rng : numpy.random.Generator
@@ -84,34 +79,29 @@ class Ensemble:
     ) -> None:  # fmt: skip
         scenes, gain = draw_scenes(scene, known, members, rng) if members > 1 else ([scene], np.ones((1, 3)))
         scenes[0], gain[0] = middle_of(scene, known)
-        #: Whether poses move the first member. If the members are drawn from an estimate, poses move the first member.
-        #: If they are drawn from the prior, poses move the second member, which is a copy of the first member.
+        #: whether poses move the first member; under the prior, they move the second member, a copy of the first member
         self._steers_first = known.horizontal_state is not State.PRIOR
         if not self._steers_first and members > 1:
             scenes[1], gain[1] = scenes[0], gain[0]
-        #: wear depths of the pads at the start, and part of the estimated clearances that is due to this wear, shape
-        #: (2, 1)
+        #: wear depths of the pads at the start, and their part of the estimated clearances, shape (2, 1)
         self.worn_before, self.moved_before = worn, np.zeros((2, 1))
         if scene.wear is not None:
             states = (known.horizontal_state, known.vertical_state)
             self.moved_before = np.where([[state.known] for state in states], widening(scene, worn)[:, None], 0.0)
             scenes = [_worn(one, scene, worn, self.moved_before[:, 0]) for one in scenes]
-        #: the first member is advanced separately, so that its forces are available before all further members are
-        #: advanced
+        #: the first member, which is advanced alone so that its forces are available first
         self.first = Twin(scenes[0], tol=tol, excitation="sampled", start=start)
         self.others = TwinBatch(scenes[1:], tol=tol, start=start) if members > 1 else None
         self._scene, self._gain, self._rng, self._speed = scene, gain, rng, 0.0
         self._numbers = numbers_of(scenes, gain, draw_biases(known, members, rng))
-        # `_turn` is the index of the next member that adopts learned parameters, and `_waiting` is the number of
-        # members that are due
+        # index of the next member that adopts learned parameters, and number of members that are due
         learns = learns and self._steers_first and members > 1
         self._learner = Learner.of(self._numbers.copy(), start) if learns else None
         self._turn, self._waiting = 0, 0.0
-        # harmonics that are missing from the measured load, and the amplitudes of each member in N, N, N m, shape (m,
-        # k, 3)
+        # harmonics that the measured load lacks, and their amplitudes of each member in N, N, N m, shape (m, k, 3)
         self._harmonics = known.load_harmonics
         self._amplitude = amplitudes_of(known, members, rng)
-        # load error of each member in N, N, N m, and time in s up to which the load errors have been advanced
+        # load error of each member in N, N, N m, and its time in s
         self._load_off, self._drifted = np.zeros((members, 3)), start
         self._walls = np.stack([penetration_rows(one) for one in scenes])
         self._clearance = np.array([[one.clearance.horizontal_m, one.clearance.vertical_m] for one in scenes])
@@ -119,7 +109,7 @@ class Ensemble:
         self._stiffness, self._exponent = np.array([one.contact.stiffness for one in scenes]), scene.contact.exponent
         self._pressed = tuning.PRESSED * scene.head.mass_kg * Gravity().acceleration_m_s2
         self.good = np.ones(members, dtype=bool)
-        #: force, peak and impulse of each pair of each member; peak and impulse count from the beginning of the span
+        #: force, and peak and impulse of the span, of each pair of each member
         self._sums = np.zeros((members, 3, PAIR_COUNT))
         self._peak, self._impulse = self._sums[:, 1], self._sums[:, 2]
         #: sum of the squared normalised innovations of each member
@@ -146,7 +136,7 @@ class Ensemble:
         return self._path[-1][1]
 
     def set_travel_speed(self, speed_m_s: float) -> None:
-        """Set the travel speed along the face, limited for each member to the speed that its wear and contact allow."""
+        """Set the travel speed along the face, up to the limit of each member's wear and contact."""
         self._speed = speed_m_s
         speeds = np.minimum(speed_m_s, self._fastest)
         self.first.set_travel_speed(float(speeds[0]))
@@ -159,7 +149,7 @@ class Ensemble:
         return found
 
     def advance_first(self, t: Array, wrench: Array, rows: Rows) -> int:
-        """Advance the first member and write its rows, shape (n,); return the number of failed advances."""
+        """Advance the first member, write its rows, shape (n,), and return the number of failed advances."""
         failed, _ = self.first.advance_rows(t, self._loads(t, wrench, slice(1))[0], rows)
         rows["followed"] = FOLLOWED
         return failed
@@ -169,8 +159,7 @@ class Ensemble:
     ) -> None:
         """Advance all further members to the time of the first member, and add intervals to the first member's rows.
 
-        `wanted` marks the rows that receive intervals. `ends` marks the rows at which a span of peaks and impulses
-        ends.
+        `wanted` marks the rows that receive intervals, and `ends` the last rows of spans.
         """
         parts = [_bytes(rows[None])]
         if self.others is not None:
@@ -192,9 +181,7 @@ class Ensemble:
         self._newest = whole[:, -1]
 
     def settle(self) -> None:
-        """Copy rates, wear and penetration from the newest rows. The caller must do so before it uses the copied
-        values.
-        """
+        """Copy rates, wear and penetration from the newest rows, before they are used."""
         rows, self._newest = self._newest, None
         if rows is not None:
             self._v, self.worn, self._depth = rows["v"].copy(), rows["wear_depth"].copy(), rows["penetration"].copy()
@@ -229,16 +216,11 @@ class Ensemble:
         self._peak[:], self._impulse[:] = 0.0, 0.0
 
     def span(self) -> tuple[Array, Array]:
-        """Return peaks and impulses of the span, shape (3, 8) each. The rows contain the value of the first member, the
-        5 % quantile and the 95 % quantile.
-        """
+        """Return peaks and impulses of the span, shape (3, 8) each: first member, 5 % and 95 % quantiles."""
         return np.stack(self._points(self._peak)), np.stack(self._points(self._impulse))
 
     def _points(self, values: Array) -> tuple[Array, Array, Array]:
-        """Return the values of the first member, and the 5 % and 95 % quantiles over the members in range.
-
-        The quantiles are widened, where necessary, to include the value of the first member.
-        """
+        """Return the values of the first member, and the 5 % and 95 % quantiles, widened to include these values."""
         low, _, high = quantiles(values if self.good.all() else values[self._used()])
         return values[0].copy(), np.minimum(low, values[0]), np.maximum(high, values[0])
 
@@ -248,8 +230,7 @@ class Ensemble:
     def clearance(self) -> Array:
         """Return the clearances of unworn pads in m, shape (2, 3): value, 5 % and 95 % quantile.
 
-        Members are weighted by the likelihood of the measured poses. The likelihood is tempered until enough members
-        have a significant weight.
+        Members are weighted by the likelihood of the measured poses, tempered until enough members have a weight.
         """
         use = self._used()
         excess = np.clip(self.square - self.square[use].min(), 0.0, 1e9)
@@ -270,10 +251,9 @@ class Ensemble:
     def stand_like(self, before: Ensemble, wrench: Array) -> None:
         """Start from the state of the members `before`, under the load `wrench`.
 
-        The poses are scaled to the clearances. Peaks and impulses are copied. Measured poses move the second member of
-        an ensemble that was drawn from a prior, but the first member of an ensemble that was drawn from an estimate. If
-        an estimate replaces a prior, the new first member therefore starts at the pose of the old second member. If a
-        prior replaces an estimate, the new second member starts at the pose of the old first member.
+        The poses are scaled to the clearances. Measured poses move the second member under a prior, and the first
+        member under an estimate. If an estimate replaces a prior, the new first member therefore starts at the pose of
+        the old second member, and vice versa.
         """
         before.settle()
         from_ = np.where(before.good, np.arange(len(before.good)), int(np.argmax(before.good)))[: len(self.good)]
@@ -294,32 +274,26 @@ class Ensemble:
             self._learner.take_over(before._learner)
             self._take_numbers(np.arange(len(self.good)))
         elif self.others is None and before._learner is not None:
-            # the estimate has not changed, so the single twin continues with the parameters of the first member
+            # a single twin continues with the parameters of the first member
             self._set_numbers(np.zeros(1, np.int64), before._numbers[:1])
 
     def stand_about(self, q: Array, v: Array) -> None:
-        """Move the first member to the pose `q`. Move each further member to the pose scaled to its clearances."""
+        """Move each member to the pose `q`, scaled to its clearances."""
         places = q * self._shares(np.broadcast_to(self._room()[0], (len(self.good), 3)))
         force = self._force(self._penetration(places))[:1]
         self._stand(places, np.tile(v, (len(places), 1)), np.tile(force, (len(places), 1)))
 
     def _room(self) -> Array:
-        """Return the scale in m of a member's motion in x, y and theta, shape (m, 3), or 1 for a locked direction.
-
-        The scales are the horizontal clearance for x, the vertical clearance for y, and the smaller clearance for
-        theta.
-        """
+        """Return horizontal, vertical and smaller clearance in m, shape (m, 3), but 1 for a locked direction."""
         room = np.column_stack([self._clearance, self._clearance.min(axis=1)])
         return np.where(self._free, room, 1.0)
 
     def _shares(self, room: Array) -> Array:
-        """Return the result of `_room` divided by the scale `room` of other members, shape (m, 3)."""
+        """Return the scales of `_room` divided by those of other members, shape (m, 3)."""
         return np.divide(self._room(), room, out=np.ones_like(room), where=room > 0.0)
 
     def _stand(self, q: Array, v: Array, force: Array, which: NDArray[np.int64] | None = None) -> None:
-        """Move members toward the poses `q`, but only so far that no pair bears much more than `force` [N], shape (m,
-        8).
-        """
+        """Move members toward the poses `q` until a pair would bear much more than `force` [N], shape (m, 8)."""
         which = np.arange(len(q)) if which is None else which
         q, v, force = q[which], v[which], force[which]
         low, high = np.zeros(len(q)), np.ones(len(q))
@@ -338,9 +312,8 @@ class Ensemble:
     def correct(self, t: float, q: Array, noise: Array, load_error: Array) -> bool:
         """Correct the members with a pose that was measured at time `t`, and return whether the pose was used.
 
-        The correction is a step of the ensemble Kalman filter. The errors of the members' loads are corrected in the
-        same step. Their standard deviation in N, N, N m is `load_error`, shape (3,). A pose that is too late is not
-        used. An outlier is used only after several consecutive outliers.
+        The errors of the members' loads, with the standard deviation `load_error` in N, N, N m, shape (3,), are
+        corrected too. A late pose is not used; an outlier is used only after several consecutive outliers.
         """
         self.settle()
         there = np.flatnonzero(np.isfinite(q) & self._free)
@@ -350,7 +323,7 @@ class Ensemble:
         after = min(bisect_left(times, t), len(times) - 1)
         path = np.stack([self._path[index][1] for index in range(after - 1, len(times))])
         share = min((t - times[after - 1]) / (times[after] - times[after - 1]), 1.0)
-        # measured pose that the sensor of each member would have given
+        # pose that the sensor of each member would have measured
         then = ((1.0 - share) * path[0] + share * path[1] + biases_of(self._numbers))[:, there]
         since = self.first.time - self._drifted
         self._drift(load_error)
@@ -373,7 +346,7 @@ class Ensemble:
         if self._learner is not None:
             self._learner.add(self._numbers[use], seen[use], center, noise[there])
         off = _off(q, then, there)
-        # the innovation is clipped, so that a single wrong pose has a limited influence
+        # limited influence of a single wrong pose
         most = tuning.OUTLYING * noise[there]
         self.square += ((off.clip(-most, most) / noise[there]) ** 2).sum(axis=1)
         weight = np.linalg.solve(scatter, seen[use].T @ about[use] / freedom)
@@ -403,8 +376,8 @@ class Ensemble:
     def _learn(self, since: float) -> None:
         """Update the learned parameters every `tuning.LEARNED_EACH` s, and let members adopt the parameters.
 
-        The first member adopts the parameters at once. All further members adopt them one after another, each about
-        once in `LEARNED_EACH` s. `since` is the time in s since the previous pose.
+        The first member adopts them at once, all further members one after another. `since` is the time in s since the
+        previous pose.
         """
         learner, count = self._learner, len(self.good) - 1
         if learner is None:
@@ -425,11 +398,9 @@ class Ensemble:
         self._set_numbers(which, self._learner.numbers(which))
 
     def _set_numbers(self, which: NDArray[np.int64], numbers: Array) -> None:
-        """Set the parameters of the members with the ascending indices `which`, and scale their poses to the new
-        clearances.
+        """Set the parameters of the members `which` (ascending), and scale their poses to the new clearances.
 
-        The parameters of a member do not change if the new values need a different kernel, as an overdamped contact
-        does.
+        A member keeps its parameters if the new values need a different kernel, as an overdamped contact does.
         """
         now = [self.first.scene, *(() if self.others is None else self.others.scenes)]
         changed = [with_numbers(now[place], own) for place, own in zip(which.tolist(), numbers, strict=True)]
@@ -473,10 +444,7 @@ class Ensemble:
         return found
 
     def _allowed(self, q: Array, force: Array, which: NDArray[np.int64] | slice = _ALL) -> NDArray[np.bool_]:
-        """Return the mask of the members that may be moved to poses `q`, (m, 3).
-
-        A member may be moved if no pair bears much more than `force`, shape (m, 8), in N.
-        """
+        """Return whether no pair of a member at the poses `q`, (m, 3), bears much more than `force` [N], (m, 8)."""
         there = self._force(self._penetration(q, which), which)
         return np.asarray((there < force + self._pressed).all(axis=1))
 
@@ -497,7 +465,7 @@ class Ensemble:
         return found
 
     def twins(self) -> list[bytes]:
-        """Return two byte strings: the exact state of the first twin, and the exact states of all further twins."""
+        """Return the exact states of the first twin and of all further twins."""
         return [self.first.snapshot(), b"" if self.others is None else self.others.snapshot()]
 
     def set_twins(self, states: Sequence[bytes]) -> None:
@@ -513,7 +481,7 @@ class Ensemble:
         return self._numbers, np.concatenate([[self._turn, self._waiting], self._learner.state()])
 
     def state(self) -> tuple[list[bytes], Any]:
-        """Return the whole state: arrays as bytes, and the state of the random generator as JSON values."""
+        """Return the whole state: arrays as bytes, and the random generator as JSON values."""
         self.settle()
         times, path = np.array([time for time, _ in self._path]), np.stack([q for _, q in self._path])
         wide = (self._peak, self._impulse, self._v, self.worn, self._depth, self._load_off)
@@ -548,9 +516,7 @@ def _bytes(rows: Rows) -> NDArray[np.uint8]:
 
 
 def _off(q: Array, then: Array, there: NDArray[np.int64]) -> Array:
-    """Return the pose `q` minus the poses `then`, shape (..., k), for the k components `there`. Angles are in [-pi,
-    pi].
-    """
+    """Return the pose `q` minus the poses `then`, shape (..., k), for the k components `there`; angles in [-pi, pi]."""
     off: Array = q[there] - then
     turn = there == _THETA
     off[..., turn] = np.remainder(off[..., turn] + np.pi, 2.0 * np.pi) - np.pi
