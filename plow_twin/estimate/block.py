@@ -1,11 +1,10 @@
 """Clearances around a block (a scene with `carries: corners`), estimated from the positions of its impacts.
 
-Between impacts, only the load and gravity move the block. Drag and errors of the load are small disturbances. The
-flight before an impact and the flight after the impact are extrapolated to the time at which the two flights are
-nearest to each other. At this time, the deepest corner touches a rigid wall or has penetrated a compliant wall. The
-position of an impact is a linear function of the clearances, the bias of the sensor, the lever arm of the sensor and
-the compliance of the contact. The quantities are estimated together from all impacts. The errors of the positions have
-a Student-t distribution of unknown scale, so that the widths of the intervals follow from the scatter of the impacts.
+The flights before and after an impact are extrapolated to the time at which they are nearest to each other. At this
+time, the deepest corner touches a rigid wall or has penetrated a compliant wall. The position of an impact is a linear
+function of the clearances, the bias and the lever arm of the sensor, and the compliance of the contact, which are
+estimated together from all impacts. The errors of the positions have a Student-t distribution of unknown scale, so the
+intervals follow from the scatter of the impacts.
 
 Reference: Lange, Little and Taylor, J. Am. Stat. Assoc. 84 (1989) 881 (Student-t errors by reweighting).
 """
@@ -32,24 +31,21 @@ from plow_twin.solve.compiled_scene import inertias
 
 Array = NDArray[np.float64]
 
-#: Definition of the walls. Each wall has the index of the axis that it bounds, and an outward normal.
+#: Definition of the walls: index of the axis that a wall bounds, and outward normal.
 WALLS: Final = {
     "right": (GX, np.array([1.0, 0.0])),
     "left": (GX, np.array([-1.0, 0.0])),
     "top": (GY, np.array([0.0, 1.0])),
     "bottom": (GY, np.array([0.0, -1.0])),
 }
-#: Lower and upper bound on the number of rows that a fit of a flight uses. The lower bound is derived from the number
-#: of coefficients of a parabola, which is three.
+#: Lower and upper bound on the number of rows for the fit of a flight, whose parabola has three coefficients.
 _FLIGHT_ROWS: Final = (4, 9)
 #: Degrees of freedom of the Student-t likelihood, derived from the recommendation of Lange et al.
 _FREEDOM: Final = 4.0
-#: Upper bound on the number of scales for which the likelihood is computed, and upper bound on the number of
-#: reweighting iterations for each scale.
+#: Upper bounds on the number of scales of the likelihood, and on the reweighting iterations for each scale.
 _SCALES, _ROUNDS = 40, 30
-#: Definition of the slices of the linear problem's unknowns. The unknowns are two clearances, three biases (x, y,
-#: theta), two coordinates of the lever arm, and the relative change of the penetration. The change is relative to the
-#: penetration with the scene's stiffness.
+#: Definition of the unknowns: two clearances, three biases (x, y, theta), two coordinates of the lever arm, and the
+#: change of the penetration relative to that with the scene's stiffness.
 _CLEARANCES, _BIAS, _LEVER, _DEPTH, _SIZE = slice(0, 2), slice(2, 5), slice(5, 7), 7, 8
 
 
@@ -68,8 +64,7 @@ class Impact:
     deeper : float
         Penetration in m that is part of `distance`, computed for a wall with the scene's stiffness.
     restitution : float
-        Coefficient of restitution, which is the normal speed of the corner after the impact divided by the speed before
-        the impact.
+        Coefficient of restitution: normal speed of the corner after the impact divided by the speed before it.
     gained : float
         Kinetic energy after the impact, divided by the energy before the impact.
     turned : ndarray, shape (2,)
@@ -91,10 +86,9 @@ class Impact:
 def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> Estimate:
     """Return the estimate of the clearances around a block from the positions of its impacts.
 
-    If only one of two opposite walls has impacts, the sensor's bias along the normal of the walls cannot be estimated.
-    In this case, the bias is assumed to be zero, and the result contains None for the bias. A clearance is not
-    observable if its standard deviation exceeds half of its prior standard deviation. An observable clearance is rough
-    if its standard deviation exceeds 1 mm.
+    If only one of two opposite walls has impacts, the sensor's bias along their normal is assumed to be zero, and is
+    None in the result. A clearance is not observable if its standard deviation exceeds half of its prior standard
+    deviation, and rough if it exceeds 1 mm.
 
     Parameters
     ----------
@@ -196,11 +190,9 @@ def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tu
     prior = np.zeros(_SIZE)
     prior[_CLEARANCES] = known.horizontal.deviation, known.vertical.deviation
     prior[_BIAS] = np.array([quantity.deviation for quantity in QUANTITIES])[BIAS]
-    # the prior was chosen for the paper's machine, so it is multiplied by the ratio of the sizes of the two machines
+    # the prior was chosen for the size of the paper's machine
     prior[_LEVER] = UNSTATED["lever_x"] * geometry.half_diagonal(scene) / PAPER_LENGTH
-    # The prior of the stiffness is log-normal, and the penetration is a power of the stiffness. The prior of the
-    # penetration is log-normal for this reason, but a normal distribution is needed here. Its deviation is chosen so
-    # that the 95 % quantile is unchanged.
+    # normal distribution with the 95 % quantile of the penetration's log-normal prior
     spread = deviation_of(scene, "contact.stiffness") / (scene.contact.exponent + 1.0)
     prior[_DEPTH] = math.expm1(NORMAL_P95 * spread) / NORMAL_P95
     for axis in (GX, GY):
@@ -217,9 +209,8 @@ def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tu
         design[row, axis] = 0.5
         design[row, _BIAS] = *normal, one.arm
         design[row, _LEVER] = one.turned
-    # an unknown with a prior deviation of zero is held fixed
     free = prior > 0.0
-    # real corners are rounded, so the error of an impact's position is at least the uncertainty of the frame's sides
+    # the error of an impact's position is at least the uncertainty of the frame's sides
     least = max(float(level[:2].max()), *(deviation_of(scene, f"frame.{side}") for side in ("width_m", "height_m")))
     scales = np.geomspace(least, max(float(prior[_CLEARANCES].max()), 2.0 * least), _SCALES)
     step, deviation = np.zeros(_SIZE), np.zeros(_SIZE)
@@ -230,10 +221,9 @@ def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tu
 def _student(design: Array, off: Array, prior: Array, scales: Array) -> tuple[Array, Array]:
     """Return the means and the standard deviations of the unknowns x in the equation `off` = `design` x + errors.
 
-    The prior of x is normal with the standard deviations `prior`. The errors have a Student-t distribution, and the
-    prior of the errors' scale is log-uniform over `scales`. For each scale, iterative reweighting gives the mode and
-    the covariance of x, and Laplace's approximation gives the evidence. The results for all scales are averaged with
-    the evidence as weight.
+    The prior of x is normal with the standard deviations `prior`. The errors have a Student-t distribution with a
+    log-uniform prior of their scale over `scales`. For each scale, reweighting gives the mode and the covariance of x,
+    and Laplace's approximation gives the evidence, with which the results are averaged.
     """
     modes, variances, log = [], [], []
     precision = np.diag(prior**-2.0)
@@ -256,7 +246,7 @@ def _student(design: Array, off: Array, prior: Array, scales: Array) -> tuple[Ar
 
 
 def impacts(scene: Scene, load: Load, poses: Poses, level: Array) -> tuple[list[Impact], int]:
-    """Return the impacts that lie between two flights long enough for a fit, and the number of all contacts.
+    """Return the impacts between two flights long enough for a fit, and the number of all contacts.
 
     Parameters
     ----------
@@ -312,9 +302,7 @@ def _load_and_weight(scene: Scene, load: Load, t: Array) -> Array:
 
 
 def _kinks(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> list[tuple[int, int]]:
-    """Return the first and the last row of each contact, which is a part of the motion with an acceleration unlike that
-    of a flight.
-    """
+    """Return the first and the last row of each contact, where the acceleration is not that of a flight."""
     one, two = np.diff(t)[:-1, None], np.diff(t)[1:, None]
     way = np.diff(q, axis=0)
     acceleration = 2.0 * (way[1:] / two - way[:-1] / one) / (one + two)
@@ -324,9 +312,7 @@ def _kinks(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> lis
 
 
 def _flight(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> Array:
-    """Return the coefficients of the parabolas of a flight, shape (3, 3). Rows are components of the pose, columns are
-    powers of t.
-    """
+    """Return the coefficients of a flight's parabolas, shape (3, 3): rows for the pose, columns for powers of t."""
     basis = np.vander(t, 3, increasing=True)
     out = np.zeros((3, 3))
     for j in range(3):
@@ -337,9 +323,7 @@ def _flight(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> Ar
 
 
 def _meeting(scene: Scene, inertia: Array, flights: list[Array], room: float) -> Impact | None:
-    """Return the impact between two flights; None if no wall was hit, or if the flights are not nearest within `room`
-    s.
-    """
+    """Return the impact between two flights; None if it hit no wall or is more than `room` s away."""
     apart = flights[1] - flights[0]
     change = apart[:, 1]
     t = -float((inertia * apart[:, 0] * change).sum() / (inertia * change * change).sum())
@@ -361,7 +345,7 @@ def _meeting(scene: Scene, inertia: Array, flights: list[Array], room: float) ->
         return None
     mass = 1.0 / (1.0 / inertia[0] + arm**2 / inertia[2])
     energy = (inertia * v**2).sum(axis=1)
-    # `corner` is the centre of the arc if the corner is rounded, so the radius is added
+    # `corner` is the centre of a rounded corner's arc
     distance = float(normal @ (q[:2] + corner)) + geometry.corner_radius(scene)
     turned = np.array([c * normal[0] + s * normal[1], -s * normal[0] + c * normal[1]])
     deeper = _deeper(scene, mass, before, after)
@@ -376,12 +360,11 @@ def _corners(scene: Scene) -> Array:
 
 
 def _deeper(scene: Scene, mass: float, before: float, after: float) -> float:
-    """Return the distance in m behind a compliant wall at which the extrapolated flights before and after the contact
-    meet.
+    """Return the distance in m behind a compliant wall at which the flights before and after the contact meet.
 
-    The corner approaches with the normal speed v, stays in contact for the time T and leaves with the speed e v. If the
-    flights are straight lines, they meet at the distance v e T / (1 + e) behind the wall. The duration is T = pi u / v,
-    where u is the largest penetration. The formula for T is exact for a linear spring.
+    The corner approaches with the normal speed v and leaves with the speed e v after the time T. Straight flights meet
+    at the distance v e T / (1 + e) behind the wall. T = pi u / v with the largest penetration u, which is exact for a
+    linear spring.
     """
     exponent = scene.contact.exponent
     largest = ((exponent + 1.0) * mass * before**2 / (2.0 * scene.contact.stiffness)) ** (1.0 / (exponent + 1.0))

@@ -1,7 +1,6 @@
-"""Tests whether the residuals of a fit are noise. If the residuals are not noise, the model or the sensor is suspect.
+"""Tests whether the residuals of a fit are noise; if not, the model or the sensor is suspect.
 
-The thresholds were chosen with simulated machines whose seeds are below 1000. The page docs/estimate.md lists faults
-that the tests do not find.
+The page docs/estimate.md lists faults that the tests do not find.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ class Verdict:
     sensor : messages about faults of the sensor
     figures : statistics of the tests
     by_scale : whether wrong scale factors are the only fault of the sensor
-    broken : whether the sensor has failed or the measurements contradict each other, so that no estimate is possible
+    broken : whether the sensor has failed or the measurements contradict each other, so no estimate is possible
     lacking : description of the most significant harmonic that the fit has added to the measured load
     changed : (2,) change in m, within the window, of the two clearances or of the biases of x and y
     """
@@ -70,16 +69,14 @@ def judge(problem: Problem, fit: Fit, period: float) -> Verdict:
     if not fit.converged:
         verdict.figures["not_converged"] = 1.0
     if verdict.sensor:
-        # measurements of a faulty sensor do not show whether the model is correct
+        # a faulty sensor does not test the model
         verdict.model.clear()
     _scale(problem, fit, verdict)
     return verdict
 
 
 def judge_sensor(poses: Poses) -> list[str]:
-    """Return messages about faults of the sensor that the poses alone show, such as a constant value or changing
-    noise.
-    """
+    """Return messages about faults of the sensor that the poses alone show, such as a constant value."""
     found = []
     for i, name in enumerate(COMPONENTS):
         column = poses.q[np.isfinite(poses.q[:, i]), i]
@@ -97,7 +94,7 @@ def judge_sensor(poses: Poses) -> list[str]:
 
 
 def predicted(fit: Fit) -> NDArray[np.bool_]:
-    """Return the mask of the measurements that the model predicts almost to within the noise, shape (n, 3)."""
+    """Return which measurements the model predicts almost to within the noise, shape (n, 3)."""
     there: NDArray[np.bool_] = np.isfinite(fit.point.residual) & (fit.variance < 1.5 * fit.noise**2)
     return there
 
@@ -110,7 +107,7 @@ def _colour(fit: Fit, verdict: Verdict) -> None:
         if quick <= 0.0 or len(rows) < 50:
             continue
         ratio = float(np.mean(np.minimum(np.abs(rows), 5.0 * quick) ** 2) / quick**2)
-        # `ratio` is a mean square divided by a squared median; the last term of the limit allows for its random scatter
+        # the last term allows for the random scatter of `ratio`
         limit = 1.0 + (tuning.MOST_RATIO - 1.0) + 4.0 * 2.5 / np.sqrt(len(rows))
         verdict.figures[f"colour_{name}"] = ratio
         if ratio > limit and not verdict.sensor:
@@ -120,7 +117,7 @@ def _colour(fit: Fit, verdict: Verdict) -> None:
 def _repeated(problem: Problem, fit: Fit, period: float, verdict: Verdict) -> None:
     """Test whether the residuals repeat in each period of the load (analysis of variance).
 
-    A wrong contact law or a wrong shape of the load causes residuals that repeat. Noise and disturbances do not repeat.
+    A wrong contact law or a wrong shape of the load causes residuals that repeat.
     """
     t, there = problem.window.poses.t, predicted(fit)
     turns = np.floor((t - t[0]) / period).astype(int)
@@ -152,8 +149,8 @@ def _repeated(problem: Problem, fit: Fit, period: float, verdict: Verdict) -> No
 def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
     """Test whether the alternative contact law explains the residuals (linearised score test).
 
-    The motion under the alternative law is simulated from the starting states of the fit and mixed into the predicted
-    motion. The share of the alternative law is an additional unknown. All unknowns except the share are eliminated.
+    The motion under the alternative law is mixed into the predicted motion. Its share is the only unknown that is not
+    eliminated.
     """
     unknowns = with_other_law(problem.unknowns)
     if unknowns is None or not fit.finished:
@@ -193,7 +190,7 @@ def _scale(problem: Problem, fit: Fit, verdict: Verdict) -> None:
 
 
 def quick_noise(residual: Array, swing: NDArray[np.int64]) -> float:
-    """Return the standard deviation of a residual, estimated from differences of successive rows within swings."""
+    """Return the standard deviation of a residual from differences of successive rows within swings."""
     there = np.isfinite(residual)
     value, part = residual[there], swing[there]
     if len(value) < 10:
@@ -267,19 +264,15 @@ def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
     elif clearance > bias and np.abs(growth).max() > 0.5 * tuning.OBSERVED:
         verdict.model.append(f"machine changed within the window: clearances by {growth[0]:.2g} m, {growth[1]:.2g} m")
         changed = np.abs(growth)
-    # a wrong load or law can resemble a change, but only a real change explains a large share of the residuals
+    # unlike a wrong load or law, a real change explains a large share of the residuals
     if changed.any() and share > tuning.CHANGE_SHARE and _felt(problem, fit):
-        # a change up to the deviation of a rough clearance only widens the interval
+        # a smaller change only widens the interval
         verdict.broken |= bool(changed.max() > 2.0 * tuning.OBSERVED)
         verdict.changed = changed
 
 
 def _felt(problem: Problem, fit: Fit) -> bool:
-    """Return whether the unknown part of the load has no effect on the residuals.
-
-    If the swings are short, the effect is smaller than the noise. If the swings are linked, the links allow for the
-    effect.
-    """
+    """Return whether the unknown part of the load has no effect on the residuals of short or linked swings."""
     drift = np.array(problem.forward.load.unknown) / np.asarray(inertias(problem.unknowns.scene)) ** 2
     span = float(np.median(np.diff(problem.window.starts)))
     return len(problem.link) > 0 or bool((drift * span**3 / 3.0 < fit.noise**2).all())
@@ -296,10 +289,7 @@ def _excess(fit: Fit) -> float:
 
 
 def _changes(problem: Problem, fit: Fit, columns: NDArray[np.intp]) -> Iterator[tuple[Array, Array]]:
-    """Yield the information matrix and the score for a change of the unknowns `columns` at each of several swings.
-
-    All other unknowns are eliminated.
-    """
+    """Yield the information matrix and the score for a change of the unknowns `columns` at each of several swings."""
     count = len(columns)
     size = SIZE + OWN * problem.window.swings
     cross, own, score = np.zeros((size, count)), np.zeros((count, count)), np.zeros(count)
@@ -319,7 +309,7 @@ def _changes(problem: Problem, fit: Fit, columns: NDArray[np.intp]) -> Iterator[
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Normal equations of one swing for the unknowns of the whole window; the starting state has been eliminated.
+    """Normal equations of one swing for the unknowns of the whole window, without its starting state.
 
     normal : (SIZE, SIZE) matrix, the information of the swing
     score : (SIZE,) right-hand side
@@ -343,9 +333,9 @@ def swing_blocks(problem: Problem, fit: Fit) -> list[Block]:
 
 
 def sandwich(problem: Problem, fit: Fit, precision: Array) -> Array:
-    """Return the sandwich covariance of the shared unknowns, from the scatter of the scores of the swings.
+    """Return the sandwich covariance (SIZE, SIZE) of the shared unknowns, from the scatter of the scores of the swings.
 
-    `precision`, shape (SIZE,), contains the inverse variances of the prior. The result has the shape (SIZE, SIZE).
+    `precision`, shape (SIZE,), contains the inverse variances of the prior.
 
     Reference: White, Econometrica 50 (1982) 1 (maximum likelihood of misspecified models).
     """
