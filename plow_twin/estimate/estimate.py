@@ -50,19 +50,17 @@ if TYPE_CHECKING:
     from plow_twin.estimate.contact_forces import ContactForces
 
 Array = NDArray[np.float64]
-#: First guess for a fit, from the result of the previous window. It consists of the unknowns of the whole window, the
-#: noise, and the differences from the model. An empty tuple means that there is no guess.
+#: First guess for a fit from the previous window: the unknowns of the whole window, the noise, and the differences from
+#: the model; empty without a guess.
 Guess = tuple[float, ...]
 
-#: Upper bounds on the length of a window, in load periods and in s. The bound that gives the longer window applies. If
-#: the data are longer than the window, only the newest part is used.
+#: Upper bound on the length of a window: the longer of load periods and seconds.
 MOST_PERIODS, MOST_SPAN_S = 20.0, 60.0
-#: Upper bound in s on the length of the data in which the period of the load is searched. It equals the longest window
-#: that a node accepts.
+#: Upper bound in s on the length of the data in which the period of the load is searched, the longest window of a node.
 _LONGEST_S = 600.0
-#: Deviate that a correct model exceeds with a probability of 1 %, derived from the normal distribution.
+#: Deviate that a correct model exceeds with a probability of 1 %, by definition.
 MOST_OTHER_LAW = round(float(ndtri(0.99)), 2)
-#: 95 % quantile of the absolute value of a standard normal variable, derived from the normal distribution.
+#: 95 % quantile of the absolute value of a standard normal variable, by definition.
 _HALF_NORMAL_P95 = float(ndtri(0.975))
 #: Bounds on the logarithm of a contact's penetration in m.
 _LN_PENETRATIONS = (math.log(1e-9), math.log(0.12))
@@ -83,7 +81,7 @@ def estimate(
     Parameters
     ----------
     scene : Scene
-        The nominal scene. Its geometry, masses and gravity are assumed to be exact. Its clearances and its contact
+        The nominal scene. Its geometry, masses and gravity are assumed to be exact; its clearances and contact
         parameters are the means of the prior.
     load : Load
         The measured load.
@@ -92,8 +90,7 @@ def estimate(
     lost : int
         Number of rows that were left out before.
     gaps : Gaps, optional
-        Measured gaps, from which the clearances are computed directly. If no poses are measured, the poses are computed
-        from the gaps.
+        Measured gaps, from which the clearances and, without measured poses, the poses are computed.
     forces : ContactForces, optional
         Measured contact forces, which determine the contact more accurately than the motion alone.
     """
@@ -111,8 +108,7 @@ def estimate_window(
 ) -> tuple[Estimate, Guess]:
     """Return the result of `estimate` for a window, and the guess for the next window.
 
-    The fit starts from `guess` if `guess` is not empty. If the fit from `guess` fails a check, the estimate is repeated
-    with a full search.
+    The fit starts from `guess`, if any. If it fails a check, the estimate is repeated with a full search.
     """
     if scene.head.carries == "corners":
         span = (float(load.t[0]), float(load.t[-1]))
@@ -125,8 +121,7 @@ def estimate_window(
     found, following = _estimate(units.scene(scene), *its, lost, guess, units.gaps(gaps), units.forces(forces))
     found = units.in_si(found, scene)
     if units.only_time and found.sensor == "ok":
-        # Times are in units of the load's period. For a machine of the paper's size, however, the duration of an impact
-        # does not depend on the period. The comparison under an uncertain load is therefore repeated with times in s.
+        # in units of the load's period, the duration of an impact would depend on the period, so repeat with times in s
         period = _period(load, poses)
         unknowns = Unknowns.stated(scene, load, poses)
         found = under_uncertain_load(found, unknowns, thinned(load, period)[0], poses, period)
@@ -219,8 +214,7 @@ def _from_motion(
     if guess:
         numbers = np.array(guess)
         shared, noise, differences = np.split(numbers, [SIZE, SIZE + 3])
-        # a guess is close to the optimum, except for a contact harder than `FITTED`, for which the guess is not from a
-        # fit
+        # the guess for a contact harder than `FITTED` is not from a fit
         certain = unknowns.penetration_of(float(shared[SOFTNESS])) > tuning.FITTED
         near = refine(forward, unknowns, poses, period, unknowns.within(shared), noise, drift, differences, certain)
         verdict = judge(*near, period) if near else None
@@ -240,10 +234,10 @@ def _from_motion(
 
 
 def _without_load(unknowns: Unknowns, load: Load, poses: Poses, lost: int) -> Estimate:
-    """Return the estimate from the poses alone, for the case that the load was not measured.
+    """Return the estimate from the poses alone, without a measured load.
 
-    The range of motion is the clearance plus the penetrations at two opposite walls. For walls that yield, the
-    penetrations and the load are estimated from the equations of motion.
+    The range of motion is the clearance plus the penetrations at two opposite walls, which are estimated from the
+    equations of motion for walls that yield.
     """
     nothing = _without_fit(unknowns, poses, lost, "load: the same value throughout, while the head moves")
     bias = bias_of_hard(unknowns, poses)
@@ -257,11 +251,7 @@ def _without_load(unknowns: Unknowns, load: Load, poses: Poses, lost: int) -> Es
 def _from_some_components(
     unknowns: Unknowns, load: Load, poses: Poses, lost: int, lacking: tuple[str, ...]
 ) -> Estimate:
-    """Return the estimate from poses in which one or two components were never measured.
-
-    If the fit gives no clearance, and x and y were measured, the poses are compared with motions under an uncertain
-    load.
-    """
+    """Return the estimate from poses in which one or two components were never measured."""
     period = _period(load, poses)
     felt, _ = thinned(load, period)
     share, time = tuning.UNMEASURED_LOAD
@@ -286,7 +276,7 @@ def _searched(
     lost: int,
     forces: ContactForces | None,
 ) -> tuple[Estimate, Guess]:
-    """Return the estimate from a search or from the comparison of whole motions; no guess is needed."""
+    """Return the estimate from a search or from the comparison of whole motions, without a guess."""
     narrow = bounces(unknowns, poses)
     bounced = compare(forward, unknowns, poses, period) if narrow else None
     searched = candidate(forward, unknowns, poses, period) if bounced is None else None
@@ -317,7 +307,7 @@ def _searched(
             found, verdict = again, judge(*again, period)
     found, verdict = _with_differences(found, verdict, period)
     if bounced is None and _fails(found[1], verdict) and not verdict.sensor:
-        # a low pass of the sensor or a change of the machine can resemble harmonics, so harmonics are tried last
+        # a low pass of the sensor or a change of the machine can resemble harmonics
         found, verdict = with_harmonics(*plain, forward.load, period) or (found, verdict)
     result = summarise(*found, verdict, lost, forces if bounced is None else None)
     if bounced is None and _fails(found[1], verdict) and not verdict.broken:
@@ -342,12 +332,10 @@ def under_uncertain_load(
     period: float,
     fitted: tuple[Problem, Fit] | None = None,
 ) -> Estimate:
-    """Return an estimate with values that allow for errors of the load in place of the withdrawn clearances.
+    """Replace the withdrawn clearances of the estimate `result` by values that allow for errors of the load.
 
-    The values come from a comparison with motions under uncertain loads. `result` is the estimate under the measured
-    load. The clearances do not change if `result` contains a clearance, or if the comparison gives no clearance.
-    `fitted` is a fit that failed a check and may have converged to a false optimum. If a clearance of `fitted` agrees
-    with the comparison, the two values are combined.
+    The values come from a comparison with motions under uncertain loads. `fitted` is a fit that failed a check. Its
+    clearances are combined with those of the comparison where they agree.
     """
     if _known(result) or (felt is not None and felt.interval() > tuning.COARSEST):
         return result
@@ -416,8 +404,7 @@ def with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
 def _with_apparent(result: Estimate, apparent: tuple[Interval, ...]) -> Estimate:
     """Return an estimate with new apparent clearances, which hold for a frame of exactly the scene's size.
 
-    The clearances of the estimate allow for an error of the frame. The shift and the additional width that distinguish
-    them from the apparent clearances do not change.
+    The clearances allow for an error of the frame. Their shift and additional width do not change.
     """
     horizontal, vertical = (
         Interval.normal(
@@ -437,11 +424,9 @@ def _with_apparent(result: Estimate, apparent: tuple[Interval, ...]) -> Estimate
 def _with_differences(
     found: tuple[Problem, Fit], verdict: Verdict, period: float
 ) -> tuple[tuple[Problem, Fit], Verdict]:
-    """Return a fit with differences of walls and sensor if the fit without differences fails a check or shows that
-    differences exist; otherwise return the given fit.
+    """Return a fit with differences of walls and sensor if the given fit fails a check or shows such differences.
 
-    If the differences are ignored and the two pads of a wall differ by 1.2 mm, the estimated clearance is 0.2 mm too
-    small.
+    If the two pads of a wall differ by 1.2 mm, a fit without differences gives a clearance that is 0.2 mm too small.
     """
     if verdict.sensor and not verdict.by_scale:
         return found, verdict
@@ -508,9 +493,7 @@ def with_gaps(result: Estimate, by_gaps: GapsFit) -> Estimate:
 
 
 def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: int, work: int) -> Estimate:
-    """Return the estimate, with intervals and states, from the result of a comparison of whole motions with a hard
-    contact.
-    """
+    """Return the estimate from a comparison of whole motions with a hard contact."""
     sensor = judge_sensor(poses)
     found = (
         ("motion", bounced.distance, tuning.MOST_DISTANCE),
@@ -544,7 +527,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         states.append(_state(bool(sensor), observed, rough))
     exponent = unknowns.scene.contact.exponent
     log = Interval.normal(*bounced.ln_penetration)
-    # clipped, because the extrapolation of a regression is not bounded
+    # the extrapolation of a regression is not bounded
     log = Interval(*np.clip([log.mean, log.p05, log.p95], *_LN_PENETRATIONS).tolist())
     mean, soft, hard = (unknowns.force / np.exp(value) ** exponent for value in (log.mean, log.p95, log.p05))
     bias = [Interval.normal(*pair) for pair in zip(bounced.bias, bounced.bias_deviation, strict=True)]
@@ -556,7 +539,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         horizontal_state=states[0],
         vertical_state=states[1],
         apparent=(apparent[0], apparent[1]) if all(state.known for state in states) else None,
-        # the bounces determine only a lower limit of the stiffness, so the interval extends to the hardest contact
+        # bounces determine only a lower limit of the stiffness
         stiffness=Interval(float(mean), float(soft), max(float(hard), unknowns.hardest_believed)),
         damping=_damping(unknowns, Interval.normal(*bounced.ln_damping)),
         bias_x=bias[0],
@@ -588,7 +571,7 @@ def _apart(one: tuple[float, float], other: tuple[float, float]) -> float:
 
 
 def _both_of_one(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
-    """Return the result of `_both` for two estimates from the same motion; the deviation is widened if they disagree.
+    """Return `_both` of two estimates from the same motion, with a larger deviation if they disagree.
 
     Reference: Birge, Phys. Rev. 40 (1932) 207 (the ratio of external to internal consistency).
     """
@@ -604,10 +587,9 @@ def _state(withdrawn: bool, observed: bool, rough: bool = False) -> State:
 
 
 def _unseen(fit: Fit) -> Array:
-    """Return the standard deviation in m, shape (2,), that rotations of walls with an untouched pad cause in the
-    clearances.
+    """Return the standard deviation of clearances in m, shape (2,), due to rotations of walls with an untouched pad.
 
-    The motion does not show the position of an untouched pad, and the linearised fit ignores this uncertainty.
+    The motion does not show the position of such a pad, and the linearised fit ignores this uncertainty.
     """
     square = np.zeros(2)
     seconds = fit.point.contact.sum(axis=0)
@@ -630,13 +612,11 @@ def _figures(beside: Graded | None) -> dict[str, float]:
 
 
 def _graded(problem: Problem, fit: Fit, verdict: Verdict) -> Graded | None:
-    """Return the result of the fit for a machine that may differ from the model, or None.
-
-    The result is None in these cases:
+    """Return the result of the fit for a machine that may differ from the model, or None in these cases:
 
     - The measurements contradict each other.
     - Swings are linked, and either no check fails or the fit has not reached an optimum.
-    - The fit has not reached an optimum, and its residuals far exceed the noise, so that the optimum may be false.
+    - The fit has not reached an optimum, and its residuals far exceed the noise.
     """
     if verdict.broken:
         return None
@@ -663,8 +643,8 @@ def _next_guess(problem: Problem, fit: Fit) -> Guess:
 def thinned(load: Load, period: float) -> tuple[Load, bool]:
     """Return a load without samples that hardly move the head, and whether the load is broad-band.
 
-    A load is broad-band if nearly all its samples move the head. A broad-band load is averaged. A load with samples so
-    rare that a broad-band part would not be visible counts as broad-band.
+    A load is broad-band if nearly all its samples move the head, or if its samples are too rare to show. A broad-band
+    load is averaged.
     """
     load = load.believable()
     most = tuning.KNOTS[0] * max(1.0, float(load.t[-1] - load.t[0]) / period)
@@ -676,13 +656,12 @@ def thinned(load: Load, period: float) -> tuple[Load, bool]:
         if len(thin.t) <= most:
             break
     broad = len(thin.t) > most
-    # the head follows the mean values of a broad-band load
     felt = load.averaged(tuning.KNOTS[1] * int(most)) if len(thin.t) > tuning.KNOTS[1] * most else thin
     return replace(felt, unknown=load.unknown), broad or load.rare
 
 
 def warm_up(scene: Scene) -> None:
-    """Compile the kernels that a scene needs, or load them from the cache; a block needs no kernel."""
+    """Compile the kernels that a scene needs, or load them from the cache."""
     if scene.head.carries == "corners":
         return
     load = Load.unmeasured(1.0)
@@ -701,7 +680,7 @@ def warm_up(scene: Scene) -> None:
 
 
 def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: ContactForces | None = None) -> Estimate:
-    """Return the estimate, with intervals and states, from a fit and from measured contact forces, if any."""
+    """Return the estimate from a fit and from measured contact forces, if any."""
     unknowns, poses = problem.unknowns, problem.window.poses
     finished, suspect = fit.finished, bool(verdict.model or verdict.sensor)
     plain = _plain(problem, fit)
@@ -718,8 +697,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     if beside is not None:
         published = np.maximum(beside.clearance, LEAST_CLEARANCE)
         spread = np.hypot(beside.clearance_deviation, _between_optima(problem, shared))
-    # The clearance may have changed at an unknown time within the window. The mean over the window then differs from
-    # the newest clearance by a uniformly distributed share of the change.
+    # after a change at an unknown time, the mean over the window differs from the newest clearance by a uniform share
     moved = verdict.changed / math.sqrt(3.0)
     deviation[[GX, GY]] = np.hypot(deviation[[GX, GY]], moved)
     spread = np.hypot(np.hypot(spread, moved), _unseen(fit))
@@ -727,17 +705,16 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     if not finished and not suspect:
         gain = f"the cost would still fall by {fit.gain_left:.0f}, expected at most {tuning.OUTLYING**2:g}"
         reasons = [f"the fit has not reached an optimum: {gain}"]
-    # compliant walls yield by `given`, so the range of motion can exceed the clearance
+    # the range of motion can exceed the clearance by the penetrations
     given = tuning.GIVEN * float(np.exp(shared[SOFTNESS] + NORMAL_P95 * min(deviation[SOFTNESS], 1.0)))
     least = range_of_motion(unknowns.scene, poses)[0] - given
     share = predicted(fit).sum(axis=0) / np.maximum(np.isfinite(fit.point.residual).sum(axis=0), 1)
-    # the equations of motion couple the components, so a measured component tests both clearances
+    # the equations of motion couple the components: a measured component tests both clearances
     share = np.where(poses.measured, share, share[poses.measured].min())
     apparent, clearances, states = [], [], []
     untested: dict[int, Interval] = {}
     for index, sides in ((GX, ("left", "right")), (GY, ("top", "bottom"))):
-        # A clearance is tested only at times at which the motion is predicted. Hard contacts are exempt, because their
-        # bounces cannot be predicted for long.
+        # only a predicted motion tests a clearance; hard contacts are exempt, because their bounces are unpredictable
         tested = share[index] > tuning.PREDICTED or unknowns.penetration_of(float(shared[SOFTNESS])) < tuning.HARD
         if not tested and finished and not suspect:
             reasons.append(
@@ -745,7 +722,6 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
                 f"{COMPONENTS[index]} is predicted, expected {tuning.PREDICTED:.0%} or more"
             )
         touched = min(float(fit.point.contact[:, _SIDES[side]].sum()) for side in sides)
-        # a clearance at the lower limit of the fit is not observed
         observed = tested and touched > tuning.TOUCHED and shared[index] > LEAST_CLEARANCE
         observed &= deviation[index] < (2.0 * tuning.OBSERVED if rough else tuning.OBSERVED) and (finished or rough)
         apparent.append(Interval.normal(shared[index], deviation[index]))
@@ -838,16 +814,12 @@ def _numbers(unknowns: Unknowns, normal: list[Interval]) -> dict[str, Any]:
 
 
 def _plain(problem: Problem, fit: Fit) -> Array:
-    """Return the part of the covariance that noise and the uncertainty of the differences in the fit cause."""
+    """Return the covariance due to noise and to the uncertainty of the differences in the fit."""
     return fit.covariance + of_differences(problem, fit) if problem.differences.any() else fit.covariance
 
 
 def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> Array:
-    """Return the covariance of the shared unknowns, which is `plain` widened by the misfit.
-
-    The factor on the covariance is the result of `_widened`. The step that the fit has not yet made is added as an
-    error.
-    """
+    """Return the covariance `plain` of the shared unknowns, widened by the misfit and by the step still to be made."""
     size = len(fit.shared)
     covariance: Array = plain * _widened(problem, fit, verdict) + np.outer(fit.left[:size], fit.left[:size])
     covariance[[GX, GY], [GX, GY]] += _between_optima(problem, fit.shared) ** 2
@@ -855,13 +827,11 @@ def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> A
 
 
 def _widened(problem: Problem, fit: Fit, verdict: Verdict) -> float:
-    """Return the factor on the variance of the noise that the scatter of the swings and the colour of the residuals
-    give.
+    """Return the factor on the variance of the noise from the scatter of the swings and the colour of the residuals.
 
-    All unknowns that move the head scatter for the same reason, so the ratio of observed to expected variance is
-    averaged over these unknowns. The ratio of a single unknown would be too random. The covariance of linked swings
-    already contains the scatter. Coloured residuals stay correlated for long, so the deviation, and not the variance,
-    is multiplied by the colour.
+    The ratio of observed to expected variance is averaged over all unknowns that move the head, because the ratio of a
+    single unknown would be too random. The colour multiplies the deviation, because coloured residuals stay correlated
+    for long.
     """
     ratio = 1.0 if len(problem.link) else max(1.0, _scatter(problem, fit, np.diag(fit.covariance)))
     colour = max(verdict.figures.get(f"colour_{name}", 1.0) for name in COMPONENTS)
@@ -872,7 +842,7 @@ def _widened(problem: Problem, fit: Fit, verdict: Verdict) -> float:
 def _between_optima(problem: Problem, shared: Array) -> float:
     """Return the standard deviation of a clearance in m over optima that explain the motion equally well.
 
-    If the contact is hard or nearly hard, or if only one component was measured, there are several optima.
+    Hard contacts, and motions of which only one component was measured, have several optima.
     """
     unknowns = problem.unknowns
     if problem.window.poses.measured.sum() == 1:
@@ -908,11 +878,9 @@ def _groups(
     states : list of State
         States of the horizontal and the vertical clearance.
     untested : dict
-        Clearances that no predicted motion tests, by the index of the axis. The clearances between pads along this axis
-        are replaced by the given clearance.
+        Clearances that no predicted motion tests, by the index of the axis. They replace the clearances between pads.
     shared, added : ndarray
-        The unknowns of a machine that may differ from the model, and the difference between two covariances, that of
-        these unknowns and that of the fit.
+        The unknowns of a machine that may differ from the model, and their covariance minus that of the fit.
     """
     out = {}
     for name, (value, deviation) in by_group(problem, fit, widened).items():
@@ -934,9 +902,7 @@ def _correlation(covariance: Array) -> tuple[tuple[float, ...], ...]:
 
 
 def _unobserved(unknowns: Unknowns, deviation: Array, index: int, reach: float, noise: Array) -> Interval:
-    """Return the interval of a clearance that is not observed, which is the prior above the range in which the head has
-    moved.
-    """
+    """Return the interval of a clearance that is not observed: the prior above the range of motion `reach`."""
     nominal, spread = unknowns.nominal()[index], max(unknowns.deviations()[index], deviation[index])
     return Interval.normal(nominal, spread).above(reach - 3.0 * float(np.hypot(noise[index], 1e-4)))
 
@@ -994,7 +960,7 @@ def _lacking(poses: Poses) -> tuple[str, ...]:
     )
     if lacking:
         return lacking
-    # long gaps count as well as the mean interval, because a flight within a gap is not measured
+    # a flight within a gap is not measured
     apart = max(poses.interval(), poses.gap())
     if apart > tuning.SPARSEST:
         lacking = (f"poses: got {1.0 / apart:.1f} a second, expected at least {1.0 / tuning.SPARSEST:.1f}",)
@@ -1002,7 +968,7 @@ def _lacking(poses: Poses) -> tuple[str, ...]:
 
 
 def _well_measured(poses: Poses) -> Poses | None:
-    """Return the poses without the values of components that were hardly measured.
+    """Return the poses without components that were hardly measured.
 
     The result is None if all or no components were measured well, or if the remaining poses are too rare.
     """
