@@ -16,17 +16,16 @@ from plow_twin.estimate.result import Estimate, State
 from plow_twin.estimate.window import Window
 from plow_twin.model.scene import Scene, Table
 
-#: Time before the evaluated span in load periods. It is derived from the time in which the effect of the members'
-#: initial states decays.
+#: Time before the evaluated span in load periods, derived from the decay of the members' initial states.
 _SETTLE_PERIODS: Final = 1.0
-#: Longest interval between two knots of a load, as a share of the load's period. It is derived from the paper's
-#: machine, for which this share of the period is about twice `tuning.LOAD_KNOT`.
+#: Longest interval between two knots of a load as a share of its period, derived from twice `tuning.LOAD_KNOT` for the
+#: paper's machine.
 _KNOT_SHARE: Final = 1.0 / 400.0
 
 
 @dataclass(frozen=True)
 class Asked:
-    """Settings of the two answers that a caller may request in addition to the estimate: contact forces and a forecast.
+    """Settings of the answers that a caller may request in addition to the estimate: contact forces and a forecast.
 
     members : number of twins from which the intervals of the forces are computed; 0 if no forces are requested
     span_s : duration at the end of the window for which forces are computed [s]
@@ -40,10 +39,10 @@ class Asked:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The estimate from a window, the first guess for the fit of the next window, and the requested additional answers.
+    """The estimate from a window, the first guess for the next window, and the requested additional answers.
 
     also : the requested answers as JSON values, by the names `forces` and `forecast`. An answer that cannot be computed
-    is null, and an entry `forces_error` or `forecast_error` contains the reason.
+    is null, with the reason in `forces_error` or `forecast_error`.
     """
 
     estimate: Estimate
@@ -57,7 +56,7 @@ class Answer:
 
 
 def answer(scene: Scene, window: Window, guess: Guess, asked: Asked) -> Answer:
-    """Return the estimate from a window and the answers requested in `asked`. The fit starts at `guess`."""
+    """Return the estimate from a window, by a fit from `guess`, and the requested answers."""
     result, following = estimate_window(scene, window.load, window.pose, window.lost, guess, window.gaps)
     also: dict[str, Any] = {}
     if asked.members:
@@ -94,8 +93,8 @@ def followed(load: Load, period: float) -> Load:
 def forecast_from(scene: Scene, result: Estimate, load: Load, plan: Plan) -> dict[str, Any]:
     """Return the forecast that starts from an estimate, as JSON values.
 
-    The forecast repeats the load of the window with the estimated gains. If the window contains too few load periods,
-    the forecast uses the load of the scene.
+    The forecast repeats the load of the window with the estimated gains, or the load of the scene if the window
+    contains too few load periods.
 
     Raises
     ------
@@ -107,10 +106,7 @@ def forecast_from(scene: Scene, result: Estimate, load: Load, plan: Plan) -> dic
 
 
 def under_load(scene: Scene, result: Estimate, load: Load) -> Scene:
-    """Return the scene with its loads replaced by the load of a window times the estimated gains.
-
-    If the window contains too few load periods, the scene is returned unchanged.
-    """
+    """Return the scene under the load of a window times the estimated gains; unchanged for too few load periods."""
     gains = [1.0 if gain is None else gain.mean for gain in (result.gain_fx, result.gain_fy, result.gain_m)]
     felt = load.thinned() if result.load_harmonics is None else result.load_harmonics.added(load.thinned())
     seen = replace(scene, loads=(Table("window", felt.t - felt.t[0], felt.wrench * gains),))

@@ -1,9 +1,8 @@
 """Solution in linear time of the normal equations for the unknowns of the swings and the shared unknowns.
 
-A swing is a part of the measured motion that begins in flight. Its starting state consists of six unknowns. In the
-equations, each swing is coupled only to its neighbours and to the unknowns that all swings share. The matrix is
-therefore block tridiagonal with a border. The block of the swings is factorised as a band matrix by Cholesky's method.
-The Schur complement of this block is factorised for the border.
+A swing is a part of the measured motion that begins in flight. It is coupled only to its neighbours and to the unknowns
+that all swings share, so the matrix is block tridiagonal with a border. Cholesky's method factorises the block of the
+swings as a band matrix, and its Schur complement for the border.
 
 Reference: Golub and Van Loan, Matrix Computations, ch. 4.3 and 3.2.6.
 """
@@ -18,14 +17,13 @@ from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_bande
 
 Array = NDArray[np.float64]
 
-#: Number of unknowns of a swing. By definition, they are the three coordinates of the pose and the three rates at the
-#: start of the swing.
+#: Number of unknowns of a swing, by definition the pose and its rates at the start of the swing.
 OWN = 6
 
 
 @dataclass(frozen=True, eq=False)
 class Arrow:
-    """Symmetric matrix for k shared unknowns and s swings, each of which has six unknowns.
+    """Symmetric matrix for k shared unknowns and six unknowns of each of s swings.
 
     border : (k, k) block of the shared unknowns
     coupling : (6 s, k) block that couples the unknowns of the swings with the shared unknowns

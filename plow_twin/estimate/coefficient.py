@@ -1,9 +1,8 @@
 """Posterior of the wear coefficient, from clearances that were estimated over weeks.
 
 The exposure of a pad is E = k_s s / A, where k_s is the wear coefficient, s the travel and A the area of the pad. The
-clearance is a function of E that does not depend on k_s. A history of clearances against travel therefore determines
-k_s. The posterior is computed on a grid of ln k_s with the log-normal prior of the scene's wear. The initial clearance
-is integrated out.
+clearance is a function of E only, so a history of clearances against travel determines k_s. The posterior is computed
+on a grid of ln k_s with the log-normal prior of the scene's wear.
 """
 
 from __future__ import annotations
@@ -23,11 +22,10 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Upper bound on the number of grid points, and half width of the grid in prior deviations. The half width is derived
-#: from the prior probability outside the grid, which is 6e-5.
+#: Upper bound on the number of grid points, and half width of the grid in prior deviations (6e-5 lies outside).
 _POINTS, _REACH = 801, 4.0
-#: Bounds on the simulated wear path. The path ends when a clearance has grown by `_FURTHER_M` [m] plus `_FURTHER` times
-#: the growth in the history.
+#: Bounds on the simulated wear path, on which a clearance grows by `_FURTHER_M` [m] plus `_FURTHER` times the growth in
+#: the history.
 _FURTHER, _FURTHER_M = 2.0, 5e-4
 
 
@@ -80,10 +78,7 @@ class Coefficient:
         return Interval(self.quantile(0.5), self.quantile(0.05), self.quantile(0.95))
 
     def quantile(self, share: float) -> float:
-        """Return a quantile of k_s in m^2/N. The posterior is widened by the model error `tuning.PATH_DEVIATION`.
-
-        `share` is the probability below the quantile.
-        """
+        """Return the quantile of k_s in m^2/N below which the probability is `share`, with the model error included."""
         middle, point = np.log(np.interp([0.5, share], np.cumsum(self.weight), self.value))
         off = math.hypot(point - middle, tuning.PATH_DEVIATION * float(ndtri(share)))
         return math.exp(float(middle) + math.copysign(off, share - 0.5))
@@ -146,10 +141,7 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
 
 
 def _check_fit(history: History, grown: Array) -> None:
-    """Raise `LifeError` if the clearances contradict the computed growth `grown`, shape (n, 2), in a chi-square test.
-
-    The computed growth has the relative standard deviation `tuning.PATH_DEVIATION`.
-    """
+    """Raise `LifeError` if the clearances contradict the growth `grown`, shape (n, 2), in a chi-square test."""
     weight = 1.0 / (history.deviation**2 + (tuning.PATH_DEVIATION * grown) ** 2)
     apart = history.clearance - grown
     apart -= (weight * apart).sum(axis=0) / weight.sum(axis=0)

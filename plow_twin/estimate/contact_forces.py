@@ -1,10 +1,8 @@
-"""Contact forces that load cells at the guides measure. The forces narrow the intervals of contact parameters and
-clearances.
+"""Contact forces measured by load cells at the guides, which narrow the intervals of contact parameters and clearances.
 
-The fit of the poses gives the motion, and the contact law gives the force of each pair. If the reading of a load cell
-contradicts the force of its pair, the measured forces are not used, and the field `reasons` of the estimate names the
-cell. If each cell agrees with its pair but the motion does not fit all forces, the field `reasons` names the contact
-law. If there is no contradiction, the module `force_fit` fits poses and forces together.
+The fit of the poses gives the motion, and the contact law gives the force of each pair. If a load cell contradicts the
+force of its pair, the measured forces are not used. If there is no contradiction, the module `force_fit` fits poses and
+forces together.
 """
 
 from __future__ import annotations
@@ -29,10 +27,9 @@ Array = NDArray[np.float64]
 
 #: Largest force [N] that is accepted, a guard against faulty readings.
 _LARGEST = 1e12
-#: Largest trial value for the delay of the load cells in s, and step between two trial values. The largest trial value
-#: is derived as three prior deviations of a sensor's delay.
+#: Largest trial value for the delay of the load cells in s (three prior deviations), and step between trial values.
 _LARGEST_DELAY, _DELAY_STEP = 0.15, 2e-3
-#: The contact law as a Python function, because the compiled function cannot be called from Python.
+#: The contact law as a Python function.
 _LAW = getattr(free_force, "py_func", free_force)
 
 
@@ -55,8 +52,7 @@ class ContactForces:
     def of(t: ArrayLike, force: ArrayLike) -> tuple[ContactForces, int]:
         """Return the usable rows in order of time, and the number of rows that are left out.
 
-        A row is left out if its stamp is not finite or repeated, if it contains no force, or if it contains a force
-        above 1e12 N.
+        A row is left out if its stamp is not finite or repeated, or if it contains no force or a force above 1e12 N.
 
         Raises
         ------
@@ -110,7 +106,7 @@ class Cells:
 
 
 class Feeling:
-    """Computation of contact forces from the motion of a fit, at the times of the measured forces."""
+    """Contact forces from the motion of a fit, at the times of the measured forces."""
 
     def __init__(self, problem: Problem, t: Array) -> None:
         window = Window(Poses(t, np.zeros((len(t), 3))), problem.window.starts, problem.window.states)
@@ -138,8 +134,8 @@ class Feeling:
 def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> tuple[Array, Array]:
     """Return the penetrations in m and the forces in N, shape (n, 8) each, for poses and rates of shape (n, 3).
 
-    `depth`, shape (8,), contains the outward displacement of each pad in m. The scene must state the damping. A
-    restitution is not supported, because its damping depends on the speed of each touch.
+    `depth`, shape (8,), contains the outward displacement of each pad in m. The scene must state the damping: that of a
+    restitution depends on the speed of each touch.
     """
     x, y, vx, vy, omega, c, s, _ = body_states(np.hstack((q, v)), scene.head.com_offset_m).T
     rows = penetration_rows(scene)
@@ -157,10 +153,7 @@ def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> t
 
 
 def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells | None, list[str]]:
-    """Return the usable cells, and a reason for each cell that contradicts the motion.
-
-    The cells are None if no cell can be compared with the motion.
-    """
+    """Return the usable cells, or None without any, and a reason for each cell that contradicts the motion."""
     felt = feeling.at(found.shared, found.point.states, 0.0)
     if felt is None:
         return None, []
@@ -178,7 +171,7 @@ def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells
     measured = forces.force - offset
     found_out, pairs = [], []
     largest = float(np.nanmax(felt.force))
-    # the noise has a lower limit, because even a cell that reads exactly 0 in flight has a limited resolution
+    # the resolution of a cell limits its noise
     noise = np.maximum(noise, 1e-4 * largest)
     for i, name in enumerate(PAIR_NAMES):
         there = np.isfinite(measured[:, i]) & (felt.swing >= 0)

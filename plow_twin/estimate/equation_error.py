@@ -1,15 +1,14 @@
 """Estimate of walls and stiffness from the weak form of the equations of motion.
 
-The method simulates no motion, so errors of the load do not accumulate. The equations are multiplied by smooth test
-functions psi. Integration by parts moves the derivatives from the measured poses q to psi:
+No motion is simulated, so errors of the load do not accumulate. Multiplication by smooth test functions psi and
+integration by parts move the derivatives from the measured poses q to psi:
 
     integral psi'' q  =  integral psi (load + contact) / M,
     contact = K sum n p (1 + d p'),   integral psi p p' = -1/2 integral psi' p^2,
 
 where p are the penetrations at the four walls, n the normals, M the mass, K the stiffness and d the damping.
-Gauss-Newton steps determine the positions of the walls, the factor K and the product K d. The remaining acceleration is
-treated as noise. If contacts last only a few samples, the result has a bias, which the module `uncertain_load`
-corrects.
+Gauss-Newton steps determine the positions of the walls, K and K d. If contacts last only a few samples, the result has
+a bias, which the module `uncertain_load` corrects.
 
 References: Shinbrot, Trans. ASME 79 (1957) 67 (modulating functions); Messenger and Bortz, J. Comput. Phys. 443 (2021)
 110525 (weak form).
@@ -34,27 +33,23 @@ from plow_twin.solve.compiled_scene import inertias
 
 Array = NDArray[np.float64]
 
-#: Index of the wall of each pair. By definition, the walls have the order right, left, top, bottom.
+#: Index of the wall of each pair, in the order right, left, top, bottom by definition.
 _WALL: Final = np.argmax(np.stack(WALLS), axis=0)
-#: Parameters of the Gauss-Newton iteration:
-#:
-#: - upper bound on the number of steps
-#: - size of a step in m below which the iteration ends
-#: - largest size of a step in m
+#: Gauss-Newton iteration: upper bound on the number of steps, size in m of the last step, largest size in m of a step.
 _STEPS, _SMALL, _LONGEST = 8, 2e-5, 3e-3
 #: Lower bounds on the interval between rows in s, and on the number of rows in half of a test function.
 _SHORTEST, _FEWEST = 5e-3, 3
 #: Unit of the stiffness in N/m, derived so that all columns of the linear system have about the same size.
 _UNIT = 1e7
-#: Deviate beyond which Huber's function is linear, and standard deviation divided by median absolute deviation. The
-#: quotient is derived for a normal distribution.
+#: Deviate beyond which Huber's function is linear, and standard deviation divided by median absolute deviation, derived
+#: for a normal distribution.
 _HUBER, _MAD = 2.0, 1.4826
-#: Starting values of a search, which lie within the bounds of the unknowns. `_SHARES` are clearances as shares of the
-#: range of motion, `_DEPTHS` are penetrations in m.
+#: Starting values of a search within the bounds of the unknowns: clearances as shares of the range of motion, and
+#: penetrations in m.
 _SHARES, _DEPTHS = (0.25, 0.5, 0.75, 0.95), (3e-3, 6e-3, 12e-3, 20e-3)
 #: Lower and upper bound on the penetration in m under the reference force.
 DEPTHS: Final = (2e-4, 3e-2)
-#: Smallest size of a column of the linear system, a guard against division by zero for columns without information.
+#: Smallest size of a column of the linear system, a guard against division by zero.
 _SINGULAR = 1e-9
 
 
@@ -65,8 +60,7 @@ class Walls:
     reach : (4,) distance in m that the corners can move to the right, left, top and bottom before they touch the wall
     ln_depth : logarithm of the penetration in m under the reference force
     damping : damping factor of the Hunt-Crossley law in s/m
-    left_over : (3,) logarithm of the ratio of two scatters, that of the residual acceleration and that of the
-    acceleration
+    left_over : (3,) logarithm of the residual acceleration's scatter divided by the acceleration's scatter
     loss : sum of the logarithms of the scatters of the residual acceleration
     """
 
@@ -83,7 +77,7 @@ class Walls:
 
     @property
     def features(self) -> Array:
-        """Features of the result for a regression, shape (7,). The first two features are the clearances."""
+        """Features for a regression, shape (7,), of which the first two are the clearances."""
         return np.concatenate([self.clearance, [self.ln_depth, np.clip(self.damping, -2.0, 3.0)], self.left_over])
 
 
@@ -107,8 +101,7 @@ class EquationError:
         half = max(_FEWEST, round(0.5 * tuning.MODULATED / step))
         s, span = np.arange(1 - half, half) / half, half * step
         bump = 1.0 - s * s
-        # the test function (1 - s^2)^3, its first time derivative and its second time derivative, each times the
-        # integration step
+        # the test function (1 - s^2)^3 and its first two time derivatives, times the integration step
         self._value = step * bump**3
         self._slope = -6.0 * step / span * s * bump**2
         self._curve = step / span**2 * (24.0 * s * s * bump - 6.0 * bump**2)
@@ -131,9 +124,7 @@ class EquationError:
         return min(found, key=lambda one: one.loss)
 
     def fit(self, q: Array, reach: Array, ln_depth: float) -> Walls:
-        """Return the fit to the poses `q`, (n, 3). It starts from the reaches (4,) in m and the logarithm of a
-        penetration in m.
-        """
+        """Return the fit to the poses `q`, (n, 3), from starting values of the reaches (4,) [m] and of `ln_depth`."""
         poses = np.stack([np.interp(self._grid, self._t, column) for column in q.T], axis=1)
         corners, normals = self._geometry(poses)
         acceleration = self._weighed(poses, self._curve)
@@ -163,7 +154,7 @@ class EquationError:
     def required_load(self, q: Array, reach: Array, ln_depth: float, damping: float) -> Load:
         """Return the load that moves the head along poses (n, 3) between walls with these properties.
 
-        The load is averaged over the time `tuning.LOAD_AVERAGED`, because its values during impacts are wrong.
+        It is averaged over `tuning.LOAD_AVERAGED`, because its values during impacts are wrong.
         """
         poses = np.stack([np.interp(self._grid, self._t, column) for column in q.T], axis=1)
         stiffness = self._force / math.exp(ln_depth)
@@ -180,9 +171,7 @@ class EquationError:
         return Load(t, mean * self._inertia - weight)
 
     def _geometry(self, q: Array) -> tuple[Array, Array]:
-        """Return the reach of each pair in m, (n, 8), and the acceleration that a unit force of each pair causes, (n,
-        3, 8).
-        """
+        """Return the reach of each pair in m, (n, 8), and the acceleration per force of each pair, (n, 3, 8)."""
         c, s = np.cos(q[:, 2]), np.sin(q[:, 2])
         body = np.stack([c, s, c * q[:, 0] + s * q[:, 1], -s * q[:, 0] + c * q[:, 1]], axis=1)
         x = c[:, None] * NORMAL_X - s[:, None] * NORMAL_Y
@@ -213,9 +202,7 @@ class EquationError:
         return found, target - columns @ found
 
     def _weighed(self, values: Array, kernel: Array) -> Array:
-        """Return the integrals of `values`, (n, ...), times `kernel`, a test function or its derivative, shape (m,
-        ...).
-        """
+        """Return the integrals (m, ...) of `values`, (n, ...), times a test function or its derivative."""
         windows = np.lib.stride_tricks.sliding_window_view(values, len(kernel), axis=0)[:: self._apart]
         out: Array = windows @ kernel
         return out

@@ -1,6 +1,4 @@
-"""Causal computation of forces and clearances over recorded data, in which each row depends only on earlier
-measurements.
-"""
+"""Forces and clearances over recorded data, where each row depends only on earlier measurements."""
 
 from __future__ import annotations
 
@@ -26,13 +24,12 @@ from plow_twin.stream.session import Session
 
 Array = NDArray[np.float64]
 
-#: Length of a window of the estimate in s, and time in s between the ends of successive windows. By definition, the two
-#: numbers are the defaults of the node.
+#: Length of a window of the estimate in s, and time in s between the ends of successive windows; by definition the
+#: defaults of the node.
 WINDOW_S, INTERVAL_S = 32.0, 10.0
 #: Nanoseconds per second, by definition.
 _NS: Final = 1e9
-#: Upper bound in s on the duration of the part of the load that is processed in one call. With this bound, the rows of
-#: all members fit into the processor's cache.
+#: Upper bound in s on the load that is processed in one call, so that all rows fit into the processor's cache.
 _PART_S: Final = 0.02
 
 
@@ -58,7 +55,7 @@ class Followed:
 
     @classmethod
     def of(cls, t: Array, rows: NDArray[np.void]) -> Followed:
-        """Return forces and clearances from the rows of a twin that follows measurements."""
+        """Return forces and clearances from the rows of a follower."""
         clearance = rows["known_clearance"].reshape(-1, 2, 3)
         return cls(t, rows["force"], rows["force_low"], rows["force_high"], clearance)
 
@@ -117,7 +114,7 @@ def follow(
 
 
 class _Steps:
-    """Loop that passes the load and all measurements to a session in order of their stamps, as a live twin does."""
+    """Loop that passes the load and all measurements to a session in order of their stamps."""
 
     def __init__(
         self, scene: Scene, load: Load, poses: Poses, gaps: Gaps | None, members: int, seed: int, span: float | None
@@ -138,7 +135,7 @@ class _Steps:
 
     def rows(self, dt: float | None) -> Iterator[Followed]:
         step = max(1, int(np.searchsorted(self._load.t, self._load.t[0] + _PART_S)))
-        # the first sample is processed separately, because there is no motion before it
+        # there is no motion before the first sample
         for first in (0, *range(1, len(self._stamps), step)):
             part = slice(first, min(first + step, len(self._stamps)) if first else 1)
             if first:

@@ -1,9 +1,9 @@
 """Joint fit of poses and contact forces by Gauss-Newton steps, starting from the fit of the poses.
 
 The unknowns are the shared unknowns, the delay of the forces, and the logarithm of the gain of each load cell. The
-starting state of each swing is eliminated. A force that is hard to predict has less weight, and Huber's function limits
-the influence of each force. The intervals are widened according to the scatter of the scores of the swings (White
-1982). A swing is a part of the motion that begins in flight.
+starting state of each swing (a part of the motion that begins in flight) is eliminated. A force that is hard to predict
+has less weight, and Huber's function limits the influence of each force. The intervals are widened according to the
+scatter of the scores of the swings (White 1982).
 """
 
 from __future__ import annotations
@@ -23,18 +23,13 @@ from plow_twin.model.pairs import PAIR_NAMES
 
 Array = NDArray[np.float64]
 
-#: Upper bound on the number of rows. In a window of ten load periods, it corresponds to about 200 rows per second.
+#: Upper bound on the number of rows, about 200 per second in a window of ten load periods.
 _MOST_ROWS = 6000
-#: Parameters of the Gauss-Newton iteration:
-#:
-#: - upper bound on the number of steps
-#: - number of initial steps in which the predictability is probed
-#: - number of random probes in each of these steps
-#: - reduction of the cost below which the iteration ends, because the step is within the noise
+#: Gauss-Newton iteration: upper bound on the number of steps, number of first steps with random probes of the
+#: predictability, number of probes in each, and reduction of the cost (within the noise) by the last step.
 _ROUNDS, _DRAWN_ROUNDS, _PROBES, _ENOUGH = 8, 3, 3, 0.5
-#: Steps of the two-sided difference quotients with respect to the delay in s and to a starting state. The steps are
-#: small and two-sided, because with the larger one-sided steps of the fit of the poses, clearances were wrong by 4
-#: standard deviations.
+#: Steps of the two-sided difference quotients with respect to the delay in s and to a starting state. With the larger
+#: one-sided steps of the fit of the poses, clearances were wrong by 4 standard deviations.
 _DELAY_STEP = 2e-5
 _STATE_STEPS = np.array([1e-5, 1e-5, 5e-5, 2e-4, 2e-4, 1.4e-3])
 
@@ -69,7 +64,7 @@ class _Place:
 
 @dataclass(frozen=True, eq=False)
 class _At:
-    """Values of the unknowns, with the predicted motion and the predicted readings of the cells `force`, shape (m,)."""
+    """Values of the unknowns, with the predicted motion and the predicted forces of the cells, shape (m,)."""
 
     place: _Place
     point: Point
@@ -78,7 +73,7 @@ class _At:
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """Normal equations of a swing for the *border*, which consists of all unknowns except the starting states.
+    """Normal equations of a swing for the *border*, all unknowns except the starting states.
 
     normal : (b, b) matrix for the unknowns of the border
     score : (b,) right-hand side for the unknowns of the border
@@ -108,15 +103,12 @@ class _Block:
 
 
 def not_used(why: str) -> JointFit:
-    """Return the result if the forces are not used, for the reason `why`."""
+    """Return the result without the forces, for the reason `why`."""
     return JointFit(ForcesUsed(unused=why))
 
 
 def fit_jointly(problem: Problem, found: Fit, forces: ContactForces, widened: float) -> JointFit:
-    """Return the joint fit of poses and forces, which starts from a fit of the poses.
-
-    `widened` is a factor on the variance of the noise of the poses.
-    """
+    """Return the joint fit of poses and forces. `widened` is a factor on the variance of the poses' noise."""
     if problem.unknowns.scene.contact.restitution is not None:
         return not_used("the law's damping follows from the speed of each touch")
     if len(problem.link):
@@ -163,8 +155,7 @@ class _Joint:
             return not_used("the model cannot be run")
         linear, jacobian = self._linearised(at)
         for index in range(_ROUNDS):
-            # in the first step, the random probes are drawn from the uncertainty of the poses; from the second step on,
-            # they are drawn from the joint uncertainty of poses and forces
+            # the first probes are drawn from the uncertainty of the poses, later probes from the joint uncertainty
             if index < _DRAWN_ROUNDS:
                 self._weigh(at.force)
                 known = self._blocks(at, linear, jacobian if index else 0.0 * jacobian)
@@ -210,11 +201,7 @@ class _Joint:
         return self._problem.cost(at.point, self._variance) + float(np.nansum(loss) + np.isnan(loss).sum()) + prior
 
     def _linearised(self, at: _At) -> tuple[Linear, Array]:
-        """Return the Jacobians of the poses and of the forces.
-
-        The Jacobian of the forces, shape (m, b + 6), contains the derivatives with respect to the border and to the
-        starting state of the swing.
-        """
+        """Return the Jacobian of the poses, and that of the forces (m, b + 6) for the border and the starting state."""
         place, border = at.place, self._border
         out = np.zeros((len(self._row), border + 6))
         for j in MOVING:
@@ -289,7 +276,7 @@ class _Joint:
         return None
 
     def _unpredicted(self, at: _At, jacobian: Array, blocks: list[_Block]) -> Array:
-        """Return the variance of the forces that the linearisation does not predict, shape (m,), from random probes."""
+        """Return the variance of the forces, shape (m,), that the linearisation does not predict, by random probes."""
         rng, place, total = np.random.default_rng(0), at.place, np.zeros(len(at.force))
         root = np.linalg.cholesky(self._step(at, blocks)[1][:SIZE, :SIZE])
         for _ in range(_PROBES):
@@ -340,9 +327,7 @@ class _Joint:
         return JointFit(used, place.shared, covariance[:SIZE, :SIZE])
 
     def _unfitted(self, at: _At) -> int:
-        """Return the number of swings with forces that do not fit, which indicate a false optimum of the starting
-        state.
-        """
+        """Return the number of swings whose forces do not fit because of a false optimum of the starting state."""
         z = (self._measured - at.force) ** 2 / self._spread
         z, swing = z[np.isfinite(z)], self._swing[np.isfinite(z)]
         count, total = np.bincount(swing), np.bincount(swing, z)

@@ -1,9 +1,8 @@
 """Contact forces with intervals, from an ensemble of twins with parameters drawn from an estimate.
 
-A twin of the ensemble is called a member. The clearances, the contact parameters and the load gains of each member are
-drawn from the estimate with their correlations. The ends of a force's interval are quantiles of this force over the
-members. After some load periods the initial states have no influence, so the differences between members show only the
-uncertainty of the estimate.
+The clearances, contact parameters and load gains of each twin (member) are drawn from the estimate with their
+correlations. The intervals are quantiles over the members. After some load periods the initial states have no
+influence, so the members differ only by the uncertainty of the estimate.
 """
 
 from __future__ import annotations
@@ -26,19 +25,17 @@ from plow_twin.run.batch import TwinBatch
 
 Array = NDArray[np.float64]
 
-#: Default number of members. It is derived from the standard error of the probability below the 5 % quantile, which is
-#: 1.4 %.
+#: Default number of members, derived from a standard error of 1.4 % of the probability below the 5 % quantile.
 MEMBERS: Final = 256
-#: Definition of an interval by three probabilities, for its lower end, its middle and its upper end.
+#: Definition of an interval by the probabilities of its lower end, middle and upper end.
 POINTS: Final = (0.05, 0.5, 0.95)
-#: Smallest number of members. It is derived from the condition that at least one member lies below the 5 % quantile.
+#: Smallest number of members, derived from one member below the 5 % quantile.
 FEWEST: Final = 20
 #: Lower bound on the clearance of a member, as a share of the estimated clearance.
 _LEAST_SHARE = 0.02
 #: Tolerance of the solver for the members, equal to the tolerance in a fit.
 TOLERANCE: Final = tuning.TOLERANCE
-#: Upper bound on the number of samples in one call. With this bound, the rows of all members fit into the processor's
-#: cache.
+#: Upper bound on the number of samples in one call, so that the rows of all members fit into the processor's cache.
 _CALL = 10
 
 
@@ -86,7 +83,7 @@ class Forces:
 
 
 class ForceEnsemble:
-    """Ensemble of twins with parameters drawn from an estimate. All twins are advanced together.
+    """Ensemble of twins with parameters drawn from an estimate.
 
     Parameters
     ----------
@@ -162,7 +159,7 @@ def quantiles(values: Array) -> Array:
     """Return the nearest-rank quantiles of non-negative values over the first axis, in the order of `POINTS`."""
     places = [min(int(share * len(values)), len(values) - 1) for share in POINTS]
     out = np.zeros((len(POINTS), *values.shape[1:]))
-    # in most pairs the forces of all members are 0, so their quantiles are 0 without sorting
+    # in most pairs the forces of all members are 0
     there = values.any(axis=0)
     out[:, there] = np.partition(np.ascontiguousarray(values[:, there].T), places, axis=1)[:, places].T
     return out
@@ -173,7 +170,7 @@ def forces_of(
 ) -> Forces:
     """Return the forces under a load, beginning `settle_s` [s] after the first sample of the load.
 
-    The time `settle_s` must be so long that the initial states of the members have no more influence on the forces.
+    After `settle_s`, the initial states of the members must have no influence on the forces.
     """
     ensemble = ForceEnsemble(scene, found, members, start=float(load.t[0]))
     load = load.with_knot(float(load.t[0]) + settle_s)
@@ -225,9 +222,7 @@ def draw_biases(found: Estimate, members: int, rng: np.random.Generator) -> Arra
 
 
 def amplitudes_of(found: Estimate, members: int, rng: np.random.Generator) -> Array:
-    """Return amplitudes of the load's harmonics drawn from an estimate, shape (m, k, 3). The first member has the mean
-    amplitudes.
-    """
+    """Return amplitudes of the load's harmonics drawn from an estimate, shape (m, k, 3); the first has the means."""
     harmonics = found.load_harmonics
     return np.zeros((members, 0, 3)) if harmonics is None else harmonics.drawn(members, rng)
 
@@ -235,8 +230,8 @@ def amplitudes_of(found: Estimate, members: int, rng: np.random.Generator) -> Ar
 def loads_of(t: Array, wrench: Array, gain: Array, harmonics: Harmonics | None, amplitude: Array) -> Array:
     """Return the loads of the members, shape (m, n, 3).
 
-    The samples have the times `t`, shape (n,), and the values `wrench`, shape (n, 3). The load of a member has the
-    gains of a row of `gain`, shape (m, 3), and the amplitudes of harmonics in `amplitude`, shape (m, k, 3).
+    The samples `wrench`, shape (n, 3), at the times `t` are added to harmonics of the amplitudes `amplitude`, shape
+    (m, k, 3), and multiplied by `gain`, shape (m, 3).
     """
     if harmonics is not None:
         wrench = wrench + harmonics.basis(t) @ amplitude
@@ -245,7 +240,7 @@ def loads_of(t: Array, wrench: Array, gain: Array, harmonics: Harmonics | None, 
 
 
 def _normal(value: Interval, white: Array) -> Array:
-    """Return random numbers with the 5 % and 95 % quantiles of an interval, from standard normal numbers `white`."""
+    """Convert standard normal numbers to numbers with the 5 % and 95 % quantiles of an interval."""
     below, above = (value.mean - value.p05) / NORMAL_P95, (value.p95 - value.mean) / NORMAL_P95
     return value.mean + np.where(white < 0.0, below, above) * white
 
