@@ -1,4 +1,4 @@
-"""Forecast of the remaining life, which is the time until a clearance reaches its limit, as a distribution.
+"""Forecast of the remaining life, the time until a clearance reaches its limit, as a distribution.
 
 The wear coefficient, the present clearances and the size of the load are drawn at random. A scenario repeats the
 forecast with the same random numbers, but with a different load or wear coefficient.
@@ -27,13 +27,13 @@ Array = NDArray[np.float64]
 
 #: Seconds per hour, by definition.
 HOUR_S = 3600.0
-#: Upper bound on the share by which a drawn clearance may be smaller than the estimated clearance.
+#: Upper bound on the share by which a drawn clearance is smaller than the estimated clearance.
 _LEAST_SHARE = 0.9
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """A scenario of a forecast: multiples of the expected load and of the expected wear coefficient."""
+    """Multiples of the expected load and of the expected wear coefficient for a forecast."""
 
     name: str
     load: float = 1.0
@@ -41,7 +41,7 @@ class Scenario:
 
     @staticmethod
     def parse(text: str) -> Scenario:
-        """Return the scenario that a text like `hard coal:load=1.3,coefficient=2` describes.
+        """Return the scenario of a text like `hard coal:load=1.3,coefficient=2`.
 
         Raises
         ------
@@ -64,7 +64,7 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Plan:
-    """Settings of a forecast, such as the limits of the clearances [m], the horizon [h] and the planned stop [h]."""
+    """Settings of a forecast, such as the limits of the clearances [m] and the horizon [h]."""
 
     limit_horizontal_m: float
     limit_vertical_m: float
@@ -121,9 +121,7 @@ class Forecast:
     scenarios: dict[str, Forecast] = field(default_factory=dict)
 
     def quantile(self, share: float) -> float | None:
-        """Return the number of hours within which the limit is reached with the probability `share`; None beyond the
-        horizon.
-        """
+        """Return the hours within which the limit is reached with the probability `share`; None beyond the horizon."""
         value = float(np.sort(self.hours)[min(int(share * len(self.hours)), len(self.hours) - 1)])
         return value if math.isfinite(value) else None
 
@@ -132,10 +130,9 @@ class Forecast:
         return float(np.mean(self.hours <= hours))
 
     def clearances(self, hours: Array) -> Array:
-        """Return quantiles of both clearances in m after `hours`, shape (n,). The result has the shape (3, n, 2).
+        """Return the 10 %, 50 % and 90 % quantiles of both clearances in m after `hours`, shape (n,), as (3, n, 2).
 
-        The quantiles are the 10 %, the 50 % and the 90 % quantile. A quantile is infinite if it lies beyond the end of
-        the path, at which a limit has been reached.
+        A quantile beyond the end of the path, at which a limit has been reached, is infinite.
         """
         grown = self.path.clearance_growth()
         exposure = np.multiply.outer(self.rate, hours)
@@ -196,9 +193,8 @@ def forecast(
     deviation_m : tuple of float
         Standard deviations of the present clearances in m.
     known : Coefficient or None
-        Posterior of the wear coefficient from a history of clearances; None for the prior. The posterior includes the
-        uncertainty of the load. With a posterior, the size of the load is therefore not drawn, but the model error
-        `tuning.PATH_DEVIATION` is drawn.
+        Posterior of the wear coefficient from a history of clearances; None for the prior. It includes the uncertainty
+        of the load, so the model error `tuning.PATH_DEVIATION` is drawn instead of the size of the load.
 
     Raises
     ------
@@ -229,10 +225,10 @@ def _forecast(
         coefficient, load = known.draw(plan.draws, rng), 1.0 + tuning.PATH_DEVIATION * rng.standard_normal(plan.draws)
     coefficient = coefficient * multiple
     size = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
-    # a drawn clearance must stay above zero, even if the clearance is very uncertain
+    # a drawn clearance must stay above zero
     now = np.maximum(rng.normal(0.0, 1.0, (plan.draws, 2)) * deviation_m, -_LEAST_SHARE * size)
     most = float(coefficient.max() * load.max()) * travel / wear.pad_area_m2
-    # the path must be so long that even the smallest drawn clearance, which is farthest from its limit, reaches it
+    # even the smallest drawn clearance must reach its limit
     spare = tuple(float(value) for value in -now.min(axis=0))
     limit = (plan.limit_horizontal_m + spare[0], plan.limit_vertical_m + spare[1])
     path = wear_path(scene, limit, most)
@@ -260,16 +256,14 @@ def check_prior(wear: Wear) -> None:
 
 
 def _exposure_at(exposure: Array, clearance: Array, limit: Array) -> Array:
-    """Return the exposure at which a non-decreasing clearance reaches each limit; it is infinite for a limit out of
-    reach.
-    """
+    """Return the exposure at which a non-decreasing clearance reaches each limit; infinite for a limit out of reach."""
     rising = np.maximum.accumulate(clearance) + 1e-15 * np.arange(len(clearance))
     at = np.interp(limit, rising, exposure)
     return np.where(limit > rising[-1], np.inf, np.where(limit <= rising[0], 0.0, at))
 
 
 def with_load(scene: Scene, multiple: float) -> Scene:
-    """Return the scene with all loads multiplied by `multiple`; gravity does not change."""
+    """Return the scene with all loads, but not gravity, multiplied by `multiple`."""
 
     def times(values: tuple[float, float]) -> tuple[float, float]:
         return multiple * values[0], multiple * values[1]
@@ -288,9 +282,8 @@ def with_load(scene: Scene, multiple: float) -> Scene:
 def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth: Array | None = None) -> Scene:
     """Return the scene with estimated clearances, which are clearances of worn pads.
 
-    `depth`, shape (8,), contains the wear depths of the pads in m, which are subtracted to obtain the clearances of new
-    pads. If the depths are not given but the scene has running-in, the depths are computed from the growth of the
-    clearances. The depths matter because with running-in, worn pads wear more slowly than new pads.
+    `depth`, shape (8,), contains the wear depths of the pads in m. For a scene with running-in, in which worn pads wear
+    more slowly than new pads, the default is computed from the growth of the clearances.
     """
     wear, new = scene.wear, scene.clearance
     if wear is None:
@@ -309,8 +302,7 @@ def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth:
 def with_estimate(scene: Scene, facts: Mapping[str, Any]) -> tuple[Scene, tuple[float, float]]:
     """Return the scene with the values of an estimate (JSON), and the standard deviations of the clearances in m.
 
-    If a clearance was estimated, the estimated contact parameters are used, because the stiffness determines which pads
-    are loaded.
+    The estimated contact parameters are used if a clearance was estimated.
 
     Raises
     ------

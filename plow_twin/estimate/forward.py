@@ -1,4 +1,4 @@
-"""The forward model of the estimate, which simulates a scene with varied parameters under the measured load."""
+"""The forward model of the estimate: simulations of a scene with varied parameters under the measured load."""
 
 from __future__ import annotations
 
@@ -20,11 +20,10 @@ from plow_twin.solve.state import EVENT, SEGMENT, TOTALS, Parts, Status, new_rec
 
 Array = NDArray[np.float64]
 
-#: Upper bounds on one simulation. The number of steps is at most `_STEPS` plus `_STEPS_PER_SECOND` for each second of
-#: motion. The event log has at most `_LOG_SIZE` rows.
+#: Upper bounds on one simulation: `_STEPS` plus `_STEPS_PER_SECOND` for each second, and rows of the event log.
 _STEPS_PER_SECOND, _STEPS = 20_000, 2_000
 _LOG_SIZE = 4096
-#: Cost of an implicit step, expressed as a number of series steps. The cost counts towards the upper bound on the work.
+#: Cost of an implicit step in series steps.
 _IMPLICIT_WORK = 10
 
 
@@ -79,7 +78,7 @@ class Forward:
         return Forward(self._scene, self.load)
 
     def of(self, scene: Scene) -> Forward:
-        """Return a model of the nominal scene `scene` under the load of this model, with the work counter at zero."""
+        """Return a model of the nominal scene `scene` under this load, with the work counter at zero."""
         return Forward(scene, self.load)
 
     def under(self, load: Load) -> Forward:
@@ -141,7 +140,7 @@ class Forward:
             if depth is not None:
                 params["penetration_rows"][4] -= depth
             if share is not None:
-                # with a linear law, a factor on the penetration has the same effect as a factor on the stiffness
+                # under a linear law, equivalent to a factor on the stiffness
                 params["penetration_rows"][:] *= share
             self._params = scene, walls, params
         inertia = inertias(scene)

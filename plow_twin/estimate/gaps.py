@@ -1,8 +1,8 @@
-"""Clearances from gap sensors, independent of the contact law. If no poses are measured, the gaps give the poses.
+"""Clearances from gap sensors, independent of the contact law, and poses if no poses are measured.
 
 A gap is linear in the clearances and in the head's body coordinates (`model/geometry.py`). A message with gaps of five
-pairs therefore determines clearances and pose by least squares. If theta is measured, gaps of four pairs are enough,
-one at each wall. The accuracy is limited by the constant errors of the sensors, which averaging does not reduce.
+pairs, or of four if theta is measured, determines clearances and pose by least squares. The constant errors of the
+sensors limit the accuracy.
 """
 
 from __future__ import annotations
@@ -25,14 +25,11 @@ Array = NDArray[np.float64]
 
 #: Largest distance [m] that is accepted as a gap, a guard against faulty readings.
 _LARGEST = 1e3
-#: Upper bound on the number of iterations. In each iteration, the residual of the nonlinear equations corrects the
-#: pose.
+#: Upper bound on the number of iterations for the nonlinear equations.
 _ROUNDS = 4
-#: Lower bound on a singular value of the equations. A smaller singular value shows that the sensors do not determine an
-#: unknown.
+#: Lower bound on a singular value of the equations, below which the sensors do not determine an unknown.
 _SINGULAR = 1e-6
-#: Definition of the groups of facing pads. A group consists of two opposite pairs, and their gaps determine a
-#: clearance.
+#: Definition of the groups of two facing pads, whose gaps determine a clearance.
 GROUPS: Final = {
     "horizontal_top": (1, 3),
     "horizontal_bottom": (7, 5),
@@ -62,8 +59,7 @@ class Gaps:
     def of(t: ArrayLike, gap: ArrayLike, deviation: float = 0.0) -> tuple[Gaps, int]:
         """Return the usable rows in order of time, and the number of rows that are left out.
 
-        A row is left out if its stamp is not finite or repeated, if it contains no gap, or if it contains a gap above
-        1e3 m.
+        A row is left out if its stamp is not finite or repeated, or if it contains no gap or a gap above 1e3 m.
 
         Raises
         ------
@@ -86,7 +82,7 @@ class GapsFit:
     poses : poses computed from the gaps; empty if theta was taken from measured poses
     clearance : (2,) horizontal and vertical clearance in m
     deviation : (2,) standard deviations of the clearances in m
-    groups : clearance between each two facing pads with sensors
+    groups : clearance of each group of facing pads with sensors
     used : number of messages that were used
     contradiction : largest mean residual of a sensor in units of its constant error; 0 if no sensor is redundant
     """
@@ -102,8 +98,8 @@ class GapsFit:
 def fit_gaps(scene: Scene, gaps: Gaps, poses: Poses) -> GapsFit | str:
     """Return the fit of clearances and poses to gaps, or a message why there is no fit.
 
-    If the gaps do not determine theta, theta is taken from `poses`. Messages may contain different sets of sensors. Of
-    the sets that determine the unknowns, the most frequent one is used. It must occur in at least 20 messages.
+    If the gaps do not determine theta, it is taken from `poses`. The most frequent set of sensors that determines the
+    unknowns is used. It must occur in at least 20 messages.
     """
     error = gaps.deviation or tuning.CONSTANT_ERROR
     rows = penetration_rows(replace(scene, clearance=Clearance(0.0, 0.0)))
@@ -141,7 +137,7 @@ def _fit_one_set(
     `gap`, shape (n, k), contains the gaps of the pairs with the indices `pairs`, shape (k,).
     """
     names = ", ".join(PAIR_NAMES[pair] for pair in pairs)
-    # the gap of a pair is half the clearance minus the reach of its corner
+    # gap of a pair: half the clearance minus the reach of its corner
     half = 0.5 * np.abs(np.stack([NORMAL_X, NORMAL_Y], axis=1))[pairs]
     fixed = np.concatenate([-rows[2:4, pairs].T, half], axis=1)
     with_turn = np.concatenate([fixed, -rows[1, pairs][:, None]], axis=1)
@@ -160,14 +156,14 @@ def _fit_one_set(
     inverse = np.linalg.pinv(equations)
     left = np.zeros_like(gap)
     for _ in range(_ROUNDS):
-        # theta is small, so the iterations converge with the derivatives at theta = 0
+        # the derivatives at theta = 0 suffice for a small theta
         c, s = np.cos(unknown[:, 4]), np.sin(unknown[:, 4])
         reach = c[:, None] * rows[0, pairs] + s[:, None] * rows[1, pairs] + rows[4, pairs]
         left = gap - (unknown[:, :4] @ fixed.T - reach)
         unknown[:, : equations.shape[1]] += left @ inverse.T
     x, y = _displacement(unknown, scene)
     clearance = np.median(unknown[:, 2:4], axis=0)
-    # averaging reduces only the noise, not the constant errors of the sensors
+    # averaging does not reduce the constant errors of the sensors
     spread = error * np.sqrt((inverse[2:4] ** 2).sum(axis=1))
     noise = unknown[:, 2:4].std(axis=0) / np.sqrt(len(t))
     q = np.stack([x, y, unknown[:, 4]], axis=1)

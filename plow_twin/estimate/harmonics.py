@@ -1,7 +1,4 @@
-"""Harmonics that are missing from a measured load, as Fourier terms at low multiples of the load's frequency.
-
-A working load is periodic, so the missing part of a measured load is mostly periodic with the period of the load.
-"""
+"""Harmonics that are missing from a measured load, as Fourier terms at low multiples of the load's frequency."""
 
 from __future__ import annotations
 
@@ -22,18 +19,17 @@ Array = NDArray[np.float64]
 COMPONENTS: Final = ("fx", "fy", "m")
 #: Upper bound on the number of corrections of a load's frequency, which converge quadratically.
 _CORRECTIONS = 6
-#: Number of knots in the shortest period of a harmonic, derived from the error of linear interpolation, which is 0.9 %.
+#: Number of knots in the shortest period of a harmonic, derived from an error of linear interpolation of 0.9 %.
 _KNOTS = 24
 
 
 @dataclass(frozen=True, eq=False)
 class Harmonics:
-    """Fourier terms that are added to a load. They are a constant, and sine and cosine of each multiple of the
-    frequency.
+    """Fourier terms that are added to a load: a constant, and sine and cosine of each multiple of the frequency.
 
     omega : angular frequency of the load in rad/s
     multiples : multiples of `omega` for which there are terms
-    size : (3,) unit of the amplitudes in N, N, N m. In a fit, it is half the range of the measured load.
+    size : (3,) unit of the amplitudes in N, N, N m; in a fit, half the range of the measured load
     amplitude : (k, 3) amplitude of each term in units of `size`
     variance : (k, 3) variance of each amplitude in units of the square of `size`
     begin : time in s at which the phases are zero
@@ -48,9 +44,7 @@ class Harmonics:
 
     @staticmethod
     def of(load: Load) -> Harmonics | None:
-        """Return harmonics of the frequency of a load, with zero amplitude; None if the load has fewer than two
-        periods.
-        """
+        """Return harmonics of a load's frequency with zero amplitude; None with fewer than two periods."""
         omega = frequency(load)
         if omega is None:
             return None
@@ -98,9 +92,7 @@ class Harmonics:
         return replace(load, t=t, wrench=wrench + self.at(t))
 
     def moved(self, by: Array, variance: Array | None = None) -> Harmonics:
-        """Return harmonics with `by`, shape (3 k,), added to the amplitudes. If `variance`, shape (3 k,), is given, it
-        replaces the variances.
-        """
+        """Return harmonics with `by`, shape (3 k,), added to the amplitudes, and with the given variances, if any."""
         shape = self.amplitude.shape
         known = self.variance if variance is None else variance.reshape(shape)
         return replace(self, amplitude=self.amplitude + by.reshape(shape), variance=known)
