@@ -68,8 +68,9 @@ class Compared:
 class _Spread:
     """Distribution of the draws. The clearances in m have the mean `centre`, shape (2,), and the deviation `about`.
 
-    The logarithms of penetration [m], damping and relative load error each have a mean and a standard deviation. If
-    `yields` is true, the clearances are the mean minus random penetrations of both walls.
+    The logarithms of penetration [m], damping and relative load error each have a mean and a standard deviation. The
+    clearances are reduced by random penetrations of both walls, with the median `yielded` relative to the penetration
+    under the reference force.
     """
 
     centre: Array
@@ -77,7 +78,27 @@ class _Spread:
     ln_depth: tuple[float, float]
     ln_damping: tuple[float, float]
     ln_error: tuple[float, float]
-    yields: bool = False
+    yielded: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """Parts of the comparison that depend on the measured quantities.
+
+    features : function that computes features of poses (n, 3); the first two are distances in m near the clearances
+    spread : distribution of the first draws
+    touched : as in `Compared`
+    draws : number of draws in a round
+    unexplained : share of the regression's correction that is added to the deviation, and constant in m that is added
+    load : function that returns the load for drawn clearances (2,) in m and drawn numbers (5,)
+    """
+
+    features: Callable[[Array], Array]
+    spread: _Spread
+    touched: NDArray[np.bool_]
+    draws: int
+    unexplained: tuple[float, ...]
+    load: Callable[[Array, Array], Load]
 
 
 def compare_under_uncertain_load(
@@ -108,29 +129,26 @@ def compare_under_uncertain_load(
     """
     rng = np.random.default_rng(seed)
     seen = MotionFeatures(unknowns, poses, period)
-    angle = bool(np.isfinite(poses.q[:, 2]).any())
     if felt is None:
-        motion = EquationError(unknowns, Load.unmeasured(period), poses.t)
-        features, spread, touched = _without_load(seen, unknowns, poses)
+        by = _without_load(seen, unknowns, poses, period)
+    elif poses.measured[2]:
+        by = _with_angle(seen, felt, unknowns, poses)
     else:
-        features, spread, touched = (_with_angle if angle else _without_angle)(seen, felt, unknowns, poses)
-    measured = features(seen.q)
+        by = _without_angle(seen, felt, unknowns, poses)
+    spread, measured = by.spread, by.features(seen.q)
     rows: list[Array] = []
     targets: list[Array] = []
     work = 0
     found = None
     for _ in range(_ROUNDS):
-        for _ in range(tuning.UNCERTAIN_DRAWS[0 if angle and felt is not None else 1]):
+        for _ in range(by.draws):
             clearance, numbers, ln_error = _draw(spread, rng)
             other = _with_exponent(unknowns, rng)
-            load = felt
-            if load is None:
-                load = motion.required_load(seen.q, np.repeat(0.5 * clearance, 2), numbers[0], math.exp(numbers[1]))
-            forward = Forward(other.scene, _with_error(load, math.exp(ln_error), rng))
+            forward = Forward(other.scene, _with_error(by.load(clearance, numbers), math.exp(ln_error), rng))
             q = seen.look(forward, other, clearance, numbers, 0.0, rng)
             work += forward.work
             if q is not None:
-                rows.append(features(q))
+                rows.append(by.features(q))
                 targets.append(np.concatenate([clearance - rows[-1][:2], numbers[:2], [ln_error]]))
         if len(rows) < _FEWEST:
             return None, work
@@ -146,16 +164,14 @@ def compare_under_uncertain_load(
     assert found is not None
     if (spread.centre < LEAST_CLEARANCE).any():  # an extrapolation of the regression beyond all draws
         return None, work
-    share, least = tuning.CORRECTED if angle else (0.0, 0.0)
-    if felt is None:
-        share, least = tuning.YIELDED[2], 0.0
+    share, least = by.unexplained
     unexplained = np.hypot(share * value[:2], least)
     # a clearance that still changes has not converged, so its last change is added to its deviation
     moved = spread.centre - before
     return Compared(
         spread.centre,
         np.sqrt(deviation[:2] ** 2 + unexplained**2 + moved**2),
-        touched,
+        by.touched,
         (float(value[2]), float(deviation[2])),
         (float(value[3]), float(deviation[3])),
         found.distance,
@@ -163,13 +179,12 @@ def compare_under_uncertain_load(
     ), work
 
 
-_Look = tuple[Callable[[Array], Array], _Spread, NDArray[np.bool_]]
+def _without_load(seen: MotionFeatures, unknowns: Unknowns, poses: Poses, period: float) -> _Comparison:
+    """Return the comparison for a load that was not measured; motions are compared by reaches and changes."""
+    equations = EquationError(unknowns, Load.unmeasured(period), poses.t)
 
-
-def _without_load(seen: MotionFeatures, unknowns: Unknowns, poses: Poses) -> _Look:
-    """Return the result of `_with_angle` for a load that was not measured; motions are compared by reaches and
-    changes.
-    """
+    def load(clearance: Array, numbers: Array) -> Load:
+        return equations.required_load(seen.q, np.repeat(0.5 * clearance, 2), numbers[0], math.exp(numbers[1]))
 
     def features(q: Array) -> Array:
         values = seen.features(q)
@@ -182,16 +197,14 @@ def _without_load(seen: MotionFeatures, unknowns: Unknowns, poses: Poses) -> _Lo
         _middle(DEPTHS),
         (_damping(unknowns), tuning.UNCERTAIN_SPREAD[2]),
         _middle(tuning.LOAD_ERRORS),
-        True,
+        tuning.YIELDED[0],
     )
-    moved = np.nanstd(poses.q[:, :2], axis=0) > tuning.RESTS * noise_level(seen.q)[:2]
-    return features, spread, moved
+    unexplained = tuning.YIELDED[2], 0.0
+    return _Comparison(features, spread, _moved(seen, poses), tuning.UNCERTAIN_DRAWS[1], unexplained, load)
 
 
-def _with_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Poses) -> _Look:
-    """Return the function that computes features, the distribution of the first draws, and the field `touched` of
-    `Compared`.
-    """
+def _with_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Poses) -> _Comparison:
+    """Return the comparison by the weak form of the equations of motion, which needs load and theta."""
     about, softness, damping = tuning.UNCERTAIN_SPREAD
     equations = EquationError(unknowns, felt, poses.t)
     first = equations.search(seen.q, range_of_motion(unknowns.scene, poses)[0])
@@ -207,10 +220,12 @@ def _with_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Pos
         first.clearance, about, (ln_depth, softness), (_damping(unknowns), damping), _middle(tuning.LOAD_ERRORS)
     )
     touched = np.asarray((times.reshape(2, 2) > tuning.TOUCHED).all(axis=1))
-    return features, spread, touched
+    draws = tuning.UNCERTAIN_DRAWS[0]
+    return _Comparison(features, spread, touched, draws, tuning.CORRECTED, lambda clearance, numbers: felt)
 
 
-def _without_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Poses) -> _Look:
+def _without_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Poses) -> _Comparison:
+    """Return the comparison by reaches, for a theta that was not measured."""
     nominal, deviations = unknowns.nominal(), unknowns.deviations()
 
     def features(q: Array) -> Array:
@@ -220,8 +235,14 @@ def _without_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: 
     depth = _middle(DEPTHS)
     damping = (_damping(unknowns), tuning.UNCERTAIN_SPREAD[2])
     spread = _Spread(nominal[:2], float(deviations[:2].max()) / 2.0, depth, damping, _middle(tuning.LOAD_ERRORS))
-    moved = np.nanstd(poses.q[:, :2], axis=0) > tuning.RESTS * noise_level(seen.q)[:2]
-    return features, spread, moved
+    moved, draws = _moved(seen, poses), tuning.UNCERTAIN_DRAWS[1]
+    return _Comparison(features, spread, moved, draws, (0.0, 0.0), lambda clearance, numbers: felt)
+
+
+def _moved(seen: MotionFeatures, poses: Poses) -> NDArray[np.bool_]:
+    """Return whether x and y moved by more than their noise, shape (2,)."""
+    moved: NDArray[np.bool_] = np.nanstd(poses.q[:, :2], axis=0) > tuning.RESTS * noise_level(seen.q)[:2]
+    return moved
 
 
 def _middle(bounds: tuple[float, ...]) -> tuple[float, float]:
@@ -241,9 +262,7 @@ def _draw(spread: _Spread, rng: np.random.Generator) -> tuple[Array, Array, floa
     white = rng.standard_normal(8)
     ln_depth = np.clip(spread.ln_depth[0] + spread.ln_depth[1] * white[2], *np.log(DEPTHS))
     clearance = spread.centre + spread.about * white[:2]
-    if spread.yields:
-        middle, about, _ = tuning.YIELDED
-        clearance -= middle * np.exp(ln_depth + about * white[:2])
+    clearance -= spread.yielded * np.exp(ln_depth + tuning.YIELDED[1] * white[:2])
     clearance = np.maximum(clearance, LEAST_CLEARANCE)
     ln_damping = spread.ln_damping[0] + spread.ln_damping[1] * white[3]
     gains = 1.0 + tuning.UNCERTAIN_GAIN * white[4:7]
