@@ -1,9 +1,8 @@
 """Fits with harmonics that are missing from the measured load.
 
-Two operations alternate. The first operation is a linearised step of all unknowns, including the amplitudes of the
-harmonics. The second operation is a short fit of all unknowns except the amplitudes. A swing is a part of the motion
-that begins in flight. The beginnings of the swings are fitted first, because the fit of a short motion has few false
-optima. Whole swings are fitted last.
+A linearised step of all unknowns, including the amplitudes of the harmonics, alternates with a short fit of all other
+unknowns. The beginnings of the swings (parts of the motion that begin in flight) are fitted first, because the fit of a
+short motion has few false optima.
 """
 
 from __future__ import annotations
@@ -21,11 +20,11 @@ from plow_twin.estimate.verdict import Verdict, judge
 
 Array = NDArray[np.float64]
 
-#: Upper bounds on the number of fits with harmonics, the number of iterations in each fit, and the number of
-#: consecutive fits without improvement.
+#: Upper bounds on the number of fits with harmonics, of iterations in each fit, and of successive fits without
+#: improvement.
 _ROUNDS, _ITERATIONS, _IN_VAIN = 12, 6, 4
-#: Horizon of the second stage, divided by the horizon of the first stage. The horizon is the upper bound on the fitted
-#: part of each swing. The third stage fits whole swings.
+#: Upper bound on the fitted part of each swing in the second stage, divided by that in the first stage. The third stage
+#: fits whole swings.
 _LONGER = 2.0
 
 
@@ -35,8 +34,7 @@ def with_harmonics(
     """Return a fit that includes harmonics of the measured load `felt`, and its verdict.
 
     The result is None if the load is not periodic, if swings are linked, if the motion cannot be simulated, or if a
-    check fails. The checks are made after each stage, because a stage that fails a check shows that the expensive fit
-    of whole swings would fail.
+    check fails after any stage.
     """
     harmonics, poses = Harmonics.of(felt), problem.window.poses
     if harmonics is None or len(problem.link):
@@ -60,10 +58,7 @@ def with_harmonics(
 def _alternated(
     problem: Problem, found: Fit, felt: Load, harmonics: Harmonics
 ) -> tuple[Problem, Fit, Harmonics] | None:
-    """Return a fit with harmonics, computed by alternating linearised steps and fits that begin with `harmonics`.
-
-    The result is None if the motion cannot be simulated.
-    """
+    """Return a fit with harmonics, by linearised steps and fits from `harmonics`; None if a simulation fails."""
     best, in_vain = found.loss, 0
     for index in range(_ROUNDS):
         value = harmonics.amplitude.ravel()
@@ -72,7 +67,7 @@ def _alternated(
         step, covariance, states = whole_step(problem, found, columns, precision, -value * precision)
         (shared, change), covariance = np.split(step, [SIZE]), covariance[SIZE:, SIZE:]
         size = float(change @ np.linalg.solve(covariance, change))
-        # a change within the noise needs no further fit, because `discrepancy.graded` applies it as a linearised step
+        # `discrepancy.graded` makes a last linearised step
         if in_vain == _IN_VAIN or (index and size < tuning.SETTLED * len(COMPONENTS)):
             break
         harmonics = harmonics.moved(np.clip(change, -tuning.LACKING, tuning.LACKING), np.diag(covariance))

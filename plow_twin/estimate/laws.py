@@ -1,8 +1,8 @@
 """Odds of two contact laws for a hard contact, from the likelihood of the measured motion under each law.
 
-Motions are drawn and simulated under each law. Their features are modelled as a polynomial of the drawn parameters plus
-normal noise (synthetic likelihood: Wood, Nature 466 (2010) 1102). The likelihood is integrated over the parameters with
-Laplace's method, and the odds are the ratio of the two integrals.
+The features of motions that are simulated under each law are modelled as a polynomial of the drawn parameters plus
+normal noise (synthetic likelihood: Wood, Nature 466 (2010) 1102). Laplace's method integrates the likelihood over the
+parameters, and the odds are the ratio of the two integrals.
 """
 
 from __future__ import annotations
@@ -20,16 +20,11 @@ Array = NDArray[np.float64]
 
 #: Smallest variance of a feature, a guard against division by zero.
 _LEAST = 1e-9
-#: Definition of the polynomial. `_CURVED` are the indices of penetration and damping, for which there are terms up to
-#: the third degree. `_CHANGING` are the indices of the clearances, for which there are products with penetration and
-#: damping.
+#: Definition of the polynomial: indices of penetration and damping, with terms up to the third degree, and of the
+#: clearances, with products with penetration and damping.
 _CURVED, _CHANGING = (0, 1), (5, 6)
-#: Parameters of the search for the most likely parameters with Levenberg-Marquardt steps:
-#:
-#: - upper bound on the number of steps
-#: - damping of the first step
-#: - gain of the likelihood below which the search ends
-#: - step of the difference quotients
+#: Levenberg-Marquardt search for the most likely parameters: upper bound on the number of steps, damping of the first
+#: step, gain of the likelihood by the last step, and step of the difference quotients.
 _STEPS, _DAMPED, _ENOUGH, _SMALL = 30, 1e-2, 1e-2, 1e-4
 
 
@@ -61,7 +56,7 @@ def log_odds(believed: Draws, other: Draws, measured: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Surface:
-    """Features as a polynomial of the parameters; features and parameters are standardised.
+    """Standardised features as a polynomial of the standardised parameters.
 
     coefficients : (terms, m) coefficients of the polynomial
     left : (n, m) leave-one-out residuals
@@ -83,9 +78,9 @@ class _Surface:
         return _Surface(coefficients, left, points)
 
     def ln_evidence(self, root: Array, seen: Array) -> float:
-        """Return the logarithm of the evidence, given the measured features `seen`, shape (m,).
+        """Return the logarithm of the evidence of the measured features `seen`, shape (m,).
 
-        `root` is the Cholesky factor of the residual covariance, with which `seen` is already whitened.
+        They are whitened by `root`, the Cholesky factor of the residual covariance.
         """
         matrix = np.linalg.solve(root, self.coefficients.T)
 

@@ -1,15 +1,13 @@
 """Estimation of the members' parameters from the poses that move the members of a follower.
 
-With a hard contact, the motion is too irregular for a fit, so an estimate hardly determines stiffness and load gains.
-Stiffness and load gains are therefore estimated from the poses while the twin follows the machine. The method is
-similar to a two-stage Kalman filter (Friedland, IEEE Trans. Autom. Control 14 (1969) 359):
+With a hard contact, an estimate hardly determines stiffness and load gains, which are therefore estimated from the
+poses while the twin follows the machine. The method is similar to a two-stage Kalman filter (Friedland, IEEE Trans.
+Autom. Control 14 (1969) 359):
 
-1. The predicted poses of the members are regressed on the parameters of the members. The slope is the sensitivity of a
-pose to the parameters.
+1. The predicted poses of the members are regressed on their parameters. The slope is the sensitivity of a pose to the
+parameters.
 2. The residuals of the regression give the covariance of a prediction with known parameters.
-3. The innovations, which are the differences between measured and predicted poses, correct the parameters.
-
-The stiffness, for example, affects the duration pi sqrt(m / K) of each rebound from a hard contact.
+3. The innovations (measured minus predicted poses) correct the parameters.
 """
 
 from __future__ import annotations
@@ -36,8 +34,8 @@ _MOST_RESTITUTION = 0.999
 def numbers_of(scenes: Sequence[Scene], gain: Array, bias: Array) -> Array:
     """Return the parameters of m members in units of `tuning.LEARNED_TO`, shape (m, 10).
 
-    The parameters are the logarithm of K^-1/2, the logarithm of the damping or restitution, two clearances, three load
-    gains, and three biases of the sensor.
+    The parameters are the logarithms of K^-1/2 and of the damping or restitution, two clearances, three load gains, and
+    three biases of the sensor.
     """
     damping = [one.contact.damping if one.contact.restitution is None else one.contact.restitution for one in scenes]
     raw = np.column_stack([
@@ -71,9 +69,9 @@ def with_numbers(scene: Scene, numbers: Array) -> tuple[Scene, Array]:
 
 
 class Learner:
-    """Normal distribution of the parameters of the machine given the poses, in units of `tuning.LEARNED_TO`.
+    """Normal distribution of the machine's parameters given the poses, in units of `tuning.LEARNED_TO`.
 
-    A parameter is *learned* if it is estimated from the poses. A parameter that is not learned has the drawn value.
+    Only *learned* parameters are estimated from the poses.
 
     Parameters
     ----------
@@ -91,8 +89,7 @@ class Learner:
         self._least, self._most = own.min(axis=0), own.max(axis=0)
         self.mean, self.covariance = own[0].copy(), np.cov(own.T).reshape(len(learned), -1)
         self._widest = np.sqrt(np.diag(self.covariance))
-        # standardised differences of the members from the mean; the difference of the first member, the median twin, is
-        # zero
+        # standardised differences of the members from the mean, zero for the median twin
         white = own - own.mean(axis=0)
         white[0] = 0.0
         self._white = white @ np.linalg.inv(np.linalg.cholesky(self.covariance)).T
@@ -100,10 +97,7 @@ class Learner:
 
     @classmethod
     def of(cls, drawn: Array, time: float) -> Learner | None:
-        """Return a learner of all parameters that have a standard deviation above one unit.
-
-        The result is None if there is no such parameter, or if there are too few members.
-        """
+        """Return a learner of the parameters with a standard deviation above one unit; None for too few members."""
         learned = np.flatnonzero(drawn[1:].std(axis=0) > 1.0)
         enough = len(drawn) >= _MEMBERS * (len(learned) + 1)
         return cls(drawn, learned, time) if len(learned) and enough else None
@@ -112,9 +106,7 @@ class Learner:
         self._precision, self._score = np.zeros((len(self.open), len(self.open))), np.zeros(len(self.open))
 
     def take_over(self, before: Learner) -> None:
-        """Combine the distribution with that of the previous learner, unless the two distributions contradict each
-        other.
-        """
+        """Combine the distribution with that of the previous learner, unless they contradict each other."""
         both, here, there = np.intersect1d(self.open, before.open, return_indices=True)
         if not len(both):
             return
@@ -148,7 +140,7 @@ class Learner:
         rest = seen - apart @ slope
         alone = rest.T @ rest / (len(own) - len(self.open) - 1)
         inverse = np.linalg.inv(alone + np.diag(noise**2))
-        # the random scatter of the members causes a random slope, and the information in the random slope is subtracted
+        # without the information in the random slope due to the scatter of the members
         self._precision += slope @ inverse @ slope.T - spread * np.trace(inverse @ alone)
         self._score += slope @ inverse @ (off - (self.mean - middle) @ slope)
 
@@ -160,11 +152,10 @@ class Learner:
         before = np.sqrt(np.diag(self.covariance))
         self.covariance = (turned / (1.0 + value.clip(0.0))) @ turned.T
         step = tuning.LEARNING * (self.covariance @ self._score)
-        # the linearisation is accurate within one standard deviation, which limits the step
+        # the linearisation is accurate within one standard deviation
         step /= max(1.0, float(np.abs(step / before).max()))
         self.mean = np.clip(self.mean + step, self._least, self._most)
-        # the machine changes with time, so deviations grow; a deviation is at least one unit and at most that of the
-        # estimate
+        # the deviations grow with time, because the machine changes
         deviation = np.sqrt(np.diag(self.covariance))
         wider = np.maximum(deviation, 1.0) * np.exp(0.5 * (time - self.time) / tuning.LEARNED_FOR)
         share = np.minimum(wider, self._widest) / deviation

@@ -1,11 +1,9 @@
-"""Wear over months, computed in seconds. A simulation of a few load periods gives the mean force on each pad.
+"""Wear over months, extrapolated from the mean force on each pad in a simulation of a few load periods.
 
-With the mean forces, the wear over many periods is extrapolated. The wear rate of a pad is k_s <F> v / A (Archard).
-Here k_s is the wear coefficient, <F> the mean force, v the travel speed and A the area of a pad. With the travel s in
-m, the exposure is defined as E = k_s s / A in 1/N. The wear depths h satisfy dh/dE = <F>(h), so they depend on time,
-travel speed and coefficient only through E. One path h(E) therefore holds for every coefficient. The path is computed
-with Heun's method. The step size is limited by the difference between Heun's and Euler's method, and by the change of
-the clearance.
+The wear rate of a pad is k_s <F> v / A (Archard) with the wear coefficient k_s, the mean force <F>, the travel speed v
+and the area A. With the travel s, the exposure is E = k_s s / A in 1/N. The wear depths h satisfy dh/dE = <F>(h), so
+one path h(E) holds for every time, travel speed and coefficient. The path is computed with Heun's method. The
+difference between Heun's and Euler's method and the change of the clearance limit the step size.
 
 References: Archard, J. Appl. Phys. 24 (1953) 981; Lemaitre and Doghri, Comput. Methods Appl. Mech. Eng. 115 (1994) 197
 (jump in cycles); ISO 13381-1 (prognosis).
@@ -29,15 +27,14 @@ from plow_twin.run.simulate import simulate
 
 Array = NDArray[np.float64]
 
-#: Wear depth in m of a trial simulation that measures the sliding distance. The depth is larger than the rounding
-#: errors, and smaller than the bound above which it would change the motion.
+#: Wear depth in m of a trial simulation that measures the sliding distance, between the bounds at which it would vanish
+#: in rounding errors or change the motion.
 _TRACE_M = 1e-12
 #: Upper bound on the number of interpolated rows between two rows of a path with running-in.
 _FINER = 16
 #: Upper bound on the number of steps of a path.
 _MOST_STEPS = 400
-#: Lower bound on the clearance in m to which the size of a step is proportional. Without this bound, steps from a
-#: clearance of zero would not grow.
+#: Lower bound on the clearance in m to which the size of a step is proportional.
 _LEAST_CLEARANCE = 1e-3
 
 
@@ -65,8 +62,7 @@ class Path:
     def clearance_growth(self) -> Array:
         """Return the growth of the horizontal and the vertical clearance in m, shape (n, 2).
 
-        A wall is assumed to move by the mean wear depth of its two pads. A clearance grows by the sum over its two
-        walls.
+        A wall is assumed to move by the mean wear depth of its two pads.
         """
         horizontal = 0.5 * self.depth @ np.abs(NORMAL_X)
         vertical = 0.5 * self.depth @ np.abs(NORMAL_Y)
@@ -98,8 +94,7 @@ def period_of(scene: Scene) -> float:
 def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, Array]:
     """Return the mean force of each worn pad in N, shape (8,), and its standard error over the periods.
 
-    If the scene has wear by sliding in the plane of the motion, each force is multiplied by the sliding distance per
-    travel.
+    With wear by in-plane sliding, each force is multiplied by the sliding distance per travel.
 
     Raises
     ------
@@ -123,7 +118,7 @@ def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, A
                 f"clearances with which the model runs: {error}"
             ) from error
         if trace:
-            # the impulse that would cause the same wear by travel alone
+            # impulse that would cause the same wear by travel alone
             impulses.append((result.wear_depth - depth) * (wear.pad_area_m2 / (trace * wear.travel_speed_m_s)))
         else:
             impulses.append(np.array([values["impulse"] for values in result.statistics.values()]))
@@ -157,7 +152,7 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
     """
     if scene.wear is None:
         raise LifeError("wear: got no wear, expected a section `wear`")
-    # without running-in, the wear coefficient is the same for all pads at all depths
+    # without running-in, the wear coefficient does not depend on the depth
     steady = without_running_in(scene.wear, np.array(scene.wear.initial_depth_m, dtype=np.float64))
     depth = with_running_in(scene.wear, steady)
     smallest = max(min(_clearances(scene, depth)), _LEAST_CLEARANCE)
@@ -170,7 +165,7 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
         euler = steady + step * force
         ahead, ahead_deviation = mean_forces(scene, with_running_in(scene.wear, euler))
         change = 0.5 * step * (ahead - force)
-        # the noise of the mean forces is subtracted, because it is not an error of the step
+        # the noise of the mean forces is not an error of the step
         noise = 0.5 * step * np.hypot(deviation, ahead_deviation)
         off = float(np.maximum(np.abs(change) - 2.0 * noise, 0.0).max()) / smallest
         if off > tuning.JUMP[1] and step * float(force.max()) > 1e-3 * smallest:

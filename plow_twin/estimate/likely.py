@@ -1,10 +1,9 @@
 """Clearances of largest likelihood, given the measured path (the mean pose at each phase of the load).
 
-Motions with random parameters are simulated. Their features, including the path, are modelled as a quadratic function
-of the parameters plus normal noise (synthetic likelihood: Wood, Nature 466 (2010) 1102). The clearances of largest
-likelihood are features of a regression over the simulated motions (semi-automatic approximate Bayesian computation:
-Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012) 419). The path itself cannot be used for the regression, because it
-has more numbers than there are motions.
+The features of simulated motions, including the path, are modelled as a quadratic function of the parameters plus
+normal noise (synthetic likelihood: Wood, Nature 466 (2010) 1102). The clearances of largest likelihood replace the path
+as features of a regression, because the path has more numbers than there are motions (semi-automatic approximate
+Bayesian computation: Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012) 419).
 """
 
 from __future__ import annotations
@@ -20,15 +19,15 @@ from plow_twin.estimate.regression import ridge, shrunk_root
 
 Array = NDArray[np.float64]
 
-#: Smallest variance of a feature, and smallest deviation of a drawn parameter, both as guards against division by zero.
+#: Smallest variance of a feature and smallest deviation of a drawn parameter, guards against division by zero.
 _LEAST, _SAME = 1e-14, 1e-12
-#: Definition of the quadratic terms by pairs of parameters. The parameters are two clearances, softness and damping.
+#: Definition of the quadratic terms by pairs of parameters: two clearances, softness and damping.
 _CURVED = tuple(combinations_with_replacement(range(4), 2))
-#: Upper bound on the number of folds of the cross-validation, which determines the computing time.
+#: Upper bound on the number of folds of the cross-validation.
 _PARTS = 10
 #: Upper bounds on the number of Gauss-Newton steps, and on the size of a step in deviations of the draws.
 _STEPS, _LONGEST = 5, 1.5
-#: Prior deviation in deviations of the draws that is so large that the parameter has practically no prior.
+#: Prior deviation, in deviations of the draws, of parameters practically without a prior.
 _FREE = 100.0
 
 
@@ -51,8 +50,7 @@ class Seen:
 def likeliest(drawn: Array, gain: float, motions: Seen, measured: Seen) -> Array:
     """Return the most likely clearances in m of n simulated motions and of the measured motion, shape (n + 1, 2).
 
-    The last row belongs to the measured motion. For the simulated motions the model is cross-validated, so that no
-    motion contributes to its own result.
+    The last row belongs to the measured motion. For the simulated motions the model is cross-validated.
 
     Parameters
     ----------
@@ -72,9 +70,7 @@ def likeliest(drawn: Array, gain: float, motions: Seen, measured: Seen) -> Array
 
 
 def _likeliest(drawn: Array, gain: float, motions: Seen, asked: Seen) -> Array:
-    """Return the most likely clearances in m of the k motions `asked`, shape (k, 2), by the model of the drawn
-    motions.
-    """
+    """Return the most likely clearances in m of the k motions `asked`, shape (k, 2)."""
     middle, scale = drawn.mean(axis=0), drawn.std(axis=0)
     scale[scale <= _SAME] = 1.0
     terms = _terms((drawn - middle) / scale)
