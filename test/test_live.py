@@ -694,8 +694,7 @@ def test_nothing_lives_longer_than_the_time_remembered_but_the_index_of_the_reco
         if index and index % 8000 == 0:
             recording = front.runtime.recording
             assert recording is not None
-            while recording.recorder.counters.queued:
-                time.sleep(0.01)
+            until(lambda: not recording.recorder.counters.queued, "an empty queue")
             gc.collect()
             writer = recording.recorder._writer
             assert isinstance(writer, RunWriter)

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from record_support import PAPER_AMPLITUDE
 from test_live import ROOT, _live
+from waiting import until
 
 from plow_twin.live.bridge.access import Access
 from plow_twin.live.bridge.opcua.bridge import OpcUa
@@ -150,10 +151,12 @@ def _bridge(plant: Plant, roles: Any, **options: Any) -> Iterator[OpcUa]:
 
 def _until(bridge: OpcUa, enough: Callable[[list[Arrived]], bool]) -> list[Arrived]:
     found: list[Arrived] = []
-    give_up = time.monotonic() + 60.0
-    while not enough(found):
-        assert time.monotonic() < give_up, (found[-3:], bridge.part())
-        found += bridge.poll(0.1)
+
+    def poll() -> bool:
+        found.extend(bridge.poll(0.1))
+        return enough(found)
+
+    until(poll, found)
     return found
 
 
@@ -316,8 +319,7 @@ def test_a_break_without_history_is_a_loss(server: Plant, roles: Any) -> None:
         server.do("rows", _rows(year_ns, 9, 10), keep=False)
         _until(bridge, lambda found: year_ns + 9 * MS in _stamps(found))
         server.cut()
-        while bridge.connected:
-            time.sleep(0.01)
+        until(lambda: not bridge.connected, "the end of the connection")
         broken = bridge.part()[2]
         assert broken["breaks"] == "1" and float(broken["unfilled_s"]) > 0.0
         server.do("rows", _rows(start_ns, 10, 20), keep=False)

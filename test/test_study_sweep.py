@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import forge
@@ -16,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from figure_checks import check_figure, kept_figures
 from scenes import preset
+from waiting import until
 
 from plow_twin import Friction, simulate
 from plow_twin.cli.app import run
@@ -108,8 +108,7 @@ def test_a_killed_sweep_goes_on_where_it_was(tmp_path: Path, capsys: pytest.Capt
     killed, whole = tmp_path / "killed", tmp_path / "whole"
     process = forge.start("plow_twin", [*arguments, str(killed)], stderr=subprocess.DEVNULL)
     try:
-        while process.poll() is None and len(list(killed.glob("chunks/*.npz"))) < 2:
-            time.sleep(0.005)
+        until(lambda: process.poll() is not None or len(list(killed.glob("chunks/*.npz"))) >= 2, pause_s=0.005)
     finally:
         process.send_signal(signal.SIGKILL)
         process.wait()
