@@ -18,18 +18,16 @@ from plow_twin.model.pairs import PAIR_COUNT
 
 Array = NDArray[np.float64]
 Deviation = tuple[float, ...]
-#: Standard deviations of a pose or a load without stated deviations. By definition, they are 0.
+#: Standard deviations of a pose or a load without stated deviations, by definition.
 UNSTATED: Deviation = (0.0, 0.0, 0.0)
-#: Smallest numbers of values from which a standard deviation is computed, for load cells in contact, for poses and
-#: gaps, and for the scatter in a comparison. The numbers are derived from the relative error of a standard deviation,
-#: which is 1 / sqrt(2 n) for n values.
+#: Smallest numbers of values for a standard deviation of load cells in contact, of poses and gaps, and in a comparison,
+#: derived from the relative error 1 / sqrt(2 n) for n values.
 FEWEST_IN_CONTACT, FEWEST_POSES, FEWEST_FOR_SCATTER = 10, 20, 50
-#: Upper bound on the interval in s between poses or samples that resolve the motion. In a soft contact, the motion over
-#: the interval is nearly a cubic polynomial.
+#: Upper bound on the interval in s between poses or samples that resolve the motion in a soft contact.
 RESOLVING: Final = 0.02
 #: Lower bound on the number of points between two knots when a load is averaged.
 _FINER = 8
-#: Largest accepted component of a pose in m or rad, and of a load in N or N m. Both are guards against faulty data.
+#: Largest accepted component of a pose in m or rad, and of a load in N or N m, guards against faulty data.
 _LARGEST_POSE, _LARGEST_LOAD = 1e6, 1e15
 
 
@@ -90,9 +88,7 @@ class Poses:
         return float(np.median(np.diff(self.t))) * self.q.size / max(measured, 1)
 
     def gap(self) -> float:
-        """Return the weighted median of the gaps in s between measured values of a component; a gap's weight is its
-        length.
-        """
+        """Return the median of the gaps in s between measured values of a component, weighted by their lengths."""
         gaps = np.sort(np.concatenate([np.diff(self.t[np.isfinite(column)]) for column in self.q.T]))
         return float(gaps[np.searchsorted(gaps.cumsum(), 0.5 * gaps.sum())])
 
@@ -103,21 +99,21 @@ class Poses:
         return Poses(self.t[inside], self.q[inside], self.deviation, assumed)
 
     def moved(self, by: Array) -> Poses:
-        """Return the poses after `by`, shape (3,), has been added to each."""
+        """Return the poses plus `by`, shape (3,)."""
         return replace(self, q=self.q + by, assumed=None if self.assumed is None else self.assumed + by)
 
     def without_spikes(self, level: Array) -> tuple[Poses, int]:
         """Return the poses without spikes, and the number of spikes.
 
-        A spike is a value far from all four neighbours, compared with the noise `level`, shape (3,). If there are too
-        many spikes, the sensor is faulty, and all values are returned.
+        A spike is a value far from all four neighbours, compared with the noise `level`, shape (3,). Too many spikes
+        show a faulty sensor and are kept.
         """
         if len(self.t) < FEWEST_FOR_SCATTER:
             return self, 0
         about = np.stack([np.roll(self.q, shift, axis=0) for shift in (-2, -1, 1, 2)])
         low, high = about.min(axis=0), about.max(axis=0)
         far = tuning.SPIKE[0] * level + (high - low)
-        # comparisons with NaN are False, so a value next to a missing value is not a spike
+        # a value next to a missing value (NaN) is not a spike
         spikes = (self.q > high + far) | (self.q < low - far)
         spikes[[0, 1, -2, -1]] = False
         count = int(spikes.sum())
@@ -128,8 +124,7 @@ class Poses:
     def fresh(self) -> Poses:
         """Return the poses without repeated values, which occur if a sensor is slower than its sender.
 
-        A repeated value is late, and its noise is not independent. If a value is repeated for a long time, the sensor
-        has stopped, and all values are returned.
+        A value that is repeated for a long time shows a stopped sensor and is kept.
         """
         one, next_one = self.q[:-1], self.q[1:]
         again = ((one == next_one) | (np.isnan(one) & np.isnan(next_one))).all(axis=1)
@@ -189,7 +184,7 @@ class Load:
 
     @staticmethod
     def unmeasured(end: float, start: float = 0.0) -> Load:
-        """Return a load of zero between two times in s, in place of a load that was not measured."""
+        """Return a load of zero between two times in s, in place of a missing measurement."""
         return Load(np.array([start, end]), np.zeros((2, 3)))
 
     @property
@@ -225,17 +220,13 @@ class Load:
         return float(np.median(np.diff(self.t)))
 
     def gain_deviations(self) -> Array:
-        """Return the stated deviations divided by the root mean square of each component, shape (3,); 0 without a
-        load.
-        """
+        """Return the stated deviations divided by the root mean square of each component (0 for 0), shape (3,)."""
         size = np.sqrt((self.wrench**2).mean(axis=0))
         shares: Array = np.divide(self.deviation, size, out=np.zeros(3), where=size > 0.0)
         return shares
 
     def period(self) -> float:
-        """Return the period in s of the strongest oscillation, or a tenth of the load's span if there is no
-        oscillation.
-        """
+        """Return the period in s of the strongest oscillation or, without any, a tenth of the load's span."""
         return self.oscillation() or float(self.t[-1] - self.t[0]) / 10.0
 
     def oscillation(self) -> float | None:
@@ -265,8 +256,7 @@ class Load:
     def smooth(self, step: float) -> Load:
         """Return values of a cubic spline through the samples at intervals of about `step` in s.
 
-        Samples at long intervals may be averages, which have a smaller amplitude than the load. The stated deviation of
-        the result therefore includes `tuning.COARSE_GAIN`.
+        Samples at long intervals may be averages, so the stated deviation of the result includes `tuning.COARSE_GAIN`.
         """
         t = np.linspace(self.t[0], self.t[-1], math.ceil((self.t[-1] - self.t[0]) / step) + 1)
         size = tuning.COARSE_GAIN * np.sqrt((self.wrench**2).mean(axis=0))
@@ -293,7 +283,7 @@ class Load:
         rows = self.wrench / np.where(scale > 0.0, scale, 1.0)
         out = np.zeros(len(rows))
         out[[0, -1]] = np.inf
-        # all lines of one recursion level are processed together
+        # one recursion level at a time
         left, right, least = np.array([0]), np.array([len(rows) - 1]), np.array([np.inf])
         while len(left):
             inner = right - left > 1
@@ -308,7 +298,7 @@ class Load:
             chord = rows[right] - rows[left]
             error = np.abs(rows[place] - rows[left][line] - along[:, None] * chord[line]).max(axis=1)
             largest = np.maximum.reduceat(error, first[:-1])
-            # index of the first sample with the largest distance from each line
+            # first sample with the largest distance from each line
             at = np.flatnonzero(error == largest[line])
             middle = place[at[np.unique(line[at], return_index=True)[1]]]
             least = np.minimum(least, largest)
@@ -320,15 +310,12 @@ class Load:
         return out
 
     def _roughness(self) -> tuple[Array, Array, Array]:
-        """Return the correlation of successive samples and two spectral densities at low frequency, as three arrays of
-        shape (3,).
+        """Return the correlation of samples, and the spectral densities of load and interpolation, shape (3,) each.
 
-        The first spectral density is that of the load. The second spectral density is that of the linear interpolation
-        of the samples. The rough part of the load is modelled as an Ornstein-Uhlenbeck process with the correlation a
-        of successive samples. The correlation follows from the mean square distance of samples from the straight line
-        through two neighbours. If the neighbours are twice as far away, the mean square distance is larger by the
-        factor (1 + a) (3 - a^2) / (3 - a). For a Brownian motion, a = 1 and the factor is 2. For uncorrelated samples,
-        a = 0 and the factor is 1.
+        The rough part of the load is modelled as an Ornstein-Uhlenbeck process with the correlation a of successive
+        samples. With neighbours twice as far away, the mean square distance of samples from the straight line through
+        two neighbours is larger by the factor (1 + a) (3 - a^2) / (3 - a): 2 for Brownian motion, 1 for uncorrelated
+        samples.
         """
         if len(self.t) < 5:
             return np.ones(3), np.zeros(3), np.zeros(3)
@@ -343,11 +330,11 @@ class Load:
     def believable(self) -> Load:
         """Return the best estimate of the load between its samples, with the spectral density of the unknown part.
 
-        If samples at long intervals are uncorrelated, they do not determine the load between two samples. In this case,
-        only the strong oscillations in the samples are used.
+        Uncorrelated samples at long intervals do not determine the load between them, so only their strong oscillations
+        are used.
         """
         correlation, its, of_samples = self._roughness()
-        # samples are treated as uncorrelated if the correlation is within three standard errors of zero
+        # a correlation within three standard errors of zero is not significant
         rare = (correlation < 3.0 / math.sqrt(len(self.t))) & (self.interval() > RESOLVING)
         fx, fy, moment = np.where(rare, its, of_samples - its).tolist()
         if not rare.any():
@@ -363,8 +350,7 @@ class Load:
     def averaged(self, count: int) -> Load:
         """Return the least-squares fit of a piecewise linear load with `count` equidistant knots.
 
-        The difference between the fit and the original load has a mean of zero over several knots, so it hardly moves
-        the head.
+        The rest of the load has a mean of zero over several knots, so it hardly moves the head.
         """
         knots = np.linspace(self.t[0], self.t[-1], count)
         within = max(_FINER, math.ceil(2.0 * len(self.t) / count))
@@ -372,7 +358,7 @@ class Load:
         times = self.t[0] + (self.t[-1] - self.t[0]) * place / (count - 1)
         left = np.minimum(place.astype(np.int64), count - 2)
         share = place - left
-        # the matrix of the normal equations is tridiagonal
+        # tridiagonal normal equations
         bands = np.zeros((2, count))
         bands[1] = np.bincount(left, (1.0 - share) ** 2, count) + np.bincount(left + 1, share**2, count)
         bands[0, 1:] = np.bincount(left, share * (1.0 - share), count)[:-1]
@@ -418,8 +404,7 @@ def useless_deviation() -> Deviation:
 
 
 def believed(stated: Deviation, q: Array, own: Array) -> tuple[Array, Deviation]:
-    """Return poses without the components that have a large stated deviation, and the deviations of all remaining
-    components.
+    """Return poses without the components that have a large stated deviation, and the deviations of the others.
 
     Parameters
     ----------
@@ -450,7 +435,7 @@ def _check_deviation(name: str, deviation: Deviation) -> None:
 
 
 def _in_order(times: Array, usable: Any) -> NDArray[np.int64]:
-    """Return the indices of usable rows in order of time; only the first of several rows with equal stamps is used."""
+    """Return the indices of usable rows in order of time; of several rows with equal stamps, only the first."""
     candidates = np.flatnonzero(usable & np.isfinite(times))
     _, first = np.unique(times[candidates], return_index=True)
     index: NDArray[np.int64] = candidates[first]
@@ -462,9 +447,9 @@ def usable_rows(
 ) -> tuple[Array, Array, int]:
     """Return stamps (n,) and rows (n, 8) in order of time, and the number of rows that are left out.
 
-    A row has a number for each pair. It is left out if its stamp is not finite or repeated, if it contains no number,
-    or if a number exceeds `largest`. For arrays of the wrong shape, an exception of the type `error` is raised. The
-    message of the exception contains the texts `names`, which name a set of rows and a number.
+    A row is left out if its stamp is not finite or repeated, if it contains no number, or if a number exceeds
+    `largest`. For arrays of the wrong shape, an `error` is raised, whose message contains `names`: those of a set of
+    rows and of a number.
     """
     times, rows = np.asarray(t, dtype=np.float64), np.array(values, dtype=np.float64)
     if times.ndim != 1 or rows.shape != (len(times), PAIR_COUNT):

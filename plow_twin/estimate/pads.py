@@ -1,10 +1,9 @@
 """Estimate of the differences from the model, and of the clearances between facing pads.
 
 The two pads of a wall may be worn differently, which rotates the wall. The sensor may have a lever arm and a low pass.
-The rotations, the lever arm and the low pass are called *differences* from the model. They are estimated in one
-linearised step from a fit. If the differences are so large that the fit fails a check, the fit is repeated with the
-differences as unknowns. Poses do not determine how a clearance is divided between the two sides of the head. A bias of
-the sensor has the same effect as a different division.
+These *differences* from the model are estimated in one linearised step from a fit, or as unknowns of the fit if it
+fails a check without them. Poses do not determine how a clearance is divided between the two sides of the head, because
+a bias of the sensor has the same effect.
 """
 
 from __future__ import annotations
@@ -23,9 +22,8 @@ from plow_twin.estimate.unknowns import GX, GY, SIZE
 
 Array = NDArray[np.float64]
 
-#: Definition of the clearance of each group of facing pads. The clearance of a group is the sum of two terms. The first
-#: term is the clearance of the axis with the given index. The second term is the sum of the rotations of the left,
-#: right, top and bottom wall, each times the given factor.
+#: Definition of the clearance of each group of facing pads: index of the axis whose clearance is a term, and factors of
+#: the rotations of the left, right, top and bottom wall in the other terms.
 _MADE_OF: Final = {
     "horizontal_top": (GX, np.array([0.5, 0.5, 0.0, 0.0])),
     "horizontal_bottom": (GX, np.array([-0.5, -0.5, 0.0, 0.0])),
@@ -38,7 +36,7 @@ assert list(_MADE_OF) == list(GROUPS)
 
 
 def deviations() -> Array:
-    """Return the prior standard deviations of the differences in a fit, shape (7,)."""
+    """Return the prior standard deviations of the differences, shape (7,)."""
     out = np.array([UNSTATED[name] for name in DIFFERENCES])
     out[TURNS] = tuning.TURN
     return out
@@ -77,7 +75,7 @@ def with_differences(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None
         differences[LAG] = max(differences[LAG], 0.0)
         change = differences - problem.differences
         size = float(change @ np.linalg.solve(covariance[SIZE:, SIZE:], change))
-        # a change within the noise needs no further fit, because `discrepancy.graded` applies it as a linearised step
+        # `discrepancy.graded` makes a last linearised step
         if index and size < tuning.SETTLED:
             break
         problem = Problem(
@@ -92,10 +90,7 @@ def with_differences(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None
 
 
 def of_differences(problem: Problem, found: Fit) -> Array:
-    """Return the part of the covariance of the shared unknowns that uncertain differences cause, shape (SIZE, SIZE).
-
-    For example, if the head touches only one pad of a wall, the position of the second pad is uncertain.
-    """
+    """Return the covariance of the shared unknowns due to uncertain differences, shape (SIZE, SIZE)."""
     _, covariance = _joint_step(problem, found)
     held = np.linalg.inv(covariance)[:SIZE, :SIZE]
     added: Array = covariance[:SIZE, :SIZE] - np.linalg.inv(held)

@@ -1,4 +1,4 @@
-"""Prior standard deviations of the numbers of a scene. They are stated in the scene or have default values."""
+"""Prior standard deviations of the numbers of a scene, either stated in the scene or by default."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from plow_twin.model.scene import Mark, Scene
 #: - frame: a drawing gives the sides up to a tolerance, and it does not show the rounding of the corners
 #: - exponent, friction: the contact law is idealised, and friction is seldom documented
 #:
-#: The deviations of clearance and frame are in m. The deviations of stiffness and damping are those of the logarithm,
-#: and the deviation of a restitution is that of the logit. The deviations of mass and inertia are relative. The
-#: deviations of exponent and friction are dimensionless.
+#: The deviations of clearance and frame are in m, those of stiffness and damping are of the logarithm, that of a
+#: restitution is of the logit, and those of mass and inertia are relative.
 DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
     "clearance": {Mark.GIVEN: 8e-3, Mark.MEASURED: 2e-3, Mark.RECONSTRUCTED: 8e-3, Mark.ASSUMED: 8e-3},
     "stiffness": {Mark.GIVEN: 2.5, Mark.MEASURED: 0.5, Mark.RECONSTRUCTED: 2.5, Mark.ASSUMED: 2.5},
@@ -27,10 +26,9 @@ DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
     "exponent": {Mark.GIVEN: 0.07, Mark.MEASURED: 0.03, Mark.RECONSTRUCTED: 0.07, Mark.ASSUMED: 0.07},
     "friction": {Mark.GIVEN: 0.05, Mark.MEASURED: 0.02, Mark.RECONSTRUCTED: 0.05, Mark.ASSUMED: 0.05},
 }
-#: Scale in m of the half-normal prior of the corner radius, which is used if the scene states no radius.
+#: Scale in m of the half-normal prior of the corner radius if the scene states no radius.
 ROUNDING: Final = 3e-3
-#: Prior standard deviations of a sensor's scale factors of x, y and theta. The deviation for theta is larger, because
-#: an angle is often computed from two distances.
+#: Prior standard deviations of a sensor's scale factors of x, y and theta. An angle is often computed from distances.
 SCALES: Final = (5e-3, 5e-3, 1e-2)
 #: Prior standard deviations of a sensor's bias of x, y [m] and theta [rad].
 BIAS: Final = (5e-3, 5e-3, 0.02)
@@ -40,7 +38,7 @@ BIAS: Final = (5e-3, 5e-3, 0.02)
 #: - `turn_<wall>`: rotation of a wall, as the difference in m between the outward displacements of its two pads
 #: - `scale_<axis>`: scale factor of the sensor
 #: - `lever_<axis>`: lever arm of the sensor in m
-#: - `filter`: squared time constant of the sensor's low pass in s2; the mean delay of the low pass is fitted separately
+#: - `filter`: squared time constant of the sensor's low pass in s2, without its mean delay
 #: - `clock`: relative drift of the sensor's clock
 UNSTATED: Final = {
     **{f"stiffness_{wall}": 0.1 for wall in ("left", "right", "top", "bottom")},

@@ -30,9 +30,7 @@ def ridge(basis: Array, penalty: float, weight: Array | None = None) -> tuple[Ar
 
 
 def shrunk_root(covariance: Array, least: float) -> Array:
-    """Return the Cholesky factor of a covariance after it has been shrunk toward its diagonal and `least` has been
-    added to the diagonal.
-    """
+    """Return the Cholesky factor of a covariance that is shrunk toward its diagonal, with `least` added to it."""
     share = tuning.SHRINKAGE[0]
     shrunk = (1.0 - share) * covariance + np.diag(share * np.diag(covariance) + least)
     return np.asarray(np.linalg.cholesky(shrunk), np.float64)

@@ -1,4 +1,4 @@
-"""The result of an estimate: values with 90 % intervals, states of the values, and faults of model and sensor."""
+"""The result of an estimate: values with 90 % intervals and states, and faults of model and sensor."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from plow_twin.estimate.unknowns import CORRELATED, QUANTITIES
 
 Array = NDArray[np.float64]
 
-#: 95 % quantile of the standard normal distribution, from which the ends of a 90 % interval are derived.
+#: 95 % quantile of the standard normal distribution, by definition the end of a 90 % interval.
 NORMAL_P95: Final = float(ndtri(0.95))
-#: Lower bound in standard deviations from which on the tail of the normal distribution is treated as exponential.
+#: Lower bound in standard deviations of the tail of the normal distribution that is treated as exponential.
 _FAR = 30.0
 _STANDARD: Final = NormalDist()
 
@@ -65,7 +65,7 @@ class Interval:
         return Interval(self.mean * unit, self.p05 * unit, self.p95 * unit)
 
     def above(self, least: float) -> Interval:
-        """Return the interval of the normal distribution after truncation below `least`."""
+        """Return the interval of the normal distribution truncated below `least`."""
         deviation = self.deviation
         if deviation <= 0.0 or (least - self.mean) < -4.0 * deviation:
             return self
@@ -76,7 +76,7 @@ class Interval:
 def _tail(least: float) -> tuple[float, float, float]:
     """Return mean, 5 % quantile and 95 % quantile of the standard normal distribution truncated below `least`.
 
-    `scipy.stats.truncnorm` is not used, because its import takes half a second.
+    The import of `scipy.stats.truncnorm` would take half a second.
     """
     if least > _FAR:  # the tail is nearly exponential
         return least + 1.0 / least, least - math.log(0.95) / least, least - math.log(0.05) / least
@@ -143,7 +143,7 @@ class ForcesUsed:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The measured motion, and the fitted motion as a sensor with bias and delay would measure it.
+    """The measured motion, and the fitted motion with the bias and delay of the sensor.
 
     t : (n,) stamps in s
     measured : (n, 3) x, y in m and theta in rad, NaN without a measurement
@@ -202,16 +202,16 @@ class Estimate:
     forces_measured : ForcesUsed, optional
         Use of measured contact forces; None if no forces were measured.
     differs : dict of str to (float, float, float)
-        Three numbers for each further quantity of the machine and of the sensor: the probability of a difference from
-        the scene, the mean of the difference, and the standard deviation of the difference.
+        Probability, mean and standard deviation of a difference from the scene, for each further quantity of the
+        machine and of the sensor.
     apparent : tuple of (Interval, Interval), optional
-        Clearances in m for which a machine with exactly the scene's frame would move like the measured machine. They
-        are present if they are more accurate than the true clearances. If they are present, twins are drawn from them.
+        Clearances in m with which a machine with exactly the scene's frame would move like the measured machine, if
+        they are more accurate than the true clearances. Twins are drawn from them.
     load_harmonics : Harmonics, optional
         Harmonics that are missing from the measured load, with times of the window; None without evidence of
         harmonics.
     motion : Motion, optional
-        The fitted motion; None if the fit does not give the motion at each time. It is not part of `as_dict`.
+        The fitted motion, which is not part of `as_dict`; None if the fit does not give it at each time.
     """
 
     t_start: float
