@@ -1,9 +1,7 @@
-"""Test of the sensor's scale factors. An error of a scale factor would cause an error of the clearances.
+"""Test of the sensor's scale factors, whose errors would cause errors of the clearances.
 
-The scale factors follow from two comparisons. In flight, the measured acceleration is compared with the acceleration
-that load, mass and gravity cause. In contact, the measured displacement of a rotated head is compared with the
-displacement that the size of the frame allows. The scale factors are estimated in one linearised step from a fit, with
-all other unknowns eliminated (score test).
+A wrong scale factor shows in the measured acceleration in flight, and in the displacement of a rotated head in contact.
+The scale factors are estimated in one linearised step from a fit, with all other unknowns eliminated (score test).
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ class Scales:
     """Estimated scale factors of the sensor.
 
     scale : (3,) measured values divided by true values of x, y and theta
-    chi2 : chi^2 of the three scale factors. If the factors are 1, the mean of chi^2 is 3.
+    chi2 : chi^2 of the three scale factors, on average 3 for a correct sensor
     """
 
     scale: Array

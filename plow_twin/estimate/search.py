@@ -1,8 +1,7 @@
-"""Search for the best fit.
+"""Search for the best fit in several stages.
 
-The search has several stages. A swing is a part of the motion that begins in flight. The part at the beginning of each
-swing that is fitted is called the *horizon*. From stage to stage, the horizon grows and the number of candidates
-decreases.
+From stage to stage, the *horizon* grows and the number of candidates decreases. The horizon is the part at the
+beginning of each swing (a part of the motion that begins in flight) that is fitted.
 """
 
 from __future__ import annotations
@@ -38,15 +37,13 @@ class Stage:
     keep: int
 
 
-#: Smallest number of rows in a horizon, and smallest number of rows in a swing. Both are derived from the number of
-#: unknowns in the starting state of a swing, which is six.
+#: Smallest numbers of rows in a horizon and in a swing, derived from the six unknowns of a starting state.
 _FEWEST_ROWS = (8, 12)
-#: Values of the differences from the model if a low pass of the sensor is the only difference. The time constant of the
-#: low pass is derived from its prior.
+#: Differences from the model with only a low pass of the sensor, with the time constant of the prior.
 LOW_PASS: Final = np.array([0.0] * LAG + [UNSTATED["filter"]])
-#: Stages of the search. Each stage has a horizon, and upper bounds on the numbers of iterations and candidates.
+#: Stages with horizons, and upper bounds on the numbers of iterations and candidates.
 STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
-#: Upper bound on the number of swings, which determines the cost of a fit.
+#: Upper bound on the number of swings.
 _MOST_SWINGS = 350
 
 
@@ -76,10 +73,9 @@ def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float)
 
 
 def _have_met(fits: list[Fit], newest: Fit) -> bool:
-    """Return whether the two best fits agree in clearances and loss, and whether `newest` is one of the two fits.
+    """Return whether the two best fits, of which one is `newest`, agree in clearances and loss.
 
-    `fits` are sorted by loss. If two starting points with different stiffness lead to equal clearances and equal loss,
-    they have found the optimum. If only the clearances agree, one of the fits has a starting state in a false optimum.
+    `fits` are sorted by loss. Starting points with different stiffness that lead to equal fits have found the optimum.
     """
     if len(fits) < 2 or newest not in fits[:2]:
         return False
@@ -91,9 +87,8 @@ def _have_met(fits: list[Fit], newest: Fit) -> bool:
 def behind_low_pass(problem: Problem, found: Fit) -> Fit | None:
     """Return a fit of the same swings with the time constant of the sensor's low pass fixed at its prior deviation.
 
-    The result is None if the new fit is not clearly better, or if the poses are too rare to show a low pass. A low pass
-    is slow if its time constant exceeds the duration of an impact. A separate fit is needed, because steps from a fit
-    without a low pass do not lead to a slow low pass.
+    Steps from a fit without a low pass do not lead to a time constant longer than an impact. The result is None if the
+    new fit is not clearly better, or if the poses are too rare to show a low pass.
     """
     if problem.window.poses.interval() > RESOLVING:
         return None
@@ -108,9 +103,9 @@ def refine(
     forward: Forward, unknowns: Unknowns, poses: Poses, period: float, shared: Array, noise: Array, drift: Array | None,
     differences: Array | None = None, close: bool = False,
 ) -> tuple[Problem, Fit] | None:  # fmt: skip
-    """Return a fit to all poses that begins at a good starting point; None if the motion cannot be simulated.
+    """Return a fit to all poses from a good starting point; None if the motion cannot be simulated.
 
-    The beginnings of the swings are fitted first, and whole swings are fitted last.
+    The beginnings of the swings are fitted before whole swings.
 
     Parameters
     ----------
@@ -130,15 +125,15 @@ def refine(
     differences : ndarray, shape (7,), optional
         Fixed differences from the model.
     close : bool
-        Whether the starting point is so close to the optimum that the fit converges with long swings even if the
-        contact is hard.
+        Whether the starting point is so close to the optimum that even the fit of a hard contact converges with long
+        swings.
     """
     hard = not close and bool(np.exp(shared[SOFTNESS]) < tuning.HARD)
     rows = poses.interval() * np.array(_FEWEST_ROWS)
     shortest = tuning.SHORTEST[0 if hard else 1 if drift is None else 2]
     horizon = tuning.HARD_HORIZON if hard else np.inf
     if drift is not None and not hard:
-        # swings must be so short that the unknown part of the load moves the head by no more than the noise
+        # the unknown part of the load may move the head by no more than the noise
         shortest = min(max(shortest, float(np.cbrt(3.0 * noise**2 / drift).min()) / period), tuning.SHORTEST[1])
     shortest = max(shortest * period, rows[1], float(poses.t[-1] - poses.t[0]) / _MOST_SWINGS)
     horizon = max(horizon * period, rows[0])
@@ -185,9 +180,7 @@ def states_at(window: Window, shared: Array) -> Array:
 
 
 def better_states(problem: Problem, shared: Array, states: Array) -> Array:
-    """Return starting states. A state is replaced by the end of the previous swing if this end fits the poses
-    better.
-    """
+    """Return starting states, replaced by the end of the previous swing where it fits the poses better."""
     window, scene = problem.window, problem.unknowns.scene_of(shared)
     gain = shared[GAIN]
     poses = window.poses

@@ -1,8 +1,8 @@
 """Models of a sensor with a lever arm, and of a sensor with a low pass.
 
-A sensor with a lever arm measures a point away from the centre of the head. The measured point moves when the head
-rotates. A first-order low pass y of the pose u obeys tau dy/dt = u - y. The mean delay tau of the low pass is part of
-the delay of the stamps. For a small tau, the remaining difference is tau^2 / 2 times the acceleration.
+A sensor with a lever arm measures a point away from the centre of the head. A first-order low pass y of the pose u
+obeys tau dy/dt = u - y. Its mean delay tau is part of the delay of the stamps, and the remaining difference is tau^2 /
+2 times the acceleration for a small tau.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from plow_twin.estimate.measurements import Poses, filled
 
 Array = NDArray[np.float64]
 
-#: Number of rows to which a parabola is fitted for the measured pose at the start of a swing. It is derived from the
-#: number of rows over which a slow sensor smooths a kink of the motion.
+#: Number of rows of a parabola for the measured pose at the start of a swing, derived from the rows over which a slow
+#: sensor smooths a kink of the motion.
 _ROWS: Final = 7
 
 
 def moved_by_lever(q: Array, v: Array, lever: Array) -> tuple[Array, Array]:
     """Return poses and rates, (n, 3) each, as a sensor with a lever arm measures them.
 
-    `lever`, shape (2,), is the lever arm in m in the axes of the head. The displacement by the lever arm at theta = 0,
-    which is constant, is subtracted.
+    `lever`, shape (2,), is the lever arm in m in the axes of the head. Its constant displacement at theta = 0 is
+    subtracted.
     """
     c, s = np.cos(q[:, 2:]), np.sin(q[:, 2:])
     arm, across = lever, np.array([-lever[1], lever[0]])

@@ -1,8 +1,7 @@
 """Conversion of a machine to units in which it has about the size of the paper's machine.
 
-The thresholds of the estimate were chosen for the size of the paper's machine. The equations of motion have the same
-form in any units of length, mass and time (mechanical similarity). The units are powers of two, so that the conversion
-causes no rounding errors.
+The thresholds of the estimate were chosen for this size. The equations of motion have the same form in any units of
+length, mass and time (mechanical similarity). Units that are powers of two cause no rounding errors.
 """
 
 from __future__ import annotations
@@ -24,8 +23,7 @@ from plow_twin.model.scene import Clearance, Contact, Friction, Initial, Provena
 if TYPE_CHECKING:
     from plow_twin.estimate.contact_forces import ContactForces
 
-#: Size of the paper's machine. By definition, it consists of half of the frame's diagonal [m], the mass [kg] and the
-#: load period [s].
+#: Size of the paper's machine by definition: half of the frame's diagonal [m], mass [kg] and load period [s].
 PAPER_LENGTH, _MASS, _PERIOD = 0.213, 2430.0, 3.14
 
 
@@ -39,9 +37,7 @@ class Units:
 
     @staticmethod
     def of(scene: Scene, load: Load) -> Units:
-        """Return units in which a machine has about the size of the paper's machine; SI units if the two sizes are
-        similar.
-        """
+        """Return units in which a machine has about the size of the paper's machine; SI units for similar sizes."""
         period = load.oscillation() or _PERIOD
         sizes = geometry.half_diagonal(scene) / PAPER_LENGTH, scene.head.mass_kg / _MASS, period / _PERIOD
         if scene.support is not None or all(
@@ -109,9 +105,7 @@ class Units:
         return Poses(poses.t / self.time, poses.q / length, deviation)
 
     def gaps(self, gaps: Gaps | None) -> Gaps | None:
-        """Return gaps in these units. An error that is not stated is assumed to have the same value in m for any
-        machine.
-        """
+        """Return gaps in these units. The default of their error is the same in m for any machine."""
         if gaps is None:
             return None
         return Gaps(gaps.t / self.time, gaps.gap / self.length, (gaps.deviation or tuning.CONSTANT_ERROR) / self.length)
@@ -168,9 +162,7 @@ class Units:
         )
 
     def _damping(self, contact: Contact) -> float:
-        """Return the unit of the damping in SI units, N s/m for an additive damping or s/m for a damping that
-        multiplies the force.
-        """
+        """Return the unit of the damping in N s/m for an additive law, else in s/m."""
         return self.mass / self.time if LAWS[contact.law].additive else self.time / self.length
 
     def _contact(self, contact: Contact) -> Contact:
@@ -201,8 +193,7 @@ def _converted(scene: Scene, its: Scene) -> dict[str, Provenance]:
     for path, kind in KINDS.items():
         mark, (part, name) = marks.get(path), path.split(".")
         value = getattr(getattr(scene, part), name, None)
-        # The ratio of the units is the converted number divided by the number. A number of zero gives no ratio, except
-        # for a clearance, which has the unit of length.
+        # the ratio of the units is the converted number divided by the number, if it is not zero
         if mark is not None and mark.deviation is not None and (value or kind == "clearance"):
             ratio = length if kind == "clearance" else getattr(getattr(its, part), name) / value
             marks[path] = replace(mark, deviation=mark.deviation * ratio)

@@ -1,4 +1,4 @@
-"""Starting points of a fit. The motion is divided into swings, which are parts that begin in flight."""
+"""Starting points of a fit, and division of the motion into swings, which begin in flight."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def smoothed(q: Array, width: int) -> Array:
 def reaches(scene: Scene, q: Array) -> Array:
     """Return the reaches in m toward the right, left, top and bottom wall, shape (n, 4).
 
-    The reach is the distance of the corner nearest to the wall from the centre of the cavity, minus half the size of
-    the frame. In contact, the reach equals half the clearance plus the penetration.
+    A reach is the distance of the corner nearest to the wall from the centre of the cavity, minus half the size of the
+    frame. In contact, it equals half the clearance plus the penetration.
     """
     rows = geometry.penetration_rows(scene)[:4]
     c, s = np.cos(q[:, 2]), np.sin(q[:, 2])
@@ -54,23 +54,23 @@ def smooth_width(poses: Poses, span: float = 0.06) -> int:
 
 
 def range_of_motion(scene: Scene, poses: Poses) -> tuple[Array, Array]:
-    """Return the clearances and the biases of x and y in m, shape (2,) each, that follow from the range of motion."""
+    """Return the clearances and the biases of x and y in m, shape (2,) each, from the range of motion."""
     reach = reaches(scene, smoothed(filled(poses), smooth_width(poses)))
     right, left, top, bottom = np.quantile(reach, 0.99, axis=0)
-    # the signs are reversed, because the frame moves to the left relative to a head that moves to the right
+    # relative to a head that moves to the right, the frame moves to the left
     return np.array([right + left, top + bottom]), 0.5 * np.array([left - right, bottom - top])
 
 
 def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
     """Return poses divided into swings of at least `shortest` s.
 
-    A swing begins in flight, when the head is away from the walls and moves on a parabola.
+    A swing begins when the head is away from the walls and moves on a parabola.
     """
     interval = poses.interval()
     raw, t = filled(poses), poses.t
     width = smooth_width(poses, 0.04)
     reach = reaches(scene, smoothed(raw, width))
-    # distance of the head from contact with the nearest wall
+    # distance of the head from the nearest wall
     room = -(reach - np.quantile(reach, 0.99, axis=0)).max(axis=1)
     noise = np.maximum(noise_level(raw), 1e-7)
     clear = tuning.OUTLYING * np.hypot(*(noise[[0, 2]] * [1.0, geometry.half_diagonal(scene)])) / np.sqrt(width)
@@ -79,7 +79,7 @@ def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
     while t[-1] > starts[-1] + 2.0 * apart:
         near = np.flatnonzero((t > starts[-1] + apart) & (t < starts[-1] + 2.0 * apart) & (room > clear))
         if not len(near):
-            # if no suitable start follows for a long time, the swing ends after a whole load period
+            # without a suitable start, the swing ends after a whole load period
             far = np.flatnonzero((t > starts[-1] + 2.0 * apart) & (room > clear))
             end = min(float(t[far[0]]) if len(far) else np.inf, starts[-1] + period)
             near = np.flatnonzero((t >= end) & (t < end + apart))
@@ -94,11 +94,9 @@ def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
 
 
 def _parabola(t: Array, q: Array, start: float, noise: Array) -> tuple[Array, float]:
-    """Return pose and rate at the time `start`, shape (6,), by parabolas through nearby poses, and the misfit of the
-    parabolas.
+    """Return pose and rate at the time `start`, shape (6,), by parabolas through nearby poses, and their misfit.
 
-    The parabolas have the longest span for which the misfit is explained by noise. A longer span contains an impact,
-    which would falsify the rates.
+    The parabolas have the longest span whose misfit noise explains. A longer span contains an impact.
     """
     near, misfit = np.zeros(0, np.int64), np.inf
     state = np.zeros(6)
@@ -130,8 +128,7 @@ def noise_level(q: Array) -> Array:
 def first_vectors(problem: Problem, most: int) -> list[Array]:
     """Return the best `most` starting points of the shared unknowns, shape (SIZE,) each, in order of the misfit.
 
-    For each of several stiffnesses and dampings, the clearances are adjusted until the simulated range of motion equals
-    the measured range.
+    For several stiffnesses and dampings, the clearances are adjusted until the simulated range of motion is right.
     """
     unknowns, window = problem.unknowns, problem.window
     measured, bias = range_of_motion(unknowns.scene, window.poses)
@@ -150,9 +147,9 @@ def first_vectors(problem: Problem, most: int) -> list[Array]:
 
 
 def _matched(problem: Problem, vector: Array, measured: Array) -> list[tuple[float, Array]]:
-    """Return `vector` with clearances adjusted to the range of motion `measured` in m, and the loss.
+    """Return the loss, and `vector` with clearances adjusted to the range of motion `measured` in m, as one item.
 
-    The result is a list of one item, or empty if the motion cannot be simulated.
+    The result is empty if the motion cannot be simulated.
     """
     poses, unknowns = problem.window.poses, problem.unknowns
     found = []
