@@ -1,14 +1,13 @@
 """Clearances if the measured load does not explain the motion, or if load or theta was not measured.
 
-Motions with random clearances, contact parameters and load errors are simulated, and the sensor's noise and gaps are
-applied to them. A regression over the simulated motions near the measured motion corrects the result of the module
-`equation_error`. The residuals of the regression give the deviation of the corrected result. The method is approximate
-Bayesian computation with local-linear adjustment, as in the module `bouncing`. If theta was not measured, the range of
-motion is corrected instead of the result of `equation_error`.
+Motions with random clearances, contact parameters and load errors are simulated with the sensor's noise and gaps. A
+regression over the simulated motions near the measured motion corrects the result of the module `equation_error`, or
+the range of motion if theta was not measured (approximate Bayesian computation with local-linear adjustment, as in the
+module `bouncing`).
 
-If the load was not measured, a load is computed for each draw. It is the load that would cause the measured motion
-between the drawn walls, averaged over a time that is longer than an impact. With this load, only the true walls give
-the measured impacts. The sensor's biases of x and y are assumed to be zero.
+If the load was not measured, the load of each draw would cause the measured motion between the drawn walls, averaged
+over a time longer than an impact. With this load, only the true walls give the measured impacts. The sensor's biases of
+x and y are assumed to be zero.
 """
 
 from __future__ import annotations
@@ -35,8 +34,7 @@ Array = NDArray[np.float64]
 _KNOTS = 1.0 / 3.0
 #: Interval [s] between the knots of the load between samples, derived as half the period of a soft contact (20 Hz).
 _KNOT = 0.025
-#: Upper bound on the number of sets of draws. The second and each further set are drawn about the result of the
-#: previous set.
+#: Upper bound on the number of sets of draws, each about the result of the previous set.
 _ROUNDS = 3
 #: Lower bound on the number of draws for a regression.
 _FEWEST = 40
@@ -104,13 +102,12 @@ class _Comparison:
 def compare_under_uncertain_load(
     felt: Load | None, unknowns: Unknowns, poses: Poses, period: float, seed: int = 0
 ) -> tuple[Compared | None, int]:
-    """Return the comparison of the measured motion with motions under random load errors, and the work of the
-    simulations.
+    """Return the comparison of the measured motion with motions under random load errors, and its work.
 
     Parameters
     ----------
     felt : Load or None
-        The measured load, without samples that hardly move the head; None if it was not measured.
+        The measured load without samples that hardly move the head; None if it was not measured.
     unknowns : Unknowns
         The prior.
     poses : Poses
@@ -166,7 +163,7 @@ def compare_under_uncertain_load(
         return None, work
     share, least = by.unexplained
     unexplained = np.hypot(share * value[:2], least)
-    # a clearance that still changes has not converged, so its last change is added to its deviation
+    # the last change of a clearance is an error of its convergence
     moved = spread.centre - before
     return Compared(
         spread.centre,
@@ -271,9 +268,9 @@ def _draw(spread: _Spread, rng: np.random.Generator) -> tuple[Array, Array, floa
 
 
 def _with_exponent(unknowns: Unknowns, rng: np.random.Generator) -> Unknowns:
-    """Return the unknowns of the scene; in half of the cases, the exponent is increased at random.
+    """Increase the exponent of the scene at random in half of the cases.
 
-    The exponent is never reduced, because with a smaller exponent a wall would be stiffest at its surface.
+    With a smaller exponent, a wall would be stiffest at its surface.
     """
     step = tuning.UNCERTAIN_EXPONENT * max(0.0, rng.standard_normal())
     contact = unknowns.scene.contact
@@ -281,7 +278,7 @@ def _with_exponent(unknowns: Unknowns, rng: np.random.Generator) -> Unknowns:
 
 
 def _with_error(load: Load, share: float, rng: np.random.Generator) -> Load:
-    """Return a load plus a random error, and plus a random part between the samples.
+    """Return a load plus a random error and a random part between the samples.
 
     The error is an Ornstein-Uhlenbeck process with the standard deviation `share` times the load's amplitude. The part
     between the samples is white noise with a spectral density of at most `load.unknown`.
@@ -296,7 +293,6 @@ def _with_error(load: Load, share: float, rng: np.random.Generator) -> Load:
         error[index] += keep * error[index - 1]
     amplitude = 0.5 * share * np.ptp(load.wrench, axis=0)
     within = np.arange(load.t[0], load.t[-1], _KNOT)
-    # `load.unknown` is an upper limit of the spectral density, so the density is drawn below this limit
     missed = rng.standard_normal((len(within), 3)) * np.sqrt(rng.random() * np.array(load.unknown) / _KNOT)
     t = np.unique(np.concatenate([load.t, grid, within]))
     parts = ((load.t, load.wrench), (grid, amplitude * error), (within, missed))

@@ -1,9 +1,8 @@
 """The vector of unknowns, its prior, and the conversion of a vector to a scene.
 
 The unknown for the stiffness K is the softness psi = ln(u + u0). Here u = (F0 / K)^(1/n) is the penetration in m under
-the reference force F0, and u0 is the penetration that a pose cannot distinguish from zero. For soft contacts psi is
-linear in ln K. For hard contacts psi is linear in the compliance and has a lower limit, because the motion shows only
-that K is large.
+the reference force F0, and u0 is the penetration that a pose cannot distinguish from zero. psi has a lower limit for
+hard contacts, because the motion shows only that K is large.
 """
 
 from __future__ import annotations
@@ -36,11 +35,10 @@ class Quantity:
     deviation : float
         Prior standard deviation in the unit of the number in the vector of unknowns.
     dimension : tuple of 3 int
-        Powers of length, mass and time in the unit of the published value. The powers for stiffness and damping are not
-        used, because their units depend on the contact law.
+        Powers of length, mass and time in the unit of the published value; unused for stiffness and damping, whose
+        units depend on the contact law.
     step : float, optional
-        Step of the difference quotient of the motion with respect to the quantity; None if the derivative is known
-        exactly.
+        Step of the difference quotient of the motion with respect to the quantity; None for an exact derivative.
     fine_step : float, optional
         Step of the difference quotient of contact forces, which are less linear in the quantity than the motion.
     probe : float
@@ -58,9 +56,9 @@ class Quantity:
     probe: float = 0.0
 
 
-#: The estimated quantities with their prior deviations, in the order of a vector of unknowns. The vector contains the
-#: softness psi for the stiffness, and the logarithm of the damping or the logit of the restitution. Quantities with a
-#: `step` change the motion of the head and come first. Quantities without a `step` change only the measurement.
+#: The estimated quantities with their prior deviations, in the order of a vector of unknowns, which contains the
+#: softness psi, and the logarithm of the damping or the logit of the restitution. First come the quantities with a
+#: `step`, which change the motion of the head. All other quantities change only the measurement.
 QUANTITIES: Final = (
     Quantity("horizontal", "horizontal clearance [mm]", 1e3, ".3f", 8e-3, (1, 0, 0), 2e-4, 1e-5, 5e-5),
     Quantity("vertical", "vertical clearance [mm]", 1e3, ".3f", 8e-3, (1, 0, 0), 2e-4, 1e-5, 5e-5),
@@ -84,7 +82,7 @@ GX: Final = _place("horizontal")
 GY: Final = _place("vertical")
 SOFTNESS: Final = _place("stiffness")
 DAMPING: Final = _place("damping")
-#: Definition of the slices of the gains and of the biases in a vector of unknowns.
+#: Definition of the gains and of the biases in a vector of unknowns.
 GAIN: Final = slice(_place("gain_fx"), _place("gain_m") + 1)
 BIAS: Final = slice(_place("bias_x"), _place("bias_theta") + 1)
 DELAY: Final = _place("delay")
@@ -98,18 +96,17 @@ PROBES: Final = np.array([quantity.probe for quantity in QUANTITIES])
 #: Names of the quantities in the published correlation matrix, with the softness in place of the stiffness.
 CORRELATED: Final = tuple("softness" if place == SOFTNESS else QUANTITIES[place].name for place in MOVING)
 
-#: Bounds on the simulated penetration in m under the reference force. Contacts with a smaller penetration give
-#: practically the same motion. With a larger penetration, the head could pass through the wall.
+#: Bounds on the simulated penetration in m under the reference force. Harder contacts give practically the same motion;
+#: through softer walls, the head could pass.
 _HARDEST, _SOFTEST = 3e-5, 0.12
 #: Lower bound on a simulated clearance in m.
 LEAST_CLEARANCE: Final = 5e-4
 
 
-#: Alternative law of a contact law. If the contact is linear (exponent 1), the alternative law is tested.
+#: Alternative law that is tested for a contact law with the exponent 1.
 OTHER_LAW: Final = {"hunt_crossley": "kelvin_voigt"}
 
-#: Lower bound on a prior standard deviation. It is used for a number that is stated as exact, which then hardly changes
-#: in the fit.
+#: Lower bound on a prior standard deviation, for numbers that are stated as exact.
 _HELD = 1e-6
 #: Upper bound on the prior deviation of a load gain.
 _MOST_GAIN = 1.0
@@ -148,7 +145,7 @@ class Unknowns:
         deviation[GY] = deviation_of(scene, "clearance.vertical_m")
         deviation[SOFTNESS] = deviation_of(scene, "contact.stiffness")
         if is_stated(scene, "contact.stiffness"):
-            # conversion of the standard deviation of ln K to that of psi = ln(u + u0)
+            # from the standard deviation of ln K to that of psi = ln(u + u0)
             u = math.exp(unknowns.softness_of(contact.stiffness)) - tuning.RESOLVED
             deviation[SOFTNESS] *= u / (u + tuning.RESOLVED) / contact.exponent
         damped = "contact.damping" if contact.restitution is None else "contact.restitution"
@@ -175,9 +172,7 @@ class Unknowns:
         return vector
 
     def deviations(self) -> Array:
-        """Return the prior standard deviations, shape (SIZE,). Without damping, the deviation of the damping is
-        practically zero.
-        """
+        """Return the prior standard deviations, shape (SIZE,), practically zero for a damping that the law lacks."""
         deviations = self.deviation.copy()
         if not self.damped:
             deviations[DAMPING] = 1e-6
@@ -206,9 +201,7 @@ class Unknowns:
 
     @property
     def hardest_believed(self) -> float:
-        """Upper end in N/m^n of the stiffness interval for a contact that is too hard for its stiffness to be
-        determined.
-        """
+        """Upper end in N/m^n of the interval of a stiffness that is too large to be determined."""
         return float(self.force / (1e-6) ** self.scene.contact.exponent)
 
     def damping_of(self, value: float) -> float:
@@ -245,7 +238,7 @@ class Unknowns:
 
 
 def contact_with(contact: Contact, stiffness: float, damping: float | None) -> Contact:
-    """Return a contact with the given stiffness and damping or restitution; None leaves the damping unchanged."""
+    """Return a contact with the given stiffness and, unless it is None, damping or restitution."""
     contact = replace(contact, stiffness=stiffness)
     if damping is None:
         return contact

@@ -1,12 +1,11 @@
 """Fit of poses in which one or two components were never measured.
 
-If a component is missing, the range of motion is unknown, so there is no starting point for the clearances in a fit. In
-a soft contact, however, the load alone determines the motion after some periods. The fit has these steps:
+Without a component, the range of motion gives no starting point for the clearances. In a soft contact, the load alone
+determines the motion after some periods. The fit has these steps:
 
 1. Vectors of unknowns are drawn from the prior, and their motions are compared with the measured components.
 2. Levenberg-Marquardt steps improve the vectors with the nearest motions.
-3. The poses are divided into swings, which begin in flight. The missing components are taken from the motions of step
-2.
+3. The poses are divided into swings, which begin in flight, with missing components from the motions of step 2.
 4. A fit with swings that are linked to each other uses only the measured values.
 """
 
@@ -36,17 +35,14 @@ _SHORTER: Final = 5
 
 
 class _Whole:
-    """Simulation of the whole motion from one start, and its distance from the measured components.
-
-    The argument `rows` of the methods is the number of poses from the first pose on.
-    """
+    """Simulation of the first `rows` poses from one start, and its distance from the measured components."""
 
     def __init__(self, forward: Forward, unknowns: Unknowns, poses: Poses, period: float) -> None:
         self.forward, self.unknowns, self.poses = forward, unknowns, poses
         self.measured = poses.measured
         self.size = np.where(self.measured, filled(poses).std(axis=0), 1.0)
         self.noise = np.where(self.measured, np.maximum(noise_level(filled(poses)), 1e-7), 1.0)
-        #: mask of the poses after the first period, which hardly depend on the unknown start
+        #: poses after the first period, which hardly depend on the unknown start
         self._settled = poses.t - poses.t[0] >= period
         self._start = np.concatenate([filled(poses)[0], np.zeros(3)])[None]
         #: indices of the unknowns that the measured components can determine
@@ -62,7 +58,7 @@ class _Whole:
         return None if run is None else run.q
 
     def residual(self, vector: Array, rows: int) -> Array | None:
-        """Return measured minus predicted values of k components, shape (n, k); None if there is no motion."""
+        """Return measured minus predicted values of k components, shape (n, k); None without a motion."""
         q = self.motion(vector, rows)
         if q is None:
             return None
@@ -114,9 +110,7 @@ class _Whole:
         return None, damping
 
     def _normalised(self, vector: Array, rows: int, scale: Array) -> Array | None:
-        """Return the residuals in units of `scale`, followed by the residuals of the prior; None if there is no
-        motion.
-        """
+        """Return the residuals in units of `scale`, and those of the prior; None without a motion."""
         error = self.residual(vector, rows)
         prior = ((vector - self.mean) / self.deviation)[self.free]
         return None if error is None else np.concatenate([(error / scale[self.measured]).ravel(), prior])
@@ -169,13 +163,13 @@ def fit_some_components(
         if before is not None:
             known = before.point.predicted
             q[: len(known)] = np.where(np.isfinite(known), known, q[: len(known)])
-        # noise is added to the assumed values, because the division into swings compares poses with their noise
+        # the division into swings compares poses with their noise
         q = q + shared[BIAS] + np.where(whole.measured, 0.0, noise) * rng.standard_normal(q.shape)
         some = replace(poses, assumed=q).between(float(poses.t[0]), end)
         return refine(forward.renewed(), unknowns, some, period, shared, noise, drift, close=True)
 
     def finished(found: tuple[Problem, Fit], end: float) -> tuple[Problem, Fit]:
-        # each repetition begins with better values of the missing components
+        # each repetition has better values of the missing components
         for _ in range(tuning.UNMEASURED_ROUNDS):
             again = None if found[1].finished else refined(found[1].shared, end, found[1])
             if again is None or again[1].loss > found[1].loss:
@@ -211,9 +205,7 @@ def _starts(whole: _Whole, rows: int, rng: np.random.Generator) -> list[Array]:
 
 
 def _like_measured(whole: _Whole) -> Array:
-    """Return the noise of all components in m, m, rad. A missing component has the mean noise of the measured
-    components.
-    """
+    """Return the noise of all components in m, m, rad, for missing components the mean of the measured ones."""
     arm = geometry.half_diagonal(whole.unknowns.scene)
     level = float((whole.noise * [1.0, 1.0, arm])[whole.measured].mean())
     return level * np.array([1.0, 1.0, 1.0 / arm])
