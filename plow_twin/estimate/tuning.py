@@ -1,8 +1,8 @@
 """All numbers of the estimator that were chosen and not derived, with the data on which each choice is based.
 
-Other modules read a number as `tuning.NAME`, so that `benchmark/tuning_sensitivity.py` can vary it. The measured
-sensitivities are in `benchmark/results/tuning.md`. Seeds are those of `benchmark/estimate.py`. In the descriptions, a
-penetration is the penetration under the reference force of 100 kN.
+Other modules read a number as `tuning.NAME`, so that `benchmark/tuning_sensitivity.py` can vary it (results in
+`benchmark/results/tuning.md`). Seeds are those of `benchmark/estimate.py`. A penetration is that under the reference
+force of 100 kN.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Windows of the sliding estimate, formed from arriving samples and poses.
 
-Each window ends at a multiple of the interval between windows. A window is formed as soon as a load sample arrives with
-a stamp later than the end of the window plus the waiting time for late data. The order of arrival within the waiting
-time has no effect, so a replay of the journal gives the same windows as the live node. If no load has arrived for half
-of a window's length, the stamps of poses determine when a window is formed, and the window contains no load.
+Each window ends at a multiple of the interval between windows. It is formed as soon as a load sample arrives with a
+stamp later than its end plus the waiting time for late data. The order of arrival within the waiting time has no
+effect, so a replay of the journal gives the same windows as the live node. After half of a window's length without a
+load, poses form windows without a load.
 """
 
 from __future__ import annotations
@@ -33,8 +33,7 @@ Row = tuple[int, tuple[float, ...]]
 #: A stamp in ns, the measured pose, and the standard deviations of the pose, or an empty tuple.
 _Pose = tuple[int, tuple[float, ...], tuple[float, ...]]
 
-#: Upper bound on the number of stored poses and on the number of stored rows of gaps. The bound is reached only if the
-#: load has stopped, or if a clock is ahead by hours.
+#: Upper bound on the number of stored poses and of stored rows of gaps, for a stopped load or a wrong clock.
 MOST_KEPT = 600_000
 
 
@@ -43,7 +42,7 @@ class Window:
     """Measurements in the window [start_ns, end_ns), with times in s after `start_ns`.
 
     samples : number of received load samples
-    poses : number of received poses plus number of received rows of gaps
+    poses : number of received poses and rows of gaps
     lost : number of rows that are left out
     gaps : measured gaps; None without gaps
     """
@@ -64,8 +63,7 @@ class Windows:
     Parameters
     ----------
     length_s, interval_s, wait_s : float
-        Three times in s: the full length of a window, the interval between the ends of successive windows, and the
-        waiting time for late data.
+        Full length of a window, interval between the ends of successive windows, and waiting time for late data in s.
     poses : tuple of 3 float
         Lower limit of the standard deviation of the poses.
     load : tuple of 3 float
@@ -73,8 +71,8 @@ class Windows:
     gaps : float
         Standard deviation of a gap sensor in m.
     early : bool
-        Whether shorter windows are formed at the beginning. The shortest window has the share `tuning.WINDOW_SHARES[1]`
-        of the full length. A short window is left out if its share of new motion is less than `tuning.NEW_MOTION`.
+        Whether shorter windows are formed at the beginning, from the share `tuning.WINDOW_SHARES[1]` of the full length
+        on and with at least the share `tuning.NEW_MOTION` of new motion.
     """
 
     def __init__(
@@ -94,19 +92,18 @@ class Windows:
         self.restart()
 
     def restart(self) -> None:
-        """Drop all data, for example because the stamps have jumped or the machine has changed."""
+        """Drop all data, for example after a jump of the stamps."""
         self._loads: list[Row] = []
         self._poses: deque[_Pose] = deque(maxlen=MOST_KEPT)
         self._gaps: deque[tuple[int, tuple[int, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
-        #: length [s] of the newest window that was checked, and the number of its poses or rows of gaps, whichever is
-        #: larger
+        #: length [s] of the newest checked window, and the larger number of its poses and rows of gaps
         self._left = (0.0, 0)
         self._newest_ns: int | None = None
         self._end_ns: int | None = None
         self._first_ns: int | None = None
-        #: stamp of the first pose after the newest sample of the load, in order of arrival [ns]
+        #: stamp [ns] of the first pose that arrived after the newest sample of the load
         self._silent_ns: int | None = None
-        #: end of the newest window that was formed [ns]
+        #: end [ns] of the newest formed window
         self._formed_ns: int | None = None
 
     def set_load_deviation(self, deviation: Deviation) -> None:
@@ -116,7 +113,7 @@ class Windows:
     def add_pose(self, stamp_ns: int, q: tuple[float, ...], deviation: tuple[float, ...] = ()) -> Window | None:
         """Add a measured pose (x, y [m], theta [rad]) and its standard deviations; a missing component is NaN.
 
-        Return a window that contains only poses if such a window is due because no load arrives.
+        Return a window of poses if one is due because no load arrives.
         """
         self._poses.append((stamp_ns, q, deviation))
         self._silent_ns = stamp_ns if self._silent_ns is None else self._silent_ns
@@ -185,7 +182,7 @@ class Windows:
 
     def _form(self, end_ns: int) -> Window | None:
         start_ns = end_ns - self._length_ns
-        # rows older than `start_ns` are not needed in later windows
+        # later windows need no older rows
         self._loads = [row for row in self._loads if row[0] >= start_ns]
         self._poses = deque((row for row in self._poses if row[0] >= start_ns), MOST_KEPT)
         self._gaps = deque((row for row in self._gaps if row[0] >= start_ns), MOST_KEPT)

@@ -1,9 +1,9 @@
 """The sliding estimate in a process of its own, so that it does not delay the samples of the twin.
 
-The class `Worker` runs in the process of the twin, which is called the *near side*. It queues data, which a thread
-sends to the *far side*. The far side is the process `python -m plow_twin.estimate.worker`. The far side compiles its
-kernels, reports that it is ready, computes the estimate of each window that is due, and sends the results to the near
-side. If several windows become due during an estimate, only the newest of these windows is estimated next.
+The class `Worker` runs in the process of the twin, the *near side*. It queues data, which a thread sends to the *far
+side*, the process `python -m plow_twin.estimate.worker`. The far side compiles its kernels, reports that it is ready,
+and sends back the estimate of each window that is due. Of several windows that become due during an estimate, only the
+newest is estimated.
 """
 
 from __future__ import annotations
@@ -35,12 +35,11 @@ from plow_twin.model.scene import Scene
 
 #: Upper bound on the interval at which queued data are sent [s].
 _SEND_S: Final = 0.05
-#: Upper bound on the number of queued items. The bound is reached only if the far side has stopped reading.
+#: Upper bound on the number of queued items, if the far side has stopped reading.
 _MOST_WAITING: Final = 1_000_000
-#: `nice` value of the far side, which bounds its effect on the twin.
+#: `nice` value of the far side, a bound on its effect on the twin.
 _NICE: Final = 10
-#: Shortest time slice in ns, and number of the system call `sched_setattr`. By definition, Linux specifies both
-#: numbers.
+#: Shortest time slice in ns, and number of the system call `sched_setattr`, by definition of Linux.
 _SLICE_NS, _SCHED_SETATTR = 100_000, 314
 #: Upper bound on the time in s until the far side has ended.
 _STOP_S: Final = 5.0
@@ -51,7 +50,7 @@ def _view(contents: dict[Any, Any]) -> MappingProxyType[Any, Any]:
     return MappingProxyType(contents)
 
 
-# `pickle` does not support mapping proxies, which a scene contains
+# a scene contains mapping proxies, which `pickle` does not support
 ForkingPickler.register(MappingProxyType, lambda view: (_view, (dict(view),)))
 
 
@@ -93,7 +92,7 @@ class Worker:
     scene : Scene
         The nominal scene.
     windows : Windows
-        The empty object that forms the windows, which is copied to the process.
+        The empty object that forms the windows in the process.
     asked : Asked
         The answers that are requested in addition to the estimate.
     """
@@ -101,7 +100,7 @@ class Worker:
     def __init__(self, scene: Scene, windows: Windows, asked: Asked = _ESTIMATE_ALONE) -> None:
         near, far = Pipe()
         command = [sys.executable, "-m", "plow_twin.estimate.worker", str(far.fileno()), *loaded_laws()]
-        # a single thread for linear algebra, so that the far side uses at most one core
+        # at most one core
         environment = os.environ | dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
         self._process = subprocess.Popen(
             command, pass_fds=[far.fileno()], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment
@@ -116,8 +115,7 @@ class Worker:
         self._closed = threading.Event()
         #: reason why the process has ended; empty while it runs
         self.error = ""
-        #: None until the estimate that `finish` requests has ended; an empty text if it succeeded, or the reason of a
-        #: failure
+        #: None until the estimate that `finish` requests has ended; then the reason of a failure, or an empty text
         self.ended: str | None = None
         self._thread = threading.Thread(target=self._send_queue, name="estimate", daemon=True)
         self._thread.start()
@@ -153,11 +151,11 @@ class Worker:
         return len(self._waiting) > _MOST_WAITING // 10
 
     def poll(self) -> Found | None:
-        """Return the next result, or None if no result has arrived; results of windows before a restart are dropped."""
+        """Return the next result, or None if none has arrived. Results of windows before a restart are dropped."""
         if self.error or self.ended is not None:
             return None
         if len(self._waiting) > _MOST_WAITING:
-            # the far side does not read, which may block the sending thread, so the far side is killed
+            # the far side does not read, which may block the sending thread
             self._process.kill()
             self._fail(f"the estimator did not read for {_MOST_WAITING} samples")
             return None
@@ -173,7 +171,7 @@ class Worker:
                 return found if found.restarts == self._restarts else None
         except (EOFError, OSError):
             code = self._process.poll()
-            if code is not None:  # the code is None while the process is ending; a later call of `poll` receives it
+            if code is not None:  # None while the process is ending
                 self._fail(f"the estimator ended with code {code}")
         return None
 
@@ -207,7 +205,7 @@ def serve(connection: Connection) -> None:
     """Receive data and send estimates until the near side closes the connection."""
     scene, windows, asked = connection.recv()
     warm_up(scene)
-    connection.send(None)  # this message reports that the kernels are compiled
+    connection.send(None)  # the kernels are compiled
     guess: Guess = ()
     ended: str | None = None
     skipped = restarts = 0
@@ -227,7 +225,7 @@ def serve(connection: Connection) -> None:
                     due = formed
         if due is None:
             connection.send(ended)
-            connection.recv()  # wait until the near side closes the connection; `recv` then raises `EOFError`
+            connection.recv()  # raises `EOFError` when the near side closes the connection
         assert due is not None
         begin = time.perf_counter()
         found = answer(scene, due, guess, asked)
@@ -260,11 +258,8 @@ def _request_short_slices() -> None:
 
 
 def main() -> None:
-    """Run the far side. The command-line arguments are a descriptor of the pipe and the names of modules with contact
-    laws.
-    """
-    # Ctrl-C sends SIGINT to the whole process group; the far side ignores SIGINT, because the near side ends the far
-    # side
+    """Run the far side, for a descriptor of the pipe and names of modules with contact laws in `sys.argv`."""
+    # Ctrl-C sends SIGINT to the whole process group, but only the near side ends the far side
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
     _request_short_slices()
