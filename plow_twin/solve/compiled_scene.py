@@ -1,4 +1,4 @@
-"""Conversion of a scene to the records that the kernels read. No other module creates these records from a scene."""
+"""Conversion of a scene to the records that the kernels read."""
 
 from __future__ import annotations
 
@@ -48,19 +48,19 @@ from plow_twin.solve.state import (
 
 #: Tightest and loosest admissible tolerance.
 TOLERANCE_RANGE = (1e-13, 1e-1)
-#: Admissible error of one step divided by the tolerance. This share is small, because the errors of hundreds of steps
-#: add up, and impacts amplify these errors.
+#: Admissible error of one step divided by the tolerance. The errors of hundreds of steps add up, and impacts amplify
+#: them.
 STEP_SHARE = 3e-4
-#: Largest admissible error of a step, relative to the length scale. It limits the error at loose tolerances.
+#: Largest admissible error of a step at loose tolerances, relative to the length scale.
 LARGEST_STEP_ERROR = 1e-6
-#: `STEP_SHARE` for exponents that are not integers. It is smaller because series converge slowly near a branch point.
+#: `STEP_SHARE` for exponents that are not integers, whose series converge slowly near a branch point.
 STEP_SHARE_FRACTION = 1e-6
 #: Number of mode changes at one instant after which the solver takes a step without event detection.
 MAX_EVENTS_AT_ONCE = 64
-#: Largest harmonic load for which rest is detected, divided by the load that presses the head against its walls
+#: Largest harmonic load at which the head can rest, divided by the load that presses it against its walls
 #: (`method.small_harmonics`).
 _SMALL_HARMONICS = 1e-2
-#: Penetration below which rounding dominates, divided by half the frame's diagonal. It is some 45 rounding errors.
+#: Penetration below which rounding dominates, divided by half the frame's diagonal (some 45 rounding errors).
 _NOISE = 1e-14
 
 _Found = TypeVar("_Found")
@@ -78,7 +78,7 @@ class CompiledScene:
     loads: LoadSet
 
     def initial_state(self, time: float = 0.0, wear_depth: Array | None = None) -> State:
-        """Return the scene's initial state at `time`. If given, `wear_depth` [m] replaces the initial wear depth."""
+        """Return the scene's initial state at `time`, with its own wear depth or `wear_depth` [m]."""
         state = new_record(state_type(self.parts.terms))
         self.start(state)
         if wear_depth is not None:
@@ -88,7 +88,7 @@ class CompiledScene:
         return state
 
     def start(self, state: State | np.void) -> None:
-        """Write coordinates, rates, damping and wear of the initial state to a zero record. Modes are not set."""
+        """Write coordinates, rates, damping and wear, but not modes, of the initial state to a zero record."""
         state["y"][:] = geometry.state_of(self.scene, self.scene.initial.q, self.scene.initial.v)
         if self.parts.terms.hysteretic is not None:
             state["damping_factor"][:] = self.scene.contact.damping or 0.0
@@ -113,13 +113,13 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         The tolerance is out of range.
     """
     _check_tolerance(tol)
-    # `_LATELY` would keep a load table in memory after the end of its scene, so scenes with tables do not use it
+    # `_LATELY` would keep a table in memory after the end of its scene
     tables = any(isinstance(load, Table) for load in scene.loads)
     return _describe(scene, tol, sampled, _Shared() if tables else _LATELY).compiled()
 
 
 def compile_scenes(scenes: Sequence[Scene], tol: float) -> tuple[NDArray[np.void], list[CompiledScene]]:
-    """Return the records of many scenes at one tolerance. A part that several scenes share is converted only once.
+    """Return the records of many scenes at one tolerance. A part that scenes share is converted only once.
 
     Returns
     -------
@@ -157,24 +157,18 @@ def _check_tolerance(tol: float) -> None:
 
 
 class _Shared:
-    """Cache for results that scenes share. Each result is computed once for the objects on which it depends.
-
-    If the argument `most` is given, the cache contains only the `most` newest results.
-    """
+    """Cache of the `most` newest results by the objects on which they depend."""
 
     def __init__(self, most: float = math.inf) -> None:
         self._most = most
         self._known: OrderedDict[tuple[Any, ...], tuple[Any, Any]] = OrderedDict()
 
     def of(self, compute: Callable[..., _Found], *sources: object, given: tuple[Any, ...] | None = None) -> _Found:
-        """Return compute(*sources), or compute(*given) if `given` is passed.
-
-        The result is stored for the next call with the same sources, so the sources must determine `given`.
-        """
+        """Return compute(*sources), or compute(*given) for a `given` that the sources determine."""
         key = (compute, *map(id, sources))
         known = self._known.get(key)
         if known is None:
-            # the sources are stored too; otherwise the id of a deleted source could belong to a new object
+            # the id of a deleted source could belong to a new object, so the sources are stored
             known = self._known[key] = sources, compute(*(sources if given is None else given))
             if len(self._known) > self._most:
                 self._known.popitem(last=False)
@@ -182,14 +176,13 @@ class _Shared:
         return found
 
 
-#: Results for parts of the scenes that were compiled last. A study usually varies some parts of a scene, and reuses the
-#: results of the other parts.
+#: Results for parts of the newest scenes. A study usually varies only some parts of a scene.
 _LATELY: Final = _Shared(64)
 
 
 @dataclass(frozen=True)
 class _Description:
-    """Content of a `CompiledScene`. `values` contains the fields of its `PARAMS` record."""
+    """Content of a `CompiledScene`, with the fields `values` of its `PARAMS` record."""
 
     scene: Scene
     values: dict[str, Any]
@@ -197,7 +190,7 @@ class _Description:
     loads: LoadSet
 
     def compiled(self, params: Params | None = None) -> CompiledScene:
-        """Return the compiled scene. Its constants are written to `params`, or to a new record if it is None."""
+        """Return the compiled scene with its constants in `params` or in a new record."""
         if params is None:
             params = new_record(params_type(options(self.scene)))
             for name, value in self.values.items():
@@ -206,7 +199,7 @@ class _Description:
 
 
 class _Unchanged(NamedTuple):
-    """Results that do not depend on the clearance. `values` contains those results that are fields of `PARAMS`."""
+    """Results that do not depend on the clearance. `values` are fields of `PARAMS`."""
 
     loads: LoadSet
     acceleration: float  #: largest acceleration in m/s^2
@@ -259,12 +252,12 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
     loads, acceleration, start_speed, harmonics, terms, unchanged = shared.of(
         _unchanged, scene.head, scene.frame, scene.contact, scene.gravity, scene.loads, scene.initial, scene.locked,
         scene.pairs, scene.wear, scene.friction, scene.support, sampled,
-        # the results depend on the clearance only if the head starts off centre, where it may touch a wall
+        # only a head that starts off centre may touch a wall at the start
         scene.clearance if any(scene.initial.q) else None,
         given=(scene, sampled, shared),
     )  # fmt: skip
     length, radius = geometry.length_scale(scene), unchanged["radius"]
-    # speed that the head gains under the largest load over half the length scale
+    # speed under the largest load after half the length scale
     speed = max(math.sqrt(length * acceleration), start_speed, 1e-3 * length)
     admissible = min(tol * (STEP_SHARE if terms.fraction is None else STEP_SHARE_FRACTION), LARGEST_STEP_ERROR)
     order = order_for(admissible)
@@ -289,7 +282,7 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
 
 
 def options(scene: Scene) -> Options:
-    """Return the options of a scene. Each option adds fields to the record of the scene's constants."""
+    """Return the options of a scene, each of which adds fields to its `PARAMS` record."""
     falls = scene.contact.restitution_fall is not None or scene.contact.restitution_fall_along_s_m is not None
     return Options(scene.head.carries == "corners", scene.frame.corner_radius_m is not None, falls)
 
@@ -333,14 +326,14 @@ def _scene_terms(
     if scene.friction is not None and scene.friction.coefficient != 0.0:
         present["slip" if scene.friction.stick_stiffness_n_m is None else "stick"] = True
     present["support"] = scene.support is not None
-    # with an offset centre of mass the moment of the loads depends on the angle, so flight has no closed form
+    # with an offset centre of mass, the moment of the loads depends on the angle
     present["flight"] = present["harmonics"] and not present["offset"] and not present["support"]
     # the closed form of flight is not valid for a block that tumbles by more than a quarter turn
     present["flight"] &= scene.head.carries == "walls"
     creeps = present["wear"] or bool({"slip", "stick"} & present.keys())
     present["rest"] = not (creeps or present["support"])
     if present["harmonics"]:
-        # without damping, a harmonic load can build up a motion, so rest under harmonic loads is not detected
+        # without damping, even a small harmonic load can build up a motion
         damped = law.viscous is not None or law.hysteretic is not None
         present["rest"] &= damped and present["flight"] and _harmonics_are_small(scene, loads, shared.of(_swing, loads))
     return law._replace(**_flags(present))
@@ -414,7 +407,7 @@ def _segments(scene: Scene, pieces: Pieces) -> Segments:
 
 
 def law_terms(contact: Contact) -> tuple[Terms, float]:
-    """Return the terms of the contact law, and the number D of a damping factor D / v0, or -1 for a constant factor."""
+    """Return the terms of the contact law, and D for a damping factor D / v0 or -1 for a constant factor."""
     law, exponent = LAWS[contact.law], float(contact.exponent)
     viscous = law.additive and bool(contact.damping)
     number = -1.0 if contact.restitution is None else law.damping_number(contact.restitution)
@@ -493,32 +486,29 @@ def _largest_acceleration(scene: Scene, wrench: Array) -> float:
 def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
     """Return the penetration in m below which the impulse until separation is negligible.
 
-    A pair that separates from the penetration d at the speed v receives the impulse K d^(n+1) / ((n+1) v). This impulse
-    must be small compared with the velocity tolerance, because there can be many separations, and some separations can
-    be a hundred times slower than the speed v.
+    From the penetration d, a pair that separates at the speed v receives the impulse K d^(n+1) / ((n+1) v). It must be
+    small compared with the velocity tolerance even after many separations that are a hundred times slower.
     """
     exponent = scene.contact.exponent
     share = 1e-5 if exponent == 1.5 or float(exponent).is_integer() else 1e-8
     impulse = share * tol * speed * scene.head.mass_kg
     release = float((impulse * (exponent + 1.0) * speed / scene.contact.stiffness) ** (1.0 / (exponent + 1.0)))
     if not float(exponent).is_integer():
-        # below a few rounding errors, a depth is noise, and the series of its power would have non-finite terms
+        # the series of the power of a smaller depth would have non-finite terms
         release = max(release, _NOISE * geometry.half_diagonal(scene))
     friction = scene.friction
     if friction is not None and friction.stick_stiffness_n_m is not None and friction.coefficient > 0.0:
-        # when a pair becomes RELEASED, the force of the spring at its sticking corner jumps to zero, so this spring
-        # force must be negligible at the depth
+        # the spring force of a sticking corner jumps to zero when its pair becomes RELEASED
         stretch = max(1e-3 * tol * length, 1e-15 * geometry.half_diagonal(scene))
         held = stretch * friction.stick_stiffness_n_m / friction.coefficient
-        # a corner needs at least 1e-11 s to cross the depth; for a faster crossing, its series would have non-finite
-        # terms
+        # the series would have non-finite terms if a corner crossed the depth in less than 1e-11 s
         depth = max(float((held / scene.contact.stiffness) ** (1.0 / exponent)), 1e-11 * speed)
         release = min(release, depth)
     return release
 
 
 def _implicit(scene: Scene, terms: Terms, values: dict[str, Any]) -> Implicit | None:
-    """Return nodes and scratch space of implicit steps, or None if the motion cannot be overdamped."""
+    """Return nodes and scratch space of implicit steps, or None without overdamped motion."""
     contact = scene.contact
     mobility = 1.0 / scene.head.mass_kg + values["radius"] ** 2 / scene.head.inertia_kg_m2
     if scene.support is not None:
@@ -552,7 +542,7 @@ def _rubbing(scene: Scene) -> dict[str, Any]:
 
 
 def _slip(scene: Scene) -> dict[str, Any]:
-    """Return the constants of friction. Without friction, only the slip speed is set, because it is a divisor."""
+    """Return the constants of friction; without friction, only a slip speed as a divisor."""
     friction = scene.friction
     if friction is None:
         return {"slip_speed": 1.0}

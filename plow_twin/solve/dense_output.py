@@ -17,7 +17,7 @@ from plow_twin.solve.support import see_from_frame
 
 @kernel(inline="source")
 def time_along(alpha, beta, sigma):
-    """Return the time since the start of the step, alpha sigma + beta sigma^2 / 2, with the series variable sigma."""
+    """Return the time since the start of the step at the series variable sigma."""
     return alpha * sigma + 0.5 * beta * sigma * sigma
 
 
@@ -26,7 +26,7 @@ def sigma_at(state, used):
     """Return the series variable sigma at `used` seconds after the start of the step."""
     if used >= state.step_size:
         return state.sigma_end
-    # in a step that begins at a touch, alpha = 0, and the formula below would be 0 / 0 at used = 0
+    # the formula below is 0 / 0 at a touch (alpha = 0)
     if state.beta == 0.0 or used == 0.0:
         return used
     # root of alpha sigma + beta sigma^2 / 2 = used, in a form without cancellation
@@ -59,8 +59,7 @@ def wear_depth_at(state, w, sigma, out) -> None:
     """Write the wear depth of each pad at sigma to `out`, shape (8,)."""
     wear_depth = row(state.wear_depth, 0)
     if any_penetrates(state):
-        # pads wear only under penetrating pairs; the sum starts at row 1 of `w.wear`, because row 0 is the wear before
-        # the step
+        # row 0 of `w.wear` is the wear before the step
         order = state.order
         growth = row(w.wear, order)
         for k in range(order - 1, 0, -1):

@@ -43,7 +43,7 @@ class Acting(NamedTuple):
 
 @kernel(inline="source")
 def acting(parts):
-    """Return the `Acting` of a scene, taken from its parts."""
+    """Return the `Acting` of a scene."""
     terms = parts.terms
     return Acting(parts.harmonics, parts.segments, terms.offset, terms.free, terms.slip, terms.stick, terms.support)
 
@@ -52,8 +52,7 @@ def acting(parts):
 def push(p, slip, stick, state, frozen, pair, force, c, s, theta, omega, x, y, vx, vy):
     """Return force and moment of one pair in head axes, and the power of its friction, for the normal force `force`.
 
-    The wall's tangent is its outward normal, rotated by +90 degrees. Rows 2 and 3 of `p.penetration_rows` contain the
-    components of the normal with the opposite sign.
+    Rows 2 and 3 of `p.penetration_rows` contain the wall's normal with the opposite sign.
     """
     fx, fy = -p.penetration_rows[2, pair] * force, -p.penetration_rows[3, pair] * force
     torque, power = row_value(p.arm_rows, pair, c, s, x, y) * force, 0.0
@@ -73,10 +72,9 @@ def push(p, slip, stick, state, frozen, pair, force, c, s, theta, omega, x, y, v
 
 @kernel(inline="source")
 def about_mass(p, c, s, load):
-    """Return the head's angular acceleration due to a load that acts at the cavity's centre.
+    """Return the head's angular acceleration due to a load at the cavity's centre.
 
-    The acceleration follows from the moment of the load about the centre of mass. Gravity is part of the load, but acts
-    at the centre of mass, so the moment of gravity is subtracted.
+    Gravity, which is part of the load, acts at the centre of mass and has no moment.
     """
     across = (c * p.offset[0] - s * p.offset[1]) * (load[1] + p.gravity)
     return -(across - (s * p.offset[0] + c * p.offset[1]) * load[0]) * p.inverse_inertia / p.inverse_mass
@@ -86,8 +84,8 @@ def about_mass(p, c, s, load):
 def accelerate(p, acts, frozen, state, t, z, load, out) -> None:
     """Write the rate of z = (x, y, theta, vx, vy, omega) to `out`. With a support, `to_world_both` defines z.
 
-    If `frozen` is true, the pairs with mode ON exert the force of their law, even where this force would pull.
-    Otherwise all penetrating pairs exert force, and no pair pulls.
+    If `frozen` is true, the pairs with mode ON exert the force of their law, even where it would pull. Otherwise all
+    penetrating pairs exert force, and no pair pulls.
     """
     load_at(p, acts.harmonics, acts.segments, t, load)
     _accelerate(p, acts.offset, acts.free, acts.slip, acts.stick, acts.support, frozen, state, z, load, out)

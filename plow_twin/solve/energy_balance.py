@@ -1,8 +1,8 @@
-"""Energy balance of a run. Changes of energy and momentum are compared with the work and impulse of the forces.
+"""Energy balance of a run: work and impulse of the forces beside changes of energy and momentum.
 
-The forces are computed at single instants, independently of the series: loads from the time, and contact forces by
-`model.contact` and `model.friction`. Powers and forces are integrated by Gauss-Legendre quadrature over each step of
-the series, or by the trapezoidal rule over fixed steps. Kinetic energy and momentum are computed from the state.
+The forces are computed at single instants, independently of the series, by `model.contact` and `model.friction`. They
+and their powers are integrated by Gauss-Legendre quadrature over each step of the series, or by the trapezoidal rule
+over fixed steps.
 """
 
 from __future__ import annotations
@@ -23,11 +23,10 @@ from plow_twin.solve.loads import load_at
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y, new_record
 from plow_twin.solve.support import to_ground
 
-#: Number of nodes of the quadrature, which is exact up to degree 15. More nodes would not reduce the imbalance, because
-#: the higher terms of a step's series are as small as the error of the series.
+#: Number of nodes of the quadrature, which is exact up to degree 15. Higher terms are as small as the series' error.
 _NODES = 8
-#: Largest phase [rad] of the fastest harmonic load over a panel, which is the interval of one quadrature in flight or
-#: at rest. Up to this phase, the quadrature of a product of two harmonics has an error of 1e-13.
+#: Largest phase [rad] of the fastest harmonic load over one quadrature in flight or at rest, with an error of 1e-13 for
+#: a product of two harmonics.
 _PANEL_PHASE = 2.0
 # indices into the powers [W] and forces [N, N m] at one time
 LOADS, NORMAL, FRICTION, SUPPORT, LOAD_X, LOAD_Y, LOAD_M, CONTACT_X, CONTACT_Y, CONTACT_M, SIZE = range(11)
@@ -45,8 +44,7 @@ SUMS = np.dtype(
 )
 
 
-#: Record of the energy balance: quadrature, work space and sums. Kernels that receive `None` instead are compiled
-#: without the balance.
+#: Record of the energy balance: quadrature, work space and sums. Kernels that receive None omit the balance.
 BALANCE = np.dtype(
     [
         ("nodes", "f8", (_NODES,)),
@@ -73,7 +71,7 @@ def new_balance() -> BalanceSums:
 
 @kernel()
 def _powers(p, parts, state, wear_depth, y, frame, t, balance, out) -> None:
-    """Write powers and forces at time t and body coordinates y. `frame` is the state of a frame on springs, or None."""
+    """Write powers and forces at time t, body coordinates y and the state `frame` of a frame on springs, if any."""
     terms, load = parts.terms, out[LOAD_X : LOAD_M + 1]
     load_at(p, parts.harmonics, parts.segments, t, load)
     ground = _on_ground(terms.support, y, frame, balance)
@@ -95,7 +93,7 @@ def _taken_by_support(p, support, frame):
 
 @kernel()
 def _on_ground(support, y, frame, balance):
-    """Return the body coordinates relative to the ground. y contains them relative to the frame."""
+    """Convert body coordinates y relative to the frame to coordinates relative to the ground."""
     if support is not None:
         to_ground(y, frame, balance.ground)
         return balance.ground
@@ -193,7 +191,7 @@ def _add(balance, powers, weight) -> None:
 
 @kernel()
 def balance_step(p, parts, wear, flight, state, w, balance) -> None:
-    """Add the integrals over the current step, after its series was computed and before it is completed."""
+    """Add the integrals over the current step, before it is completed."""
     y, wear_depth, end, support = balance.body, balance.wear_depth, state.sigma_end, parts.terms.support
     frame = _frame_now(support, w)
     set_row(wear_depth, 0, row(state.wear_depth, 0))

@@ -1,7 +1,6 @@
-"""Detection of the first event of a step.
+"""Detection of the first event of a step, the earliest root of all guard functions (`polynomial.first_root`).
 
-A guard function is a polynomial over the step. It is positive as long as a pair keeps its mode. The event is the
-earliest root of all guard functions (`polynomial.first_root`).
+A guard function is a polynomial that is positive as long as a pair keeps its mode.
 """
 
 from __future__ import annotations
@@ -15,11 +14,9 @@ from plow_twin.solve.state import CLIPPED, CROSSING, OFF, ON, RATIO, RELEASED, S
 
 #: Largest difference of the times of two simultaneous events, divided by the size of the step that ends with them.
 _AT_ONCE = 1e-12
-#: Penetration at which a pair changes from ON to RELEASED, divided by `Params.release`. The pair changes back to ON at
-#: `Params.release`.
+#: Penetration at which a pair changes from ON to RELEASED, divided by `Params.release`, at which it changes back.
 LET_GO = 0.25
-#: Allowances for rounding in the proof that no guard function becomes negative: a factor for sums of terms, and an
-#: absolute error of the guard function 1 + lambda d'.
+#: Allowances for rounding of guard functions: a factor for sums of terms, and an absolute error of 1 + lambda d'.
 _ROUNDED, _ROUNDING = 1.0 + 1e-9, 1e-9
 _ALL_PAIRS = 2**PAIR_COUNT - 1
 #: Penetration below which a RELEASED pair is treated as resting on its wall, divided by `Params.release`.
@@ -33,8 +30,8 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
     The guard function depends on the mode and on the penetration d:
 
     - OFF: -d.
-    - ON: F / K = d + (C / K) d' for Kelvin-Voigt, and d for all other laws. For exponents that are not integers, a
-      small penetration is subtracted.
+    - ON: F / K = d + (C / K) d' for Kelvin-Voigt, and d for all other laws, minus a small penetration for exponents
+      that are not integers.
     - All other modes: d.
     """
     guard, weights = w.guard, w.per_pair
@@ -54,24 +51,20 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
     for pair in range(PAIR_COUNT):
         first = max(guard[0, pair], 0.0)
         if state.mode[pair] == ON:
-            # a pair becomes RELEASED at a quarter of the depth at which a RELEASED pair becomes ON, so that it cannot
-            # alternate between the two modes
+            # the two depths differ, so that a pair cannot alternate between RELEASED and ON
             first -= min(LET_GO * p.release, 0.5 * first)
         elif state.mode[pair] == RELEASED and first <= ON_THE_WALL * p.release:
-            # a RELEASED pair that rests on its wall separates at the depth -LET_GO * release, so its guard function is
-            # increased by this distance
+            # a RELEASED pair that rests on its wall separates at the depth -LET_GO * release
             first = max(guard[0, pair] + LET_GO * p.release, 0.0)
         guard[0, pair] = first if p.enabled[pair] == 1 else 1.0
 
 
 @kernel()
 def _second_guard(p, state, w, order, pair, viscous, hysteretic, integer, fraction, ramp) -> bool:
-    """Write the second guard function of a penetrating pair to `w.column[0]`. Return whether the pair has one.
-
-    The second guard function depends on the mode:
+    """Write the second guard function of a penetrating pair to `w.column[0]`, and return whether it has one:
 
     - ON: 1 + lambda d', or the force F for a law with a ramp.
-    - CLIPPED: the function for ON with the opposite sign. It is positive as long as the force would pull.
+    - CLIPPED: the function for ON with the opposite sign, positive as long as the force would pull.
     - RELEASED: p.release - d.
     """
     g, mode = w.column[0], state.mode[pair]
@@ -130,9 +123,9 @@ def _ramp_guard(p, state, w, order, pair) -> None:
 def _unsafe_pairs(w, order, h):
     """Return an integer with a bit for each pair whose guard function g may become negative on [0, h].
 
-    The function g stays positive on [0, h] if g_0 and
-    b(h) = g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are positive. The reason is that b is a lower bound of g and
-    concave. If the test fails for any pair, the signs of the Bernstein coefficients are tested.
+    g stays positive on [0, h] if g_0 and b(h) = g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are positive, because
+    b is concave and a lower bound of g. If this test fails for any pair, the signs of the Bernstein coefficients are
+    tested.
     """
     guard, b = w.guard, w.bernstein
     reach = splat(0.0)
@@ -156,9 +149,7 @@ def _unsafe_pairs(w, order, h):
 def _nothing_ends(p, state, w, order, h, penetrating, hysteretic) -> bool:
     """Return whether no pair changes its mode on [0, h], for an integer exponent without a ramp.
 
-    The function combines the first test of `_unsafe_pairs` with the test of `_stays`, for all pairs at once. A positive
-    linear term is ignored. The allowances for rounding ensure that every guard function that passes this test would
-    pass `_unsafe_pairs` and `_stays`.
+    The test is stricter than `_unsafe_pairs` and `_stays`: it ignores positive linear terms and allows for rounding.
     """
     weights = w.per_pair
     for pair in range(PAIR_COUNT):
@@ -194,7 +185,7 @@ def _next_mode(p, mode, viscous, fraction, ramp):
 
 @kernel()
 def _stays(column, order, h) -> bool:
-    """Return whether the lower bound of `_unsafe_pairs` proves that a guard function stays positive on [0, h]."""
+    """Return whether a guard function stays positive on [0, h] by the lower bound of `_unsafe_pairs`."""
     reach = 0.0
     for k in range(order, 1, -1):
         reach = (reach + max(-column[k], 0.0)) * h
@@ -223,7 +214,7 @@ def _ends_with(column, order, at, within) -> bool:
 
 @kernel(fast=True)
 def _guards_end_with(w, order, at, within):
-    """Return an integer with a bit for each pair for whose first guard function `_ends_with` is true."""
+    """Return an integer with a bit for each pair whose first guard function satisfies `_ends_with`."""
     value, slope, zero = row(w.guard, order), splat(0.0), splat(0.0)
     for k in range(order - 1, -1, -1):
         slope = slope * at + value
@@ -237,7 +228,7 @@ def note_switches(
 ) -> None:
     """Write to `w.switch` the next mode of each pair that changes its mode at the event, and -1 for all other pairs.
 
-    Pairs whose events differ only by rounding change their modes together, so that a symmetric motion stays symmetric.
+    Events that differ only by rounding are simultaneous, so that a symmetric motion stays symmetric.
     """
     column, within = w.column[0], _AT_ONCE * at
     ending = _guards_end_with(w, order, at, within)
@@ -277,7 +268,7 @@ def first_event(p, state, w, order, sigma, penetrating, viscous, hysteretic, int
             for k in range(order + 1):
                 column[k], w.halves[0, k] = w.guard[k, pair], w.bernstein[k, pair]
             if _stays(column, order, best):
-                # this guard function cannot become negative before the event that has already been found
+                # it cannot become negative before the event that has already been found
                 continue
             state.guard_roots += 1
             root = first_root_within(column, order, sigma, w)

@@ -1,7 +1,7 @@
-"""Fixed-step methods without event detection. They are RK4, as in the paper, and semi-implicit Euler.
+"""Fixed-step methods without event detection: RK4, as in the paper, and semi-implicit Euler.
 
-These methods serve as a check of the Taylor series. They share only the geometry and the contact law with the series,
-and integrate the equations of motion (paper, eq. 5) in world axes about the centre of mass.
+They check the Taylor series, with which they share only the geometry and the contact law. The equations of motion
+(paper, eq. 5) are integrated in world axes about the centre of mass.
 """
 
 from __future__ import annotations
@@ -76,10 +76,9 @@ def _runge_kutta(p, acts, state, t, dt, z, trial, k, load) -> None:
 def end_coarsely(p, parts, state, totals, target, bound) -> int:
     """Advance the state to `target` by the Runge-Kutta steps of `bound`, and estimate the error. Return a `Status`.
 
-    The error of a step is estimated from the two middle stages as |k2 - k3| dt / 3. The order of this estimate is one
-    less than the order of the method. Errors of the velocity are multiplied by the remaining time. If a pair touches or
-    separates within a step, the error of its impulse is F dt / 2. This error is multiplied by the time in which the
-    largest load moves the head across the clearance.
+    The error of a step is |k2 - k3| dt / 3 by the two middle stages. Errors of the velocity are multiplied by the
+    remaining time. If a pair touches or separates within a step, the error F dt / 2 of its impulse is multiplied by the
+    time in which the largest load moves the head across the clearance.
     """
     terms = parts.terms
     acts, y, size = acting(parts), state.y, 6 if terms.support is None else 12
@@ -89,7 +88,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
     dt = (target - start) / bound.steps
     _to_world(p, parts.terms.support, state, z)
     for pair in range(PAIR_COUNT):
-        # CLIPPED and RELEASED pairs penetrate their walls, so they are treated as ON
+        # CLIPPED and RELEASED pairs penetrate their walls
         state.mode[pair] = OFF if state.mode[pair] == OFF else ON
     pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
     state.bounded += 1
@@ -135,8 +134,8 @@ def integrate_fixed(
 ) -> int:
     """Take the steps `done[0]` to `steps` of size `dt`, and write a row every `stride` steps. Return a `Status`.
 
-    z, shape (6,) or (12,), contains the integrated variables between calls (`support.to_world_both`). A conversion to
-    body coordinates and back would change their last bits.
+    z, shape (6,) or (12,), contains the integrated variables between calls (`support.to_world_both`), because a
+    conversion to body coordinates and back would change their last bits.
     """
     trial, k = np.empty(z.size), np.empty((4, z.size))
     load, y, acts = np.empty(3), state.y, acting(parts)
@@ -153,7 +152,7 @@ def integrate_fixed(
         if not within_range(p, state, y):
             return _RANGE
         if n % stride == 0 or n == steps:
-            # the last row can follow fewer than `stride` steps after the previous row, so its index is rounded up
+            # rounded up for the last row, which may follow earlier
             row = (n + stride - 1) // stride
             pose_of(p, y, parts.terms.offset, q[row], v[row])
             if frame is not None:

@@ -1,17 +1,16 @@
-"""Friction with stick. The functions compute the force of sticking corners, and conditions for slip and stick.
+"""Friction with stick: force of sticking corners, and conditions for slip and stick.
 
 A spring and a damper connect a sticking corner to its anchor a on the wall. A slipping corner exerts sliding friction:
 
     sticks    T = k (s - a) + c s'      while |T| <= mu_s N
     slips     T = +-mu N                while +-(k s' + c s'') >= mu N'
 
-T is the tangential force and N the normal force. s is the corner's position along the wall. k and c are the constants
-of spring and damper. While a corner slips, the anchor follows the corner, so that spring and damper carry mu N.
-A corner slips as long as the force of spring and damper would grow at least as fast as mu N if the corner started to
-stick.
+T is the tangential force, N the normal force, s the corner's position along the wall, and k and c the constants of
+spring and damper. While a corner slips, the anchor follows it, so that spring and damper carry mu N. A corner starts to
+stick when the force of spring and damper would grow more slowly than mu N.
 
-If mu_s = mu, T and the accelerations are continuous at the change, so the change of each pair can be determined
-separately. Sources: Cundall and Strack, Geotechnique 29 (1979) 47; Luding, Granul. Matter 10 (2008) 235, sec. 3.2.
+If mu_s = mu, T is continuous at the change, so each pair can change separately. Sources: Cundall and Strack,
+Geotechnique 29 (1979) 47; Luding, Granul. Matter 10 (2008) 235, sec. 3.2.
 """
 
 from __future__ import annotations
@@ -38,12 +37,11 @@ from plow_twin.solve.state import (
     Y,
 )
 
-#: A negative first value of a guard function is treated as rounding error up to the sum of two bounds. `_ROUNDING` is
-#: relative to the terms of the function at the start of the step. `_ROUNDING_OVER_STEP` is relative to the largest term
-#: over the step.
+#: Rounding errors of the first value of a guard function, relative to its terms at the start of the step and to its
+#: largest term over the step.
 _ROUNDING, _ROUNDING_OVER_STEP = 1e-10, 1e-13
-#: Rounding error of a corner's position along its wall, divided by `Params.leverage`. The rounding error of its slip
-#: rate, divided by `Params.threshold[0]`, has the same value.
+#: Rounding error of a corner's position along its wall, divided by `Params.leverage`, and of its slip rate, divided by
+#: `Params.threshold[0]`.
 _FINEST = 4e-15
 
 
@@ -62,7 +60,7 @@ def held_force(p, state, pair, place, rate):
 
 @kernel(inline="code")
 def tangential_force(p, state, frozen, pair, normal, place, rate):
-    """Return the tangential force T in N. Unless `frozen` is true, T is limited to the force that causes slip."""
+    """Return the tangential force T in N, limited to the force that causes slip unless `frozen` is true."""
     grip = state.grip[pair]
     if state.mode[pair] != ON:
         return 0.0
@@ -83,7 +81,7 @@ def _anchor(p, state, pair, force, place, rate) -> None:
 
 @kernel(inline="code")
 def _normal_force(p, state, pair, depth):
-    """Return the normal force of a pair that pushes, even if rounding has made the penetration `depth` negative."""
+    """Return the normal force of a pair that pushes, even if rounding makes the penetration `depth` negative."""
     return max(law_force(p, state, pair, depth, rate_of(p, pair, state.y)), 0.0)
 
 
@@ -91,15 +89,15 @@ def _normal_force(p, state, pair, depth):
 def grasp(p, state, pair, old) -> None:
     """Make the corner of a pair that begins to push stick with a relaxed spring, or slip if |T| exceeds mu_s N.
 
-    N is computed from the previous mode `old`, because rounding of the depth would otherwise determine the result. At a
-    touch, N is the force at depth 0, which is the force of the Kelvin-Voigt damper. For a CLIPPED pair, N is 0.
+    Against rounding of the depth, N depends on the previous mode `old`: it is the force at depth 0 at a touch, and 0
+    for a CLIPPED pair.
     """
     place, rate = _along(p, pair, state.y)
     depth = 0.0 if old == OFF else penetration_of(p, state, pair, state.y)
     normal = 0.0 if old == CLIPPED else _normal_force(p, state, pair, depth)
     state.anchor[pair], state.grip[pair] = place, 0
     held = p.stick_damping * rate
-    # without normal force, every moving corner slips; the guard function of a slipping corner gives the same result
+    # without normal force, every moving corner slips
     if abs(held) > p.static_friction * normal or (normal <= 0.0 and rate != 0.0):
         state.grip[pair] = 1 if rate > 0.0 else -1
 
@@ -109,7 +107,6 @@ def switch_grip(p, state, pair, new) -> None:
     """Set a corner to stick or slip, as the event `new` requires."""
     if new == STICKS:
         place, rate = _along(p, pair, state.y)
-        # a Kelvin-Voigt force acts from the touch on, even if rounding has made the depth zero or negative
         normal = _normal_force(p, state, pair, penetration_of(p, state, pair, state.y))
         _anchor(p, state, pair, state.grip[pair] * p.friction * normal, place, rate)
         state.grip[pair] = 0
@@ -119,7 +116,7 @@ def switch_grip(p, state, pair, new) -> None:
 
 @kernel()
 def settle_grips(p, state, force) -> None:
-    """Determine after a fixed step which corners slip. `force` contains the normal forces, shape (8,)."""
+    """Determine after a fixed step which corners slip under the normal forces `force`, shape (8,)."""
     for pair in range(PAIR_COUNT):
         place, rate = _along(p, pair, state.y)
         if state.mode[pair] != ON or force[pair] <= 0.0:
@@ -147,10 +144,7 @@ def weigh_grips(p, state, w) -> None:
 
 @kernel(fast=True, inline="code")
 def grip_terms(p, state, w, k, place, rate):
-    """Return coefficient k of the series of the tangential forces T of the eight pairs.
-
-    `place` and `rate` are coefficient k of the corners' positions and slip rates. `w.force` contains the normal forces.
-    """
+    """Return coefficient k of the tangential forces T, from coefficient k of the corners' positions and slip rates."""
     if k == 0:
         place = place - row(state.anchor, 0)
     return row(w.grip, 0) * row(w.force, k) + row(w.grip, 1) * place + row(w.grip, 2) * rate
@@ -160,8 +154,8 @@ def grip_terms(p, state, w, k, place, rate):
 def grip_guard(p, state, w, order, pair, side) -> int:
     """Write a guard function of a corner to `w.column[0]`. Return the event of its root, or 0 without a guard function.
 
-    A sticking corner has two guard functions, mu_s N -+ T, one for each direction of slip (`side`). A slipping corner
-    has one guard function, for side 0. It is the condition for slip in the docstring of this module, times dt/dsigma.
+    A sticking corner has the guard functions mu_s N -+ T, one for each direction of slip (`side`). A slipping corner
+    has one for side 0, the condition for slip in the module's docstring times dt/dsigma.
     """
     g, rate, force, drag = w.column[0], w.slip[0], w.force, w.slip[4]
     grip = state.grip[pair]
@@ -173,11 +167,10 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         sign = 1.0 if side == 0 else -1.0
         for k in range(order):
             g[k] = p.static_friction * force[k, pair] - sign * drag[k, pair]
-        # a negative normal force is treated as 0: because of the error of its touch time, a pair with mode ON can be
-        # slightly outside its wall
+        # a pair with mode ON can be slightly outside its wall, because of the error of its touch time
         g[0] = p.static_friction * max(force[0, pair], 0.0) - sign * drag[0, pair]
         size, noise = p.static_friction * abs(force[0, pair]) + abs(drag[0, pair]), 0.0
-        # the guard function is increased by the rounding error of T; otherwise a corner could slip as soon as it sticks
+        # without the rounding error of T, a corner could slip as soon as it sticks
         late = _FINEST * (p.stick_stiffness * p.leverage + p.stick_damping * p.threshold[0])
     else:
         for k in range(order - 1):
@@ -192,8 +185,7 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         for k in range(1, order):
             power *= state.sigma_end
             noise = max(noise, _ROUNDING_OVER_STEP * abs(g[k]) * power)
-    # a negative first value within rounding error is set to 0, so that the higher orders determine the sign of the
-    # guard function
+    # within the rounding error of the first value, the higher orders determine the sign
     if abs(g[0]) <= _ROUNDING * size + noise:
         g[0] = max(g[0], 0.0)
     g[0] += late

@@ -1,4 +1,4 @@
-"""Computation of the growth of errors from the fundamental matrices of successive stretches of a motion."""
+"""Growth of errors from the fundamental matrices of successive stretches of a motion."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from typing import Final
 from plow_twin.kernel.arrays import copy_into
 from plow_twin.kernel.compiler import kernel
 
-#: Largest number of earlier times from which the growth of errors is computed. When this number is reached, every
-#: second time is removed.
+#: Largest number of earlier times from which the growth of errors is computed. Beyond it, every second time is removed.
 MOST_KEPT: Final = 256
-#: `_SQUARINGS`: largest number of squarings of a matrix. After these squarings, two singular values are treated as
-#: equal if their ratio is within 1e-6 of 1. `_RANK_ONE`: a matrix with trace 1 is treated as having rank one if the
-#: trace of its square is larger than this value. In this case the squarings end.
+#: `_SQUARINGS`: largest number of squarings of a matrix, after which singular values with a ratio within 1e-6 of 1 are
+#: treated as equal. `_RANK_ONE`: trace of the square above which a matrix with trace 1 is treated as having rank one.
 _SQUARINGS, _RANK_ONE = 18, 1.0 - 1e-9
 
 
@@ -33,8 +31,7 @@ def _larger_norm(a, height, most, gram, power, square) -> float:
     """Return the larger of `most` and the largest singular value of the first `height` rows of a matrix.
 
     Let A be these rows and G = A^T A. The square of the largest singular value lies between trace(G^(m+1)) / trace(G^m)
-    and trace(G^m)^(1/m). G is squared repeatedly until the square root of the upper bound is less than `most`, or until
-    the power of G has rank one.
+    and trace(G^m)^(1/m). G is squared until the upper bound is below `most`, or until the power of G has rank one.
     """
     size, trace = a.shape[1], 0.0
     for i in range(size):
@@ -88,8 +85,8 @@ def _multiply_all(matrix, since, count, grown) -> None:
 def _largest(grown, count, height, scratch) -> float:
     """Return the largest spectral norm of the first `height` rows of the matrices grown[:, i, :], at least 1.
 
-    The sum of squares of a matrix is an upper bound of its squared norm. The norm of the matrix with the largest sum is
-    computed first, so that few of the remaining norms have to be computed.
+    The sum of squares of a matrix is an upper bound of its squared norm. After the norm of the matrix with the largest
+    sum, few norms have to be computed.
     """
     most, begin, size = 1.0, 0, len(grown)
     squares = scratch[5:].reshape(-1)
@@ -116,8 +113,7 @@ def _stretch_basis(matrix, basis, moved, logs) -> None:
     _multiply(matrix, basis, moved)
     for j in range(size):
         for i in range(2 * j):
-            # each vector is made orthogonal to the previous vectors in two passes, because a single pass leaves
-            # rounding errors
+            # two passes, because a single pass leaves rounding errors
             before, share = i % j, 0.0
             for k in range(size):
                 share += basis[k, before] * moved[k, j]
@@ -171,7 +167,7 @@ def follow_growth(matrices, changes, ends, since, kept, whole, basis, scratch, t
         matrix, count = matrices[index], kept[0]
         grown, size = since[1], len(matrix)
         _multiply_all(matrix, since[0], count, grown)
-        # entry `count` of `grown` is `matrix` itself, the growth since the beginning of the current stretch
+        # growth since the beginning of the current stretch
         for k in range(size):
             copy_into(grown[k, count], matrix[k])
         ended = ends[index] == 1

@@ -1,6 +1,6 @@
-"""Kinematics of the head. The functions compute penetrations and their rates, and convert between axes.
+"""Kinematics of the head: penetrations and their rates, and conversions between axes.
 
-The argument `rows` contains coefficients of each pair for cosine and sine of the head's angle and for its position x, y
+The argument `rows` contains each pair's coefficients of cosine and sine of the head's angle and of its position x, y
 (`model.geometry`).
 """
 
@@ -15,17 +15,17 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, splat
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
-#: A quarter turn in rad. After each quarter turn of a tumbling block, its corners are renamed (`solve.tumbling`).
+#: A quarter turn in rad, after which the corners of a tumbling block are renamed (`solve.tumbling`).
 QUARTER_TURN = 0.5 * math.pi
 
 
-#: 1 if the state is in world axes, as for a head that carries corners. None if it is in head axes.
+#: 1 for a state in world axes, as for a head that carries corners, and None for a state in head axes.
 fixed_axes = by_field("tumbles", lambda p: 1, lambda p: None)
 #: Whether the head may turn beyond 45 degrees (`model.geometry.tumbles`).
 may_tumble = by_field("tumbles", lambda p: p.tumbles != 0.0, lambda p: False)
 
 
-#: 1 if the corners are rounded, so that a rotation moves the touching point along its wall. Otherwise None.
+#: 1 for rounded corners, whose rotation moves the touching point along its wall, and None for sharp corners.
 _is_rounded = by_field("roll", lambda p: 1, lambda p: None)
 _roll = by_field("roll", lambda p: p.roll, lambda p: 0.0)
 
@@ -50,8 +50,7 @@ def spin_of_axes(p, omega):
 def named_angle(p, y, theta):
     """Return theta without the quarter turns after which the corners were renamed (`solve.tumbling`).
 
-    The body coordinates y contain the cosine and sine of the returned angle. For a head that carries walls, the
-    function returns theta.
+    The body coordinates y contain the cosine and sine of this angle, which is theta for a head that carries walls.
     """
     if fixed_axes(p) is not None:
         turns = np.rint((y[THETA] - math.atan2(y[SIN], y[COS])) / QUARTER_TURN)
@@ -107,7 +106,7 @@ def slip_arm(p, pair, c, s, x, y):
 
 @kernel(fast=True, inline="code")
 def rolled(p, values, angle):
-    """Return positions along the walls, or slip rates, after adding the product of `roll` and `angle` (or its rate)."""
+    """Return positions along the walls, or slip rates, plus the product of `roll` and `angle` or its rate."""
     if _is_rounded(p) is not None:
         values = values + splat(_roll(p) * angle)
     return values
@@ -115,7 +114,7 @@ def rolled(p, values, angle):
 
 @kernel(fast=True, inline="code")
 def slip_arms(p, arms, k):
-    """Return coefficient k of the series of all friction arms. For sharp corners, the result is `arms`."""
+    """Return coefficient k of all friction arms, given those of sharp corners, `arms`."""
     if _is_rounded(p) is not None and k == 0:
         arms = arms - splat(_roll(p))
     return arms
