@@ -1,7 +1,7 @@
 """Live twins in lanes under sampled loads. A twin advances from sample to sample, and writes a row at each sample.
 
-If a load is sampled frequently, a step ends at the next sample long before its series becomes inaccurate. A series
-therefore ends at the order from which its terms are negligible over this step (`series.expand`).
+Under a load with frequent samples, a step ends long before its series becomes inaccurate. A series therefore ends at
+the order from which its terms are negligible over the step (`series.expand`).
 """
 
 from __future__ import annotations
@@ -51,8 +51,7 @@ from plow_twin.solve.method.rest import slow_enough
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, Status, X, Y
 from plow_twin.solve.step import LONGEST_STEP
 
-#: Number of steps under constant load between two samples, after which a lane is checked for rest. The check costs as
-#: much as this number of steps.
+#: Number of steps under constant load after which a lane is checked for rest. The check costs as many steps.
 _MAY_REST: Final = 32
 #: Size of a term that is treated as zero, divided by the admissible size of the term of the last order
 #: (`method.series`).
@@ -81,7 +80,7 @@ class Samples(NamedTuple):
     params: NDArray[np.void]  #: parameters of all twins, shape (m,)
     states: NDArray[np.void]
     blocks: NDArray[np.void]  #: twins of a thread, eight in each `BLOCK`; shape (b,)
-    #: for each block, bit mask of the twins whose modes it contains; -1 for a block that must be loaded from records
+    #: for each block, bit mask of the twins whose modes it contains; -1 for a block to load from records
     noted: NDArray[np.int64]
     totals: NDArray[np.void]  #: numbers of touches since the previous sample, by lane, shape (8,)
     times: NDArray[np.float64]  #: times of the samples in s, shape (n,)
@@ -93,8 +92,8 @@ class Samples(NamedTuple):
 
 
 #: Indices in `Samples.progress`: current block, number of twins that a method without lanes continues, state of the
-#: current block, first twin of the thread, and the twin after its last twin. The state of a block is `_LOADED` if it is
-#: in the lanes, `_LEFT` if one of its twins has left the lanes, and 0 in all other cases.
+#: current block, first twin of the thread, and the twin after its last twin. The state of a block is `_LOADED` in the
+#: lanes, `_LEFT` if one of its twins has left the lanes, else 0.
 BLOCK_NOW, OTHERS, LOADED, FIRST, END = range(5)
 _LOADED, _LEFT = 1, 2
 
@@ -110,7 +109,7 @@ def _unowned_samples(s):
 
 @kernel()
 def _begin_samples(s, lanes, bits) -> None:
-    """Set the loads of some lanes to straight lines up to their next samples, and store the current states."""
+    """Set the loads of some lanes to straight lines up to their next samples, and store their states."""
     samples = s.load.samples
     for j in range(3):
         set_row(lanes.sample, j, choose(bits, exact_row(lanes.next, j), exact_row(lanes.sample, j)))
@@ -233,7 +232,7 @@ def _load_record(s, power, lanes, lane, member) -> None:
 
 @kernel()
 def _store_block(s, hysteretic, power, lanes) -> None:
-    """Write the lanes to their block. If a twin has left the lanes, the block must be loaded from records."""
+    """Write the lanes to their block, which must be loaded from records if a twin has left the lanes."""
     block = s.progress[BLOCK_NOW]
     if s.progress[LOADED] == _LOADED:
         refresh(lanes, hysteretic, power)
@@ -248,7 +247,7 @@ def _store_block(s, hysteretic, power, lanes) -> None:
 
 @kernel()
 def _clear_sums(s, lanes, bits) -> None:
-    """Reset the sums of the rows of some lanes, and of all lanes whose twins have passed all samples."""
+    """Reset the sums of some lanes, and of all lanes whose twins have passed all samples."""
     zero, bits = exact_splat(0.0), bits | ~lanes.live[0]
     for pair in range(PAIR_COUNT):
         set_row(lanes.peak, pair, choose(bits, zero, exact_row(lanes.peak, pair)))
@@ -263,7 +262,7 @@ def _clear_sums(s, lanes, bits) -> None:
 
 @kernel()
 def _fail(s, lanes, lane, code) -> None:
-    """Undo a failed advance. The twin has its previous state at the time of the next sample.
+    """Undo a failed advance: the twin has its previous state at the time of the next sample.
 
     The caller has to call `note_modes` afterwards.
     """
@@ -288,8 +287,7 @@ def _fail(s, lanes, lane, code) -> None:
 def _tell(lanes, reached, viscous, hysteretic, power, fraction) -> None:
     """Write poses and rates of all lanes to `lanes.out`, and penetrations, their rates and forces to `lanes.told`.
 
-    `reached` is a bit mask of the lanes that have reached a sample. The peaks of these lanes include the force at the
-    sample.
+    `reached` is a bit mask of the lanes that have reached a sample, whose force enters their peaks.
     """
     for i in range(COMPONENTS):
         set_row(lanes.out, i, exact_row(lanes.y, i))
@@ -350,7 +348,7 @@ def _write_rows(s, lanes, reached) -> None:
 
 @kernel()
 def _go_on(s, lanes, passed) -> int:
-    """Start the advances of lanes to their next samples. Remove twins that have passed the last sample.
+    """Start advances to the next samples, and remove twins that have passed the last sample.
 
     Returns a bit mask of the lanes that can take a step without a further check.
     """
@@ -375,7 +373,7 @@ def _limit_steps(lanes) -> int:
     left, longest = exact_row(lanes.stop, 0) - exact_row(lanes.time, 0), exact_splat(LONGEST_STEP)
     ahead = below(exact_splat(0.0), left)
     whole = choose(below(left, longest), left, longest)
-    # an empty lane keeps its longest step, so that its results are finite
+    # an empty lane needs finite results
     set_row(lanes.whole, 0, choose(ahead, whole, exact_row(lanes.whole, 0)))
     return ahead
 
@@ -491,10 +489,9 @@ def advance_lanes(
 ) -> bool:  # fmt: skip
     """Advance the twins of all blocks through all samples. Return False if `iterations` iterations were not sufficient.
 
-    `eight` and `work`, shape (1,), are lanes and scratch space. `budget` is the largest number of steps of an advance
-    to a sample. If an advance fails, the state of the twin is unchanged, and its time becomes the time of the sample. A
-    twin at rest leaves its lane with its state at the previous sample. A method without lanes continues it
-    (`Samples.other`).
+    `eight` and `work`, shape (1,), are lanes and scratch space. `budget` is the largest number of steps to a sample. A
+    failed advance changes only the time of the twin. A twin at rest leaves its lane at the previous sample, and a
+    method without lanes continues it (`Samples.other`).
     """
     s, lanes, w = _unowned_samples(s), eight[0], work[0]
     for _ in range(iterations):

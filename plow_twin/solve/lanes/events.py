@@ -1,10 +1,10 @@
-"""Detection of the first event of each lane's step.
+"""Detection of the first event of each lane's step, the time at which a guard function becomes negative.
 
-An event is the time at which a guard function becomes negative. Only few guard functions can become negative within a
-step. Each lane lists these guard functions, and each iteration searches eight of them, from any lanes.
+Each lane lists the few guard functions that can become negative, and each iteration searches eight of them, from any
+lanes.
 
-If a CLIPPED or RELEASED pair separates from its wall, no force changes, so the step does not end. The rest of the step
-is searched for the next touch of this pair.
+The separation of a CLIPPED or RELEASED pair changes no force and does not end the step. The rest of the step is
+searched for its next touch.
 """
 
 from __future__ import annotations
@@ -31,13 +31,11 @@ from plow_twin.solve.state import CLIPPED, COS, OFF, ON, RELEASED, SIN, X, Y
 
 #: Largest difference of the times of two simultaneous events, divided by the size of the step that ends with them.
 _AT_ONCE = 1e-12
-#: Conditions for the end of a search for a root. `_FOUND`: relative change of the root. The next change would be of the
-#: order of the cube of this change. `_STRAIGHT`: effect of the curvature on the change. `_ROUNDED`: relative change due
-#: to rounding.
+#: Conditions for the end of a search for a root. `_FOUND`: relative change of the root, whose cube is negligible.
+#: `_STRAIGHT`: effect of the curvature on the change. `_ROUNDED`: relative change due to rounding.
 _FOUND, _STRAIGHT, _ROUNDED = 1e-6, 1e-3, 2e-16
 _MOST_CHANGES = 80
-#: Factor for rounding. If the step has been shortened since the search for a root began, a root that exceeds the step
-#: by this factor is certainly beyond the step.
+#: Factor for rounding, by which a root is certainly beyond a shortened step.
 _SURELY_LATER = 1.0 + 1e-9
 #: Indices in `lanes.chosen` after the five coefficients of a penetration: factor of d, factor of d', constant.
 _DEPTH, _RATE, _CONSTANT = 5, 6, 7
@@ -121,10 +119,7 @@ def _note(lanes, slot, kind, bits) -> None:
 
 @kernel()
 def _list_off(lanes, order) -> None:
-    """List the guard functions of pairs that are OFF.
-
-    A guard function is omitted if its first terms, with bounds of the later terms, prove that the pair stays OFF.
-    """
+    """List the guard functions of OFF pairs, unless their first terms and bounds of the later terms exclude a touch."""
     h, series, cosine, sine = exact_row(lanes.step, 0), lanes.series, lanes.series[COS], lanes.series[SIN]
     x, y = series[X], series[Y]
     # bounds of the terms after the second term: the sums of abs(term k) h^k for k > 1
@@ -160,10 +155,9 @@ def _row_of(array, k, places):
 def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order, h, fraction):
     """Write the guard functions `of_depth` d + `of_rate` d' + `constant` to `guard`, with the penetrations d.
 
-    `places` contains the lanes of the guard functions. None means one guard function of each lane, in order. Returns a
-    bit mask of the guard functions that may become negative. A guard function g stays positive on [0, h] if g_0 and
-    b(h) = g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are positive. The reason is that b is a lower bound of g and
-    concave.
+    `places` contains the lanes of the guard functions; None means one guard function of each lane, in order. Returns a
+    bit mask of the guard functions that may become negative. g stays positive on [0, h] if g_0 and b(h) = g_0 + g_1 h -
+    sum over k > 1 of max(-g_k, 0) h^k are positive, because b is concave and a lower bound of g.
     """
     cosine, sine, x, y = lanes.series[COS], lanes.series[SIN], lanes.series[X], lanes.series[Y]
     reach = term = deeper = zero = exact_splat(0.0)
@@ -177,8 +171,7 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
             term = fused(of_rate * (k + 1.0), deeper, of_depth * depth)
             deeper = depth
         else:
-            # the series variable may be a root of time; in this variable, the series of the rate d' is not the
-            # derivative of the series of d
+            # if the series variable is a root of time, the series of d' is not the derivative of the series of d
             term = of_depth * depth
             if damped != 0 and k < order:
                 deeper = linear_at(
@@ -199,7 +192,7 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
     first = fused(of_rate, deeper, of_depth * depth) + constant
     kept = below(zero, first)
     if fraction is not None:
-        # a pair that separates within the step penetrates at the start of the step, so the first value is not changed
+        # a pair that separates within the step penetrates at the start
         kept |= below(zero, exact_row(lanes.begin, 0))
     first = choose(kept, first, zero)
     set_row(guard, 0, first)
@@ -208,7 +201,7 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
 
 @kernel()
 def _choose_guards(lanes, at, hysteretic, fraction) -> int:
-    """Choose up to eight guard functions, beginning with the next function of each lane. Return their number."""
+    """Choose up to eight guard functions, first the next function of each lane, and return their number."""
     count, before = 0, -1
     while before < count < WIDTH:
         before = count
@@ -227,7 +220,7 @@ def _choose_guards(lanes, at, hysteretic, fraction) -> int:
 
 @kernel()
 def _write_choice(lanes, lane, guard, i, hysteretic, fraction) -> None:
-    """Write the guard function with index `i` of an iteration: factors of d and d', constant, and interval."""
+    """Write the guard function `i` of an iteration: factors of d and d', constant, and interval."""
     chosen, pair = lanes.chosen, guard % PAIR_COUNT
     mode, sign, constant, rate = lanes.mode[pair, lane], 1.0, 0.0, lanes.viscous[lane] / lanes.stiffness[lane]
     begin = 0.0
@@ -263,7 +256,7 @@ def _allowance(lanes, pair, lane, mode) -> float:
 
 @kernel()
 def _shift(lanes, guard, order, again, fraction) -> None:
-    """Shift the guard functions of pairs that have separated, so that they begin at the time of separation."""
+    """Shift the guard functions of pairs that have separated to the time of separation."""
     x, zero = exact_row(lanes.begin, 0), exact_splat(0.0)
     for r in range(order):
         after = exact_row(guard, order)
@@ -272,8 +265,7 @@ def _shift(lanes, guard, order, again, fraction) -> None:
             set_row(guard, j, after)
     first = zero
     if fraction is not None:
-        # a RELEASED pair may separate slightly outside its wall (`LET_GO`); in this case its guard function -d begins
-        # above 0
+        # a RELEASED pair may separate slightly outside its wall (`LET_GO`), where -d is positive
         first = choose(below(zero, exact_row(guard, 0)), exact_row(guard, 0), zero)
     set_row(guard, 0, choose(again, first, exact_row(guard, 0)))
 
@@ -283,8 +275,8 @@ def isolate(lanes, column, w, order, bits):
     """Return bit masks of the polynomials with one root in [0, reach), and of those that may have several roots.
 
     `column` contains one polynomial for each lane. The number of sign changes of its Bernstein coefficients is the
-    number of roots, or exceeds this number by an even number. A first estimate of the root is written to `lanes.root`.
-    This estimate is the root of the chord between the coefficients that change sign.
+    number of roots plus an even number. The root of the chord between the coefficients that change sign, a first
+    estimate, is written to `lanes.root`.
     """
     h, b, zero = exact_row(lanes.reach, 0), lanes.bernstein, exact_splat(0.0)
     to_bernstein(lanes, column, w, order, h)
@@ -309,8 +301,7 @@ def isolate(lanes, column, w, order, bits):
 def cross(lanes, column, order, bits) -> None:
     """Compute each polynomial's only root in [0, reach], by Halley's method with bisection as fallback."""
     low, high, x, zero = exact_splat(0.0), exact_row(lanes.reach, 0), exact_row(lanes.root, 0), exact_splat(0.0)
-    # if a polynomial decreases from a double zero at 0, each iteration would only divide x by three, so the root is set
-    # to 0
+    # each iteration toward a double zero at 0 would only divide x by three
     falls_from_zero = below(exact_row(column, 2), zero) & ~below(zero, magnitude(exact_row(column, 0)))
     x = choose(falls_from_zero & ~below(zero, magnitude(exact_row(column, 1))), zero, x)
     open_bits = bits & below(zero, x)
@@ -349,7 +340,7 @@ def _leaves(guard, i, order, h) -> bool:
 
 @kernel()
 def _note_root(lanes, lane, at, i, order) -> None:
-    """Use the root of a guard function to end the step, or to record the separation of a CLIPPED or RELEASED pair."""
+    """End the step at a root, or record the separation of a CLIPPED or RELEASED pair."""
     guard, root = lanes.guarded[at, i], lanes.root[i] + lanes.begin[i]
     pair = guard % PAIR_COUNT
     if guard < SECOND and lanes.mode[pair, lane] > ON:
@@ -368,8 +359,8 @@ def _note_root(lanes, lane, at, i, order) -> None:
 def first_events(lanes, w, order, full, hysteretic, power, fraction) -> None:
     """Shorten each lane's step to its first event. Write the number of the guard function, or -1, to `lanes.event`.
 
-    `order` is the order of the series. Guard functions always have the order `full`, because the rounding of their
-    Bernstein coefficients would otherwise depend on `order`.
+    Guard functions have the order `full`, because the rounding of their Bernstein coefficients would otherwise depend
+    on `order`, the order of the series.
     """
     never = exact_splat(np.inf)
     for pair in range(PAIR_COUNT):
@@ -378,7 +369,7 @@ def first_events(lanes, w, order, full, hysteretic, power, fraction) -> None:
     for lane in range(WIDTH):
         lanes.event[lane] = -1
     _list_guards(lanes, order, hysteretic, power, fraction)
-    # every iteration searches at least one guard function of each lane whose list is not empty
+    # an iteration searches at least one listed guard function of each lane
     for at in range(GUARDS):
         lanes.rounds[0] = at
         count = _choose_guards(lanes, at, hysteretic, fraction)
@@ -392,7 +383,7 @@ def first_events(lanes, w, order, full, hysteretic, power, fraction) -> None:
 
 @kernel()
 def _write_chosen(lanes, at, order, full, fraction):
-    """Write the guard functions of an iteration. Return a bit mask of those that may become negative."""
+    """Write the guard functions of an iteration, and return a bit mask of those that may become negative."""
     chosen, guard, zero = lanes.chosen, lanes.guard[at], exact_splat(0.0)
     places = places_of(lanes.row_place)
     for i in range(5):
@@ -411,7 +402,7 @@ def _write_chosen(lanes, at, order, full, fraction):
 
 @kernel()
 def _search(lanes, w, at, order, bits) -> None:
-    """Search the first root of each guard function. A function stays listed if a shorter step may change its root."""
+    """Search the first root of each guard function, which stays listed if a shorter step may change its root."""
     guard = lanes.guard[at]
     single, several = isolate(lanes, guard, w, order, bits)
     if single != 0:
@@ -468,7 +459,7 @@ def _ends_with(guard, order, at, within):
 def note_switches(lanes, order, viscous, fraction) -> None:
     """Write the modes after the steps to `lanes.switch`, or -1 for pairs that keep their mode.
 
-    Pairs whose events differ only by rounding change their modes together, so that a symmetric motion stays symmetric.
+    Events that differ only by rounding are simultaneous, so that a symmetric motion stays symmetric.
     """
     ending = 0
     for lane in range(WIDTH):
@@ -486,8 +477,7 @@ def note_switches(lanes, order, viscous, fraction) -> None:
             guard, lane = lanes.guarded[at, i], lanes.owner[at, i]
             if lanes.event[lane] >= 0 and 0 <= guard < AGAIN:
                 pair = guard % PAIR_COUNT
-                # the first guard function of a pair takes precedence, so the second guard function is ignored for a
-                # pair that already has a new mode
+                # the first guard function of a pair takes precedence over the second
                 if lanes.switch[pair, lane] < 0 and lanes.parted[pair, lane] >= lanes.step[lane]:
                     _note_switch(lanes, lane, guard, viscous, fraction)
     for lane in range(WIDTH):

@@ -1,4 +1,4 @@
-"""The main loop for lanes. Each lane runs one scene after another, with steps that do not depend on other lanes."""
+"""The main loop for lanes. Each lane runs one scene after another, independently of other lanes."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from plow_twin.solve.step import LONGEST_STEP, ONE_INSTANT, PAST_AN_INSTANT
 
 
 class Members(NamedTuple):
-    """Arrays of all scenes of a run. The first axis of each array is the scene."""
+    """Arrays of all scenes of a run, with the scene as first axis."""
 
     params: NDArray[np.void]
     states: NDArray[np.void]
@@ -57,9 +57,9 @@ class Members(NamedTuple):
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
 _BUDGET, _PAUSED = int(Status.BUDGET), int(Status.PAUSED)
-#: Internal result for a lane whose next step requires another method.
+#: Result for a lane whose next step requires another method.
 OTHER_METHOD: Final = 6
-#: Internal result for a lane whose scene has reached its end.
+#: Result for a lane whose scene has reached its end.
 _DONE: Final = 7
 
 
@@ -118,7 +118,7 @@ def _look(members, flight, rest, lanes, lane, w, t_end, budget, in_range) -> int
 
 @kernel()
 def _fill_rows(lanes, lane, order, fraction, t, i, end, q, v) -> int:
-    """Fill the output rows within a lane's step from row i on, eight at once. Return the first row after the step."""
+    """Fill the output rows within a lane's step from row i on, and return the first row after the step."""
     last, begin, sigma = i, lanes.time[lane], lanes.root
     while last < t.size and t[last] < end:
         last += 1
@@ -127,7 +127,7 @@ def _fill_rows(lanes, lane, order, fraction, t, i, end, q, v) -> int:
         for j in range(WIDTH):
             sigma[j] = sigma_of(lanes, lane, max(t[i + min(j, count - 1)] - begin, 0.0), fraction)
         at = exact_row(sigma, 0)
-        # four independent sums keep the processor busy, because no sum has to wait for another sum
+        # four independent sums keep the processor busy
         for first in range(0, COMPONENTS, 4):
             one, two = lanes.series[first], lanes.series[first + 1]
             three, four = lanes.series[first + 2], lanes.series[first + 3]
@@ -184,7 +184,7 @@ def _touch(p, lanes, pair, lane) -> None:
 
 @kernel()
 def _touch_or_release(p, lanes, pair, lane) -> None:
-    """Start the contact of a pair with the force law d^n. After a slow touch the pair is RELEASED (`step`)."""
+    """Start the contact of a pair with the force law d^n, or release it after a slow touch (`step`)."""
     lanes.touched[lane] &= ~(1 << pair)
     if lanes.mode[pair, lane] == ON:
         if _rate(p, lanes, pair, lane) > slow_touch(p):
@@ -213,7 +213,7 @@ def _switch(p, sums, lanes, lane, hysteretic, fraction) -> None:
                 _touch_or_release(p, lanes, pair, lane)
             else:
                 lanes.touched[lane] &= ~(1 << pair)
-            # a RELEASED pair is treated as ON, so a change between RELEASED and ON is not counted
+            # changes between RELEASED and ON are not counted
             sums.logged += 0 if old in (ON, RELEASED) and new in (ON, RELEASED) else 1
 
 
@@ -228,7 +228,7 @@ def end_of(lanes, lane, fraction):
 
 @kernel()
 def complete(p, sums, lanes, lane, hysteretic, fraction) -> None:
-    """Set the time, counts and modes of a lane to the end of its step. The lane's state must already be there.
+    """Set the time, counts and modes of a lane, whose state is already there, to the end of its step.
 
     If modes change, `lanes.stale` is set, and the caller has to call `note_modes` afterwards.
     """
@@ -283,7 +283,7 @@ def go_past_an_instant(params, lanes) -> None:
 
 @kernel()
 def _leave(members, lanes, w, order, lane, code, t) -> None:
-    """Remove the scene from a lane and store its status. If the scene has reached its end, write its last rows."""
+    """Remove the scene from a lane, store its status, and write its last rows at its end."""
     member = lanes.member[lane]
     p, state, totals = members.params[member], members.states[member], members.totals[member]
     find_peaks(lanes, w, order - 1)
@@ -306,7 +306,7 @@ def _leave(members, lanes, w, order, lane, code, t) -> None:
 
 @kernel(inline="source")
 def _unowned_members(members):
-    """Return the members with arrays that are not reference counted. The caller has to keep them alive."""
+    """Return the members with arrays that are not reference counted."""
     return Members(
         unowned(members.params),
         unowned(members.states),
@@ -337,12 +337,10 @@ def run_lanes(
 ) -> bool:  # fmt: skip
     """Advance the members with the indices `queue` to `t_end`, eight at a time.
 
-    Returns False if `iterations` iterations were not sufficient.
-
-    `power` is 1 for exponents other than 1, and None for the exponent 1. `fraction` is 1 for exponents that are not
-    integers, and None for integers. `t` contains the times of the output rows. `order` is the order of the series.
-    `budget` is the largest number of steps of a scene. A scene leaves its lane with a `Status` or with `OTHER_METHOD`.
-    After the last iteration, all scenes leave with `PAUSED`.
+    `power` and `fraction` are those of `record.powers`, `order` is the order of the series, `budget` the largest number
+    of steps of a scene, and `t` contains the times of the output rows. A scene leaves its lane with a `Status` or with
+    `OTHER_METHOD`. If `iterations` iterations are not sufficient, all scenes leave with `PAUSED`, and the result is
+    False.
     """
     members, queue, t = _unowned_members(members), unowned(queue), unowned(t)
     waiting = 0
