@@ -1,8 +1,7 @@
 """Choice of each lane's series variable sigma (time or a root of time), for exponents that are not integers.
 
 The time since the start of a step is t = alpha sigma + beta sigma^2 / 2 (`method.series`). For the exponent 1.5, sigma
-is derived from the square root of the time since a recent touch, or of the time until a near separation, as in
-`method.taylor`.
+follows from the square root of the time since a touch or until a separation, as in `method.taylor`.
 """
 
 from __future__ import annotations
@@ -51,10 +50,7 @@ def sigma_of(lanes, lane, used, fraction) -> float:
 
 @kernel()
 def choose_maps(harmonics, extent, waves, second, hysteretic, fraction, segments, lanes, w) -> None:
-    """Choose the series variable of each lane, and convert `lanes.whole` to a value of this variable.
-
-    A pair that is ON becomes RELEASED if its penetration d is too small for a series of d^n.
-    """
+    """Choose the series variable of each lane, and convert `lanes.whole` to it. Release too shallow pairs."""
     shallow, near = _look_at_pairs(lanes)
     if shallow != 0:
         _release(lanes)
@@ -99,7 +95,7 @@ def _choose_map(lanes, w, lane, order, near) -> None:
 
 @kernel()
 def _mark_touching(lanes) -> None:
-    """Write, for each slot, a bit mask of the lanes whose pair touches at the start of the step."""
+    """Write for each slot a bit mask of the lanes whose pair touches at the start of the step."""
     for slot in range(PAIR_COUNT):
         lanes.touching[slot] = 0
     for lane in range(WIDTH):

@@ -1,7 +1,7 @@
 """Record of eight scenes that run together. Each row of its series and constants contains one number for each scene.
 
 The position of a scene in a row is its lane. The acting pairs of each lane are assigned to slots 0, 1, ..., so that one
-vector operation processes one acting pair of every lane. The pairs in a slot may differ between lanes.
+vector operation processes an acting pair of every lane, which may be a different pair in each.
 """
 
 from __future__ import annotations
@@ -26,9 +26,8 @@ WIDTH: Final = 8
 COMPONENTS: Final = 8
 #: Indices in `moment` of the factors of cosine, sine, X and Y in the contacts' moment.
 DC, DS, DX, DY = range(4)
-#: Numbering of guard functions. The first guard functions of the eight pairs begin at 0. The second guard functions of
-#: the pairs begin at `SECOND`. The guard functions for a new touch after a separation in the same step begin at
-#: `AGAIN`.
+#: Numbers of guard functions: the first of each pair from 0, the second of each pair from `SECOND`, and those for a new
+#: touch after a separation in the same step from `AGAIN`.
 SECOND: Final = PAIR_COUNT
 AGAIN: Final = 2 * PAIR_COUNT
 GUARDS: Final = 3 * PAIR_COUNT
@@ -45,7 +44,7 @@ _ARM, _Y, _FACTOR, _MODE, _ENABLED, _BLOCKS = 5, 7, 8, 9, 10, 11
 STEPS, EVALUATIONS, EVENTS, GUARD_ROOTS, RECOVERIES, AT_ONCE = range(6)
 COUNTS: Final = 6
 
-#: Constants and state of eight scenes. They determine the next steps of these scenes.
+#: Constants and state of eight scenes, which determine their next steps.
 _BLOCK_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("rows", "f8", (PAIR_COUNT, 5, WIDTH)),  # coefficients of cosine, sine, X, Y and 1 in the penetration
     ("arms", "f8", (PAIR_COUNT, 2, WIDTH)),  # coefficients of cosine and sine in the arm
@@ -186,23 +185,20 @@ LANES: Final = np.dtype(
 )
 
 
-#: Terms that lanes support. They are the terms of a contact law without a ramp, harmonic loads, flight and rest. For a
-#: step of flight or rest, the scene is taken out of its lane.
+#: Terms that lanes support: a contact law without a ramp, and harmonic loads. A scene leaves its lane for flight and
+#: rest.
 _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "fraction", "flight", "rest"}
 
 
 def fits_lanes(compiled: CompiledScene, *, sampled: bool = False) -> bool:
-    """Return whether a scene can run in lanes.
-
-    Its only terms must be those of the contact law and of harmonic loads or samples. A ramp and `Options` are excluded.
-    """
+    """Return whether a scene can run in lanes, which exclude all terms but `_COVERED` or samples, and `Options`."""
     parts = compiled.parts._replace(terms=compiled.parts.terms._replace(segments=None)) if sampled else compiled.parts
     there = (name for name, term in zip(Terms._fields, parts.terms, strict=True) if term is not None)
     return parts.implicit is None and _COVERED.issuperset(there) and not any(options(compiled.scene))
 
 
 def powers(terms: Terms) -> tuple[int | None, int | None]:
-    """Return two flags, 1 or None: for exponents other than 1, and for exponents that are not integers."""
+    """Return two flags, 1 or None, for exponents other than 1 and for exponents that are not integers."""
     return 1 if terms.integer or terms.fraction else None, terms.fraction
 
 
@@ -210,7 +206,7 @@ def new_lanes() -> NDArray[np.void]:
     """Return empty lanes, shape (1,)."""
     lanes = new_records(LANES, 1)
     lanes["member"] = -1
-    # an empty lane contains the numbers of a scene at rest, so that its results are finite
+    # an empty lane needs finite results
     lanes["y"][:, COS] = lanes["half_cavity"] = lanes["whole"] = 1.0
     return lanes
 
@@ -364,7 +360,7 @@ def _weigh_lanes(lanes) -> None:
     """Write the linear maps from an order of the state to the same order of the forces, summed over acting pairs.
 
     Along a wall's normal, f = -n F with F = K (a c + b s + n Z) + C (a c' + b s' + n Z'), where Z is X or Y. The moment
-    is c Gc + s Gs - X fy + Y fx, where Gc and Gs are sums of F times the coefficients of the arms.
+    is c Gc + s Gs - X fy + Y fx with sums Gc and Gs of F times the coefficients of the arms.
     """
     along, turn, zero = lanes.along, lanes.turn, exact_splat(0.0)
     for i in range(6):
@@ -408,10 +404,7 @@ def read_block(lanes, block) -> None:
 
 @kernel()
 def write_block(block, lanes, new) -> None:
-    """Copy the state of the lanes to their block.
-
-    The data derived from modes is copied if it has changed, and the constants are copied if the block is new.
-    """
+    """Copy the state of the lanes to their block, with changed data derived from modes and a new block's constants."""
     copy_part(block, lanes, 0 if new else _STATE, _NOTES if lanes.noted[0] < 0 else _SIZE)
 
 

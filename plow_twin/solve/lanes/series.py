@@ -1,9 +1,8 @@
 """Taylor series of eight scenes with fixed contact modes. `method.series` contains the equations.
 
 If the contact force is linear in penetration and rate, the sum over a scene's acting pairs is one affine map of the
-state. With this map, an order needs twelve Cauchy products for any number of acting pairs. A force with the damping
-lambda d' needs more products for each slot of acting pairs (`record`). The force K d (1 + lambda d') = K (d + lambda /
-2 (d^2)') adds half a product for each slot. The force K d^n (1 + lambda d') adds three products for each slot.
+state, with twelve Cauchy products in an order. For each slot of acting pairs (`record`), the force K d (1 + lambda d')
+= K (d + lambda / 2 (d^2)') adds half a product, and the force K d^n (1 + lambda d') adds three.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from plow_twin.solve.lanes.waves import coarse_exp2, coarse_log2, turn_lanes
 from plow_twin.solve.method.taylor import FURTHEST
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
-#: Largest usable term of a series. Products of larger terms would not be finite.
+#: Largest usable term of a series, whose products are finite.
 _FINITE = 1e300
 #: Lowest order at which a series with negligible terms may end.
 _FEWEST_ORDERS = 4
@@ -82,11 +81,10 @@ def expand_loads(harmonics, extent, second, fraction, lanes, w, order) -> None:
 
 @kernel()
 def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction, segments) -> int:
-    """Write the series of the state. Return the order.
+    """Write the series of the state, and return the order.
 
     Under sampled loads, the series of a lane ends at the order from which its terms are negligible over the longest
-    admissible step. The higher terms of this series are set to zero, so that the bits of a lane's results do not depend
-    on the orders of other lanes.
+    admissible step. Its higher terms are zero, so that the bits of a lane do not depend on the orders of other lanes.
     """
     series, moment = lanes.series, lanes.moment
     zero = exact_splat(0.0)
@@ -126,7 +124,7 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction,
                     break
             if power is None:
                 calm = quiet
-        # the rows with the highest orders are added last, so the processor can start the sum before they are available
+        # the highest orders are added last, so that the sum can start before they are available
         px = py = pvx = pvy = pc = ps = torque = other = wc = ws = zero
         for j in range(1, k):
             turned = exact_row(series[OMEGA], j)
@@ -167,7 +165,7 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction,
                     turned_by = exact_row(lanes.slope, 2)
                 before_c, before_s = c, s
             else:
-                # the series of the time t(sigma) has the coefficients alpha and beta / 2
+                # coefficients of the time t(sigma): alpha and beta / 2
                 if k == 1:
                     turned_by = exact_row(lanes.slope, 2) * alpha
                 if k == 2:
@@ -246,7 +244,7 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction,
 
 @kernel(inline="code")
 def tested(power) -> int:
-    """Return how many of the last orders determine the size of a step."""
+    """Return the number of last orders that determine the size of a step."""
     if power is None:
         return 2
     return MOST_LACUNA
@@ -254,7 +252,7 @@ def tested(power) -> int:
 
 @kernel(inline="code")
 def _long_quiet(history) -> int:
-    """Return a bit mask of the lanes whose terms were negligible in all orders just before the newest order."""
+    """Return a bit mask of the lanes whose terms were negligible in all last orders before the newest."""
     bits = history
     for i in range(1, MOST_LACUNA - 1):
         bits &= history >> WIDTH * i
@@ -293,7 +291,7 @@ def _set_state(series, k, x, y, vx, vy, om, c, s, angle) -> None:
 
 @kernel(inline="code")
 def _add_ends(load, k, c0, s0, c, s, share, wc, ws):
-    """Return coefficient k of a load times cosine and sine: `wc` and `ws` with the first and the last product added."""
+    """Return coefficient k of a load times cosine and sine: `wc` and `ws` plus the first and the last product."""
     first, newest = exact_row(load, 0) * share, exact_row(load, k)
     return fused(newest, c0, fused(first, c, wc)), fused(newest, s0, fused(first, s, ws))
 
@@ -302,8 +300,8 @@ def _add_ends(load, k, c0, s0, c, s, share, wc, ws):
 def _start(lanes, viscous, c, s, x, y, dc, ds, dx, dy):
     """Return coefficient 0 of the forces along X and Y, and of the factors of cosine and sine in the contacts' moment.
 
-    Forces and factors are computed from the same penetrations as the guard functions. The summed maps
-    (`record._weigh_lanes`) have different rounding, so the force would begin 1e-17 m away from the event.
+    They are computed from the same penetrations as the guard functions. By the rounding of the summed maps
+    (`record._weigh_lanes`), the force would begin 1e-17 m away from the event.
     """
     fx = fy = gc = gs = exact_splat(0.0)
     for slot in range(PAIR_COUNT):
@@ -321,7 +319,7 @@ def _start(lanes, viscous, c, s, x, y, dc, ds, dx, dy):
 
 @kernel(inline="code")
 def _add_force(lanes, gear, push, fx, fy, gc, gs):
-    """Return the forces along X and Y and the factors of c and s in the moment, after adding a slot's F = K `push`."""
+    """Return the forces along X and Y and the factors of c and s in the moment, plus those of a slot's F = K `push`."""
     force = exact_row(lanes.stiffness, 0) * push
     return (
         fused(exact_row(gear, 2) * -1.0, force, fx), fused(exact_row(gear, 3) * -1.0, force, fy),
@@ -333,8 +331,8 @@ def _add_force(lanes, gear, push, fx, fy, gc, gs):
 def _push(lanes, w, k, acts, c, s, x, y, dc, ds, dx, dy):
     """Return coefficient k of the forces along X and Y, and of the factors of cosine and sine in the contacts' moment.
 
-    Forces and factors are sums over the slots for F = K d (1 + lambda d'). The next order of the penetrations and order
-    k of F / K are written to `lanes`.
+    They are sums over the slots for F = K d (1 + lambda d'). The next order of the penetrations and order k of F / K
+    are written to `lanes`.
     """
     fx = fy = gc = gs = exact_splat(0.0)
     for slot in range(PAIR_COUNT):
@@ -360,7 +358,7 @@ def _push(lanes, w, k, acts, c, s, x, y, dc, ds, dx, dy):
 
 @kernel(inline="code")
 def _push_by_power(lanes, w, k, acts, hysteretic, fraction, c, s, x, y, dc, ds, dx, dy, alpha, beta):
-    """Return the same results as `_push`, for F = K d^n (1 + lambda d') with exponents n other than 1."""
+    """Return the results of `_push` for F = K d^n (1 + lambda d') with exponents n other than 1."""
     fx = fy = gc = gs = zero = exact_splat(0.0)
     for slot in range(PAIR_COUNT):
         gear, depth = lanes.gear[slot], lanes.depth[slot]
@@ -397,7 +395,7 @@ def _push_by_power(lanes, w, k, acts, hysteretic, fraction, c, s, x, y, dc, ds, 
 
 @kernel(inline="code")
 def _multiply(lanes, slot, k, hysteretic):
-    """Return coefficient k of d^n, and coefficient k of d^n d' without the product that contains coefficient k of d^n.
+    """Return coefficient k of d^n, and that of d^n d' without the product that contains coefficient k of d^n.
 
     The exponents are integers from 2 to 4, and may differ between lanes.
     """
@@ -426,10 +424,10 @@ def _product(a, b, k):
 
 @kernel(inline="code")
 def _raise(lanes, w, slot, k, hysteretic):
-    """Return the same results as `_multiply`, for exponents n that are not integers.
+    """Return the results of `_multiply` for exponents n that are not integers, by `model.contact.power_term`.
 
-    The recurrence for the power P of the base b is that of `model.contact.power_term`. The base is d. If the pair of a
-    lane touches at the start of the step, the base is d / sigma^2, and P begins with sigma^3 (n = 1.5).
+    The base is d. If the pair of a lane touches at the start of the step, it is d / sigma^2, and the power begins with
+    sigma^3 (n = 1.5).
     """
     power, base, rate = lanes.power[slot], lanes.base[slot], lanes.rate[slot]
     touching, zero, above = lanes.touching[slot], exact_splat(0.0), exact_row(lanes.exponent, 0) + 1.0
@@ -527,7 +525,7 @@ def _size(lanes, vx, vy, om, c, s):
 
 @kernel()
 def _not_too_far(lanes, step):
-    """Return the steps, limited where the variable is the square root of the time since a touch (`method.taylor`)."""
+    """Limit the steps where the variable is the square root of the time since a touch (`method.taylor`)."""
     zero, alpha, beta = exact_splat(0.0), exact_row(lanes.alpha, 0), exact_row(lanes.beta, 0)
     furthest = alpha / beta * FURTHEST
     far = below(zero, alpha) & below(zero, beta) & below(furthest, step)
@@ -539,10 +537,10 @@ def _not_too_far(lanes, step):
 
 @kernel()
 def accurate_steps(lanes, w, order, power, fraction) -> int:
-    """Write the accurate step size of each lane's series to `lanes.step`. Return a bit mask of non-finite series.
+    """Write the accurate step size of each lane's series to `lanes.step`, and return a bit mask of non-finite series.
 
-    The test is that of `method.step_size.accurate_step`. A coarse logarithm is sufficient, because a step that is
-    longer by 1e-4 has an error that is larger by 0.2 %.
+    The test is that of `method.step_size.accurate_step`, with a coarse logarithm: a step that is longer by 1e-4 has an
+    error that is larger by 0.2 %.
     """
     whole, least, zero, infinite = exact_row(lanes.whole, 0), exact_splat(1e3), exact_splat(0.0), 0
     recent = tested(power)
@@ -552,7 +550,7 @@ def accurate_steps(lanes, w, order, power, fraction) -> int:
         here = coarse_log2(exact_row(lanes.threshold, i) / size) * w.inverse[order - i]
         least = choose(below(here, least), here, least)
     shorter = below(coarse_exp2(least), whole)
-    # a long step is shortened, because an admissible error of the velocity results in a large error of the position
+    # over a long step, an admissible error of the velocity is a large error of the position
     stretch = least + exact_row(lanes.stretch, 0)
     stretch = choose(below(zero, stretch), stretch, zero)
     step = choose(shorter, coarse_exp2(fused(stretch, exact_splat(-w.inverse[order]), least)), whole)

@@ -12,8 +12,7 @@ from plow_twin.solve.lanes.record import COMPONENTS, WIDTH, linear_at, penetrati
 from plow_twin.solve.state import COS, SIN, X, Y
 from plow_twin.solve.totals import add_set_times
 
-#: Allowances for rounding. `_ROUNDED`: factor by which the upper bound of a force is increased. `_SAME`: ratio of a
-#: maximum to a peak up to which they are treated as equal.
+#: Allowances for rounding: factor on the upper bound of a force, and ratio up to which a maximum equals a peak.
 _ROUNDED, _SAME = 1.0 + 1e-9, 1.0 + 1e-12
 
 
@@ -21,11 +20,10 @@ _ROUNDED, _SAME = 1.0 + 1e-9, 1.0 + 1e-12
 def sum_step(lanes, w, order, power) -> None:
     """Write the change of the state over each lane's step, and the integrals of the changes of cosine, sine, X and Y.
 
-    A change is the difference from the value at the start of the step. The integrals are necessary only for impulses
-    with the exponent 1.
+    Only impulses with the exponent 1 need the integrals.
     """
     h, zero = exact_row(lanes.step, 0), exact_splat(0.0)
-    # four independent sums keep the processor busy, because no sum has to wait for another sum
+    # four independent sums keep the processor busy
     for i in range(0, COMPONENTS, 4):
         a = b = c = d = zero
         for k in range(order, 0, -1):
@@ -51,13 +49,13 @@ def sum_step(lanes, w, order, power) -> None:
 
 @kernel()
 def add_step(totals, lanes, w, order, full, viscous, hysteretic, power, fraction) -> None:
-    """Add the current steps to the sums in the lanes, and the times of sets of corners to `totals`, if it is not None.
+    """Add the current steps to the sums in the lanes, and the times of sets of corners to `totals`, if any.
 
-    The arguments `order` and `full` are those of `first_events`.
+    `order` and `full` are those of `first_events`.
     """
     last = order - 1
     if totals is None and hysteretic is None and power is None:
-        # under sampled loads, the series of a lane that ends before the series of other lanes has one more term
+        # under sampled loads, a series that ends early has one more term
         last = order
     for slot in range(PAIR_COUNT):
         taken = lanes.taken[slot]
@@ -123,11 +121,10 @@ def _impulses_by_power(lanes, w, slot, order, fraction):
 
 @kernel()
 def _raise_peaks(totals, lanes, w, slot, order, full, on) -> int:
-    """Increase the peaks in `lanes.gained`, by the series of F / K. Return a bit mask of the lanes that were checked.
+    """Increase the peaks in `lanes.gained` by the series of F / K, and return a bit mask of the checked lanes.
 
-    If an upper bound of the force exceeds the peak, the peak is increased to the larger of the two end values of the
-    force. A force whose maximum may be within the step is stored for `find_peaks`. Under sampled loads its maximum is
-    computed at once, because each row needs its peak.
+    The peak is increased to the larger end value of the force. A force whose maximum may be within the step is stored
+    for `find_peaks`. Under sampled loads its maximum is computed at once, because each row needs its peak.
     """
     h, zero, half, push = exact_row(lanes.step, 0), exact_splat(0.0), exact_splat(0.5), lanes.push[slot]
     end = bend = slope = zero
@@ -164,7 +161,7 @@ def _raise_peaks(totals, lanes, w, slot, order, full, on) -> int:
 
 @kernel()
 def _hull_top(lanes, push, w, order, full):
-    """Return the largest Bernstein coefficient of `push`, which is its upper bound over each lane's step."""
+    """Return the largest Bernstein coefficient of `push`, an upper bound over each lane's step."""
     zero = exact_splat(0.0)
     for k in range(order + 1, full + 1):
         set_row(push, k, zero)
@@ -200,8 +197,7 @@ def _keep_bulge(lanes, push, pair, lane, order) -> None:
 def find_peaks(lanes, w, order) -> None:
     """Increase the peaks by the maxima of the forces in `lanes.bulge`, which may be from any lanes and steps.
 
-    Each maximum is computed as a root of F', independently of the current peak. The bits of a peak therefore do not
-    depend on other lanes.
+    Each maximum is a root of F', independent of the current peak, so the bits of a peak do not depend on other lanes.
     """
     if lanes.bulges[0] == 0:
         return

@@ -1,4 +1,4 @@
-"""Functions of the eight numbers in a SIMD vector: sine, cosine, and a coarse logarithm and power for step sizes."""
+"""Sine, cosine, and a coarse logarithm and power, of the eight numbers in a SIMD vector."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from plow_twin.kernel.simd import (
     significand_of,
 )
 
-#: Largest angle for which the product of the number of quarter turns and the first part of pi / 2 is exact.
+#: Largest angle whose number of quarter turns times the first part of pi / 2 is exact.
 _LARGEST = 1e5
-#: Number that rounds a double to an integer, if the number is added to the double and subtracted from the sum.
+#: Number whose addition and subtraction rounds a double to an integer.
 _ROUNDS = 6755399441055744.0
 #: 2 / pi, and pi / 2 in three parts, the first two of 33 bits (fdlibm, e_rem_pio2.c).
 _QUARTERS = (0.6366197723675814, 1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
@@ -65,7 +65,7 @@ def coarse_exp2(value):
 
 @kernel()
 def turn_lanes(angle, cosine, sine) -> None:
-    """Write cosine and sine of the eight numbers in `angle`. Each has an error of one or two rounding errors."""
+    """Write cosine and sine of the eight numbers in `angle`, with one or two rounding errors."""
     x = exact_row(angle, 0)
     turns = (x * _QUARTERS[0] + _ROUNDS) - _ROUNDS
     r = fused(turns, exact_splat(-_QUARTERS[1]), x)
@@ -78,7 +78,7 @@ def turn_lanes(angle, cosine, sine) -> None:
         c = fused(c, square, exact_splat(_COSINE[i]))
     s = fused(s * square, r, r)
     c = fused(c * square, square, fused(square, exact_splat(-0.5), exact_splat(1.0)))
-    # `quarter`, from 0 to 3, is the number of quarter turns after subtraction of whole turns
+    # number of quarter turns without whole turns, 0 to 3
     whole = (turns * 0.25 - 0.375 + _ROUNDS) - _ROUNDS
     quarter = turns - whole * 4.0
     first, half, last = (
