@@ -1,4 +1,4 @@
-"""The main loop of the solver. It takes one step after another, and evaluates the motion at each output time."""
+"""The main loop of the solver, which takes steps and evaluates the motion at each output time."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _BUDGET, _LOG_FULL, _PAUSED = int(Status.BUDGET), int(Status.LOG_FULL), int(Stat
 
 @kernel(inline="source")
 def _unowned_loads(parts):
-    """Return the parts with loads that are not reference counted. The caller has to keep the loads alive."""
+    """Return the parts with loads that are not reference counted."""
     return Parts(parts.terms, unowned(parts.harmonics), unowned(parts.segments), parts.implicit)
 
 
@@ -51,10 +51,7 @@ def _next(p, parts, state, w, stop_time, budget) -> int:
 
 @kernel()
 def _present(p, harmonics, flight, support, state, w, y) -> None:
-    """Write the body coordinates at the current time to y, and the state of a frame on springs to `w`.
-
-    The current time can be within a step.
-    """
+    """Write the body coordinates at the current time, which may be within a step, to y, and a frame's state to `w`."""
     if state.step_size >= 0.0:
         evaluate(p, harmonics, flight, support, state, w, sigma_at(state, state.elapsed), y)
     else:
@@ -67,7 +64,7 @@ def _present(p, harmonics, flight, support, state, w, y) -> None:
 def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
     """Advance the motion to `target`, and return a `Status`. Steps may extend beyond `target`, up to `stop_time`.
 
-    If `totals` is None, impulses, peaks and times are not computed. The motion does not depend on `totals`.
+    Without `totals`, which do not influence the motion, no impulses, peaks and times are computed.
     """
     while True:
         t0 = state.step_start
@@ -77,7 +74,7 @@ def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
         if code != _OK:
             return code
         low = sigma_at(state, state.elapsed)
-        # rounding can place the stop time slightly beyond the end of the step; the remainder must not become a step
+        # rounding can place the stop time slightly beyond the end of the step
         stopped = state.ends_at_stop == 1 and target >= state.stop_time
         if target < t0 + state.step_size and not stopped:
             if totals is not None:
@@ -119,10 +116,9 @@ def _clear(totals) -> None:
 
 @kernel()
 def _undo(support, state, w, target) -> None:
-    """Undo a failed advance. Set the time to `target`, and the head to its state and wear before the advance.
+    """Undo a failed advance: set the time to `target`, and the head to `w.saved_y` and `w.saved_wear`.
 
-    If the advance began within a step, this step is shortened to the time before the advance. `w.saved_y` and
-    `w.saved_wear` contain the saved state and wear.
+    If the advance began within a step, this step is shortened to the time before the advance.
     """
     set_row(state.y, 0, row(w.saved_y, 0))
     set_row(state.wear_depth, 0, row(w.saved_wear, 0))
@@ -136,9 +132,9 @@ def _undo(support, state, w, target) -> None:
 def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound, pace):
     """Start or continue an advance to `target`. Return a `Status` and the number of steps of the advance.
 
-    If the advance fails, the time becomes `target`, but the state and the counts of the head are those before the
-    advance. `saved` is an array of one record for the state before the advance. With a `bound`, an advance that reaches
-    the largest number of steps does not fail, because a few Runge-Kutta steps complete it.
+    If the advance fails, the time becomes `target`, and the head has its state and counts before the advance, from the
+    record `saved`. With a `bound`, a few Runge-Kutta steps complete an advance that reaches the largest number of
+    steps.
     """
     state = states[index]
     if pace.underway == 0:
@@ -171,7 +167,7 @@ def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budge
 
 @kernel()
 def _read_row(p, parts, state, w, totals, out) -> None:
-    """Write the state at the current time and the totals to a `ROW`, and reset the totals."""
+    """Write the current state and the totals to a `ROW`, and reset the totals."""
     y = w.moved
     _present(p, parts.harmonics, parts.terms.flight, parts.terms.support, state, w, y)
     pose_of(p, y, parts.terms.offset, out.q, out.v)
@@ -221,18 +217,16 @@ def advance_rows(
     work : ndarray of records, shape (1,)
         Scratch space.
     totals : ndarray of records, shape (1,), or None
-        Sums over an advance. With None, no sums are computed and no rows are written. The motion does not depend on
-        this choice.
+        Sums over an advance. With None, no sums are computed and no rows are written.
     times : ndarray, shape (n,)
         Times in s, not decreasing.
     wrench : ndarray, shape (m, n + 1, 3), or None
-        Samples of the load, divided by mass and inertia. The sample before the first time precedes the samples at the
-        times. The load is interpolated linearly between samples, and a step ends at each time. None selects the loads
-        of the scene.
+        Samples of the load, divided by mass and inertia: one before the first time, and one at each time. The load is
+        interpolated linearly, and a step ends at each time. None selects the loads of the scene.
     rows : ndarray of `ROW`, shape (m, n), or None
         Array that receives the motion and the totals at each time, or None without `totals`.
     marks : ndarray of int64, shape (k,)
-        Increasing numbers of advances, counted from 1. After each of these advances the state is copied.
+        Increasing numbers of advances, counted from 1, after which the state is copied.
     snapshots : ndarray of records, shape (k,)
         Array that receives the copies of the state.
     bound : record of `BOUND`, or None
@@ -243,8 +237,7 @@ def advance_rows(
     Returns
     -------
     bool
-        Whether all advances are done. Otherwise, the caller checks its limits and repeats the call with the same
-        `pace`.
+        Whether all advances are done. If not, the caller repeats the call with the same `pace`.
     """
     parts, states = _unowned_loads(parts), unowned(states)
     w, count = work[0], times.size
@@ -294,16 +287,16 @@ def interrupt_step(p, parts, state, w, totals) -> None:
 
 @kernel(entry=True)
 def lay_out_again(p, parts, state, w) -> None:
-    """Repeat the computation of the current step after a snapshot was restored. Snapshots do not contain its series.
+    """Compute the series of the current step, which a restored snapshot does not contain.
 
-    A snapshot can be within a step only under the scene's own loads. Steps under these loads have no stop time.
+    A snapshot can be within a step only under the scene's own loads, whose steps have no stop time.
     """
     if state.at_rest == 1:
         write_rest(p, state, w)
         return
     used, implicit = state.elapsed, parts.implicit
     if implicit is not None:
-        # the step is computed a second time, so the fields that the first computation changed are restored
+        # restore the fields that the first computation of the step changed
         state.implicit_size, state.decay_times = state.implicit_size_before, state.decay_times_before
         state.refused = state.refused_before
     steps, evaluations, guard_roots = state.steps, state.evaluations, state.guard_roots
@@ -316,9 +309,9 @@ def lay_out_again(p, parts, state, w) -> None:
 
 @kernel()
 def _rows_in_flight(p, harmonics, flight, state, w, t, i, q, v, penetration, force):
-    """Fill the output rows within a step of free flight, from row i on. Return the index of the first row after it.
+    """Fill the output rows within a step of free flight, from row i on, and return the first row after it.
 
-    With this code in a separate function, the loop over rows in `integrate` is a tenth faster.
+    As a separate function, it makes the loop over rows in `integrate` a tenth faster.
     """
     if flight is not None:
         t0, y, rate = state.step_start, w.read_y, w.read_rate

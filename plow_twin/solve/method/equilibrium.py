@@ -1,4 +1,4 @@
-"""Equilibrium of a head that is held by its contacts. The functions compute its stiffness and its distance."""
+"""Equilibrium of a head that is held by its contacts: stiffness and distance."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def held(p, state, y, least) -> bool:
 def stiffness_at(p, acts, state, w, gyration) -> None:
     """Write the accelerations at the state `w.rest[0]` to `w.rest[1]`, and the stiffness, shape (3, 3), to `w.hessian`.
 
-    The stiffness is minus the derivative of these accelerations with respect to the coordinates. The third coordinate
-    is the angle times the radius of gyration, which makes the matrix symmetric.
+    The stiffness is minus the derivative of the accelerations with respect to the coordinates. The radius of gyration
+    times the angle as third coordinate makes the matrix symmetric.
     """
     z, rate, moved, t = w.rest[0], w.rest[1], w.rest[2], state.step_start
     accelerate(p, acts, True, state, t, z, w.rest[3, :3], rate)
@@ -63,7 +63,7 @@ def stiffer_than(h, least) -> bool:
 
 @kernel()
 def to_equilibrium(h, rate, z, gyration) -> float:
-    """Move z by one Newton step x towards the point without acceleration. Return x h x, which is twice the energy."""
+    """Move z by one Newton step x towards the point without acceleration. Return x h x, twice the energy."""
     a, b, c = rate[3], rate[4], rate[5] * gyration
     low10, low20 = h[1, 0] / h[0, 0], h[2, 0] / h[0, 0]
     d1 = h[1, 1] - low10 * h[0, 1]

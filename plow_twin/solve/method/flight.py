@@ -1,9 +1,8 @@
 """Free flight in closed form. A step can have any size, as long as the head cannot reach a wall.
 
-Without contact, position and angle of the head are double integrals of the load. These integrals are elementary
-functions for constant, piecewise linear and harmonic loads. An upper bound of the distance that the head moves within a
-time limits the step (conservative advancement). Near a wall, the motion is computed by Taylor series with event
-detection.
+Without contact, position and angle of the head are double integrals of the load, which are elementary functions for
+constant, piecewise linear and harmonic loads. An upper bound of the distance that the head moves within a time limits
+the step (conservative advancement).
 """
 
 from __future__ import annotations
@@ -79,7 +78,7 @@ def _reach(p, w, time, leverage) -> float:
 
 @kernel(inline="source")
 def own(parts):
-    """Return 1 if flights of the scene have a closed form, and None otherwise."""
+    """Return 1 for flights in closed form, and None without."""
     return parts.terms.flight
 
 
@@ -110,7 +109,7 @@ def safe_time(p, harmonics, state, w, span) -> float:
     z = w.flight[0]
     to_world(p, state.y, z)
     _bounds(p, harmonics, state.step_start, z, w)
-    # the walls rotate about the head's centre of mass, so the distance of this centre from the origin is added
+    # the walls rotate about the head's centre of mass
     leverage = p.leverage + math.hypot(z[0], z[1]) + max(gap, 0.0)
     time = span
     while time >= least:

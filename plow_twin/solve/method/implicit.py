@@ -1,9 +1,9 @@
 """Implicit steps for overdamped contact, by collocation at Radau points with fixed contact modes.
 
-In overdamped contact, the damper stops a pair much faster than the spring moves it. For this reason, stability limits
-the steps of an explicit series to a few decay times, even if the motion is smooth. Radau IIA collocation (Hairer and
-Wanner, Solving ODEs II, sec. IV.5) is stable for longer steps. The solution is a polynomial in time. The polynomial is
-written as a series, so that events, outputs and totals are computed as for an explicit step.
+In overdamped contact, the damper stops a pair much faster than the spring moves it, so stability limits the steps of an
+explicit series to a few decay times. Radau IIA collocation (Hairer and Wanner, Solving ODEs II, sec. IV.5) is stable
+for longer steps. Its solution, a polynomial in time, is written as a series, so that events, outputs and totals are
+computed as for an explicit step.
 """
 
 from __future__ import annotations
@@ -48,29 +48,27 @@ from plow_twin.solve.support import (
     to_world_both,
 )
 
-#: Number s of stages, which is the degree of the polynomials. The order of the method is 2 s - 1.
+#: Number s of stages, the degree of the polynomials. The order of the method is 2 s - 1.
 STAGES = 9
 #: Ratio of the decay rate of a contact's dampers to the angular frequency of its springs, above which the contact is
-#: overdamped. This ratio determines at compilation whether a scene may need implicit steps.
+#: overdamped and the scene may need implicit steps.
 OVERDAMPED_RATIO = 20.0
-#: Cost of an implicit step, divided by the cost of an explicit step. An implicit step must be longer than this number
-#: of stable explicit steps.
+#: Cost of an implicit step in explicit steps. It must be longer than this number of stable explicit steps.
 _WORTH = 30.0
-#: Admissible error of an implicit step, divided by that of an explicit step, because it replaces many explicit steps.
+#: Admissible error of an implicit step, which replaces many explicit steps, divided by that of an explicit step.
 _GAIN = 100.0
 #: Rounding error of a velocity, divided by the largest velocity. Smaller errors are always admissible.
 _NOISE = 1e-12
 #: Rounding error of a guard function of stick and slip, divided by its largest term.
 _GUARD_NOISE = 1e-6
-#: Number of failed attempts at an implicit step, up to which each failure doubles the time until the next attempt.
+#: Number of failed attempts up to which each doubles the time until the next attempt at an implicit step.
 _MOST_REFUSED = 12
 
 
 def _coefficients(nodes: NDArray[np.longdouble]) -> NDArray[np.longdouble]:
     """Return the matrix that converts the values of a polynomial at the nodes to its coefficients, shape (n, n).
 
-    The matrix is the inverse of a Vandermonde matrix. Extended precision is used because the inversion loses half of
-    the digits.
+    The inversion of the Vandermonde matrix loses half of the digits.
     """
     n = len(nodes)
     columns = np.zeros((n, n), np.longdouble)
@@ -131,7 +129,7 @@ def _implicit_type(size: int) -> np.dtype[np.void]:
 
 
 def new_implicit(support: bool) -> Implicit:
-    """Return nodes, weights and scratch space of implicit steps. `support` is true if the frame is on springs."""
+    """Return nodes, weights and scratch space of implicit steps, for a fixed frame or for a frame on springs."""
     implicit = new_record(_implicit_type(6 if support else 3))
     for name, table in zip(("nodes", "weights", "from_values", "from_stages"), _rule(), strict=True):
         implicit[name] = table
@@ -142,8 +140,7 @@ def new_implicit(support: bool) -> Implicit:
 def decay_rate(p, state, slip, stick, support) -> float:
     """Return the sum of the decay rates in 1/s due to all dampers, or 0 if the motion is not overdamped.
 
-    The dampers include regularised friction, with its slope at the current slip rate, and the damper of a sticking
-    corner.
+    The dampers include regularised friction and the damper of a sticking corner.
     """
     y, decay, spring = state.y, 0.0, 0.0
     c, s, om, x, yy, vx, vy = y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY]
@@ -192,17 +189,14 @@ def stable_decay(order):
 
 @kernel(inline="source")
 def has_decayed(p, state) -> bool:
-    """Return whether fast motion has decayed since the last change of contact.
-
-    Each failed attempt at an implicit step doubles the number of decay times that is required.
-    """
+    """Return whether fast motion has decayed since the last change of contact, later after failed attempts."""
     wait = 5.0 - math.log(p.velocity_tolerance / p.threshold[0])
     return bool(state.decay_times >= wait * 2.0**state.refused)
 
 
 @kernel(inline="source")
 def note_decay(state, decay, step_size) -> None:
-    """Add a step to the number of decay times, or reset the number if the motion is not overdamped."""
+    """Add a step to the number of decay times, or reset the number without overdamping."""
     if decay > 0.0:
         state.decay_times += decay * step_size
     else:
@@ -211,14 +205,11 @@ def note_decay(state, decay, step_size) -> None:
 
 @kernel()
 def _jacobian(p, acts, state, t, z, implicit, base, out) -> None:
-    """Write the accelerations at z to `base`, shape (n,), and their derivatives to `out`, shape (2, n, n).
-
-    The derivatives are taken with respect to position and with respect to velocity.
-    """
+    """Write the accelerations at z to `base`, (n,), and their derivatives by place and velocity to `out`, (2, n, n)."""
     rate, moved, n = implicit.rate[0], implicit.rate[1], base.size
     accelerate(p, acts, True, state, t, z, implicit.load, rate)
     for j in range(2 * n):
-        # over this difference the law is nearly linear, and rounding is negligible
+        # a difference over which the law is nearly linear, and rounding negligible
         delta = 1e-8 / (p.radius if j % 3 == 2 else 1.0)
         saved = z[j]
         z[j] = saved + delta
@@ -350,9 +341,9 @@ def _wear_at_nodes(p, support, state, h, implicit, sliding, running_in) -> float
 def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -> bool:
     """Compute the velocities at the nodes by Newton's method. Return whether it has converged.
 
-    The derivatives are computed at every node, because the damped direction rotates with the head. The iteration
-    continues until only rounding errors remain, because a strong damper converts a small error of a velocity to a large
-    error of its force. Wear is slow, so the wear depths of the previous iterate are used.
+    The derivatives are computed at every node, because the damped direction rotates with the head. Only rounding errors
+    may remain, because a strong damper converts a small error of a velocity to a large error of its force. Wear is
+    slow, so the wear depths of the previous iterate are used.
     """
     z, s, a, residual = implicit.z, implicit.nodes.size, implicit.weights, implicit.residual
     n = implicit.accelerations.shape[1]
@@ -392,7 +383,7 @@ def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -
                 * p.velocity_tolerance
                 / p.position_tolerance
             )
-        # convergence is quadratic, so the iteration ends when a change is not much smaller than the previous change
+        # convergence is quadratic until only rounding errors remain
         if change < 1e-14 * p.threshold[0] or (change < 0.1 * p.velocity_tolerance and change > 0.1 * before):
             _places(implicit, h)
             return True
@@ -404,8 +395,8 @@ def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -
 def _interpolate(values, coefficients, h, out) -> None:
     """Write the series of eight polynomials, given by their values at the nodes of a step of size h.
 
-    The differences from the last value are interpolated. Otherwise the large coefficients would have to cancel the
-    constant part of all values, which would leave rounding errors.
+    The differences from the last value are interpolated, because the coefficients of a large constant part would leave
+    rounding errors.
     """
     scale, n = 1.0, len(coefficients)
     last = row(values, n - 1)
@@ -452,9 +443,8 @@ def _frame_terms(p, support, w, implicit, scale):
 def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float:
     """Write the series of state, penetration, rate and force from the collocation polynomials. Return the error.
 
-    The error is the size of the last terms. The polynomials of velocities and forces use only the values at the nodes,
-    because an initial velocity that a damper stops at once would distort them. If this velocity is too large to omit,
-    the error is infinite.
+    The error is the size of the last terms. The polynomials of velocities and forces omit an initial velocity that a
+    damper stops at once. If it is too large, the error is infinite.
     """
     s, body, pairs, scratch = implicit.nodes.size, implicit.body, implicit.pairs, w.left
     _bodies(p, support, state, implicit, 0)
@@ -496,7 +486,7 @@ def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float
     last, place = w.series[s - 1], w.series[s]
     size += 4.0 * (abs(last[VX]) + abs(last[VY]) + p.radius * abs(last[OMEGA]))
     size += scale * (abs(place[X]) + abs(place[Y]) + p.radius * abs(place[THETA])) + more
-    # this is the part of the last term on [0, h] that polynomials of lower degree cannot represent
+    # part of the last term on [0, h] that polynomials of lower degree cannot represent
     return (size * h ** (s - 1) + grip * _GAIN * p.threshold[0]) * 2.0 ** (1 - 2 * s)
 
 
@@ -519,8 +509,7 @@ def _write_grip(p, state, h, w, implicit, seen, series) -> None:
 def _last_of_guards(p, state, w, h) -> float:
     """Return the largest ratio of the last term to the largest term in any guard function of stick and slip.
 
-    The last term is compared with terms of its own guard function, because even a small force can determine whether a
-    corner slips.
+    Even a small force can determine whether a corner slips.
     """
     guard, share = w.column[0], 0.0
     for pair in range(PAIR_COUNT):
@@ -542,7 +531,7 @@ def _write_ramp(p, h, w, implicit) -> float:
     """Write the force of a ramped law as K times an elastic part plus C times a remainder. Return the last term's size.
 
     The elastic part is d for the exponent 1, and 0 otherwise. The size is a velocity per h^(STAGES - 1). The force of a
-    CLIPPED pair does not act on the head, but determines the time at which the pair starts to push.
+    CLIPPED pair determines the time at which the pair starts to push.
     """
     s, largest = implicit.nodes.size, 0.0
     _interpolate(implicit.pairs[1], implicit.from_stages, h, w.damped)
@@ -579,7 +568,7 @@ def _lay_out(p, parts, implicit, ramp, rubbing, slip, stick, support, state, w, 
         return False
     state.implicit_size_before, state.decay_times_before = state.implicit_size, state.decay_times
     state.refused_before = state.refused
-    # the dampers of a support act even without contact
+    # dampers of a support act without contact
     damped = penetrating or support is not None
     w.decay[0] = decay_rate(p, state, slip, stick, support) if damped else 0.0
     if w.decay[0] <= 0.0 or state.touching != 0 or not has_decayed(p, state):
@@ -604,8 +593,7 @@ def note_step(implicit, state, w, step_size, has_event) -> None:
     if implicit is not None:
         note_decay(state, w.decay[0], step_size)
         if has_event:
-            # the polynomial of a long step can show a false event if a pair only approaches its wall; the size of the
-            # next step is therefore limited
+            # the polynomial of a long step can show a false event if a pair only approaches its wall
             state.implicit_size = min(state.implicit_size, 4.0 * step_size)
 
 
@@ -619,10 +607,7 @@ def _start(p, support, state, implicit) -> None:
 
 @kernel()
 def _collocate(p, parts, support, state, w, span, decay, implicit, ramp, wear, sliding, running_in, stick) -> float:
-    """Compute an implicit step as series of order `STAGES`. Return its size in s, or 0 if explicit steps are better.
-
-    `decay` is the result of `decay_rate` in 1/s.
-    """
+    """Compute an implicit step as series of order `STAGES`. Return its size in s, or 0 if explicit steps are better."""
     least = _WORTH * stable_decay(p.order) / decay
     if span < least:
         return 0.0
@@ -636,7 +621,7 @@ def _collocate(p, parts, support, state, w, span, decay, implicit, ramp, wear, s
             size = _write_series(p, support, state, h, w, implicit, ramp, wear, stick)
             better = 0.9 * (admissible / max(size, 1e-6 * admissible)) ** (1.0 / (STAGES - 1))
             if size <= admissible:
-                # if a sample has shortened the step, the size of the next step is not reduced
+                # a step that a sample has shortened does not reduce the next step
                 longer = h * min(better, 4.0)
                 state.implicit_size = max(longer, state.implicit_size) if h == span else longer
                 state.implicit_steps += 1
