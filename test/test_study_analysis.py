@@ -501,12 +501,12 @@ def test_mutated_files_many_times(tmp_path: Path) -> None:
 
 def test_rows_beyond_the_limit_are_thinned_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(thinned, "MOST_ROWS", 100)
-    rows, signal = thinned.Thinned(1), thinned.ThinnedSignal()
+    rows, signal = thinned.Thinned(1), thinned.Thinned(1)
     for begin, end in pairwise((0, 1, 70, 71, 350, 900, 901)):
         stamps = np.arange(begin, end)
         rows.add(stamps, 2.0 * stamps[:, None])
     for stamp in range(901):
-        signal.add(stamp, 2.0 * stamp)
+        signal.add_row(stamp, 2.0 * stamp)
     assert (rows.rows, rows.stride) == (901, 16)
     for stamps, values in (rows.series(), signal.series()):
         np.testing.assert_array_equal(stamps, np.arange(0, 901, 16))

@@ -41,7 +41,7 @@ from plow_twin.stream.session import Session
 from plow_twin.stream.silences import Silences
 from plow_twin.study.analysis.loads import LoadTotals
 from plow_twin.study.analysis.signals import Comparison, compare
-from plow_twin.study.analysis.thinned import Thinned, ThinnedSignal
+from plow_twin.study.analysis.thinned import Thinned
 
 Array = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ class Prediction:
         self.present.add(part.stamp_ns, np.hstack((rows.q, rows.force, -rows.penetration)))
         self.clearance.add(slow["stamp_ns"], slow["clearance"])
 
-    def is_inside(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
+    def is_inside(self, signal: Thinned) -> NDArray[np.bool_]:
         """Return for each measured value whether its stamp lies in a stretch of the load."""
         stamps = signal.series()[0]
         if not self.spans:
@@ -99,10 +99,10 @@ class Prediction:
         inside = [(stamps >= first) & (stamps <= last) for first, last in self.spans.values()]
         return np.asarray(np.any(inside, axis=0))
 
-    def outside(self, signal: ThinnedSignal) -> int:
+    def outside(self, signal: Thinned) -> int:
         """Return the number of values of a signal that have a stamp in no stretch of the load."""
         inside = self.is_inside(signal)
-        return round(signal.came * (1.0 - float(inside.mean()))) if len(inside) else 0
+        return round(signal.rows * (1.0 - float(inside.mean()))) if len(inside) else 0
 
     def restart(self) -> None:
         """Begin a new stretch after a reset. Its stamps may be earlier than those of the previous stretch."""
@@ -116,16 +116,16 @@ class Prediction:
         """Index of the longest stretch."""
         return self.resets if self._longer() is self.present else self._longest_number
 
-    def is_of_longest(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
+    def is_of_longest(self, signal: Thinned) -> NDArray[np.bool_]:
         """Return for each measured value whether it belongs to the longest stretch.
 
         A value belongs to the stretch that contains its stamp. If the clock has stepped back, several stretches may
         contain the stamp. In this case, the value belongs to the stretch in which it arrived.
         """
-        at, _ = signal.series()
+        at, rows = signal.series()
         if len(self.spans) < 2:
             return np.ones(len(at), np.bool_)
-        came, number = signal.stretches(), self.longest_number
+        came, number = rows[:, 1], self.longest_number
 
         def away(stretch: int) -> Array:
             first, last = self.spans[stretch]
@@ -152,7 +152,8 @@ class Prediction:
 class Measured:
     """Measured values of each signal, in order of arrival."""
 
-    signals: dict[str, ThinnedSignal] = field(default_factory=dict)
+    #: Columns of a signal: its value, and the stretch in which the value arrived.
+    signals: dict[str, Thinned] = field(default_factory=dict)
     #: Stretch of the latest message of each role, and its newest stamp [ns] in this stretch.
     _latest: dict[str, tuple[int, int]] = field(default_factory=dict)
     implausible: int = 0
@@ -169,7 +170,7 @@ class Measured:
             if math.isfinite(value) and abs(value) > _LARGEST:
                 self.implausible += 1
             elif math.isfinite(value) and stamp_ns > 0:
-                self.signals.setdefault(prefix + name, ThinnedSignal()).add(stamp_ns, value, stretch)
+                self.signals.setdefault(prefix + name, Thinned(2)).add_row(stamp_ns, value, stretch)
 
 
 @dataclass
@@ -197,8 +198,8 @@ class Analysis:
     @property
     def lost(self) -> dict[str, int]:
         """Counts of lost data. A signal counts as lost if all its stamps lie outside the time of the load."""
-        counts = ((self.predictions[0].outside(signal), signal.came) for signal in self.measured.signals.values())
-        outside = sum(count for count, came in counts if count == came)
+        counts = ((self.predictions[0].outside(signal), signal.rows) for signal in self.measured.signals.values())
+        outside = sum(count for count, rows in counts if count == rows)
         found = {"measured_implausible": self.measured.implausible, "measured_outside_the_load": outside}
         return self.losses | {name: count for name, count in found.items() if count}
 
@@ -214,8 +215,8 @@ class Analysis:
             if name not in self.measured.signals:
                 continue
             signal = self.measured.signals[name]
-            (at, values), ours = signal.series(), prediction.is_of_longest(signal)
-            one = compare(times[rising], column[rising], (at[ours] - stamps[0]) * 1e-9, values[ours])
+            (at, rows), ours = signal.series(), prediction.is_of_longest(signal)
+            one = compare(times[rising], column[rising], (at[ours] - stamps[0]) * 1e-9, rows[ours, 0])
             if one is not None:
                 found[name] = one
         return found
@@ -266,7 +267,8 @@ class Analysis:
             if key not in self.measured.signals or not len(stamps):
                 continue
             signal = self.measured.signals[key]
-            at, values = signal.series()
+            at, rows = signal.series()
+            values = rows[:, 0]
             inside = (at >= stamps[0]) & (at <= stamps[-1]) & prediction.is_of_longest(signal)
             place = np.minimum(np.searchsorted(stamps, at[inside]), len(stamps) - 1)
             predicted = columns[key][place] > 0.0

@@ -73,7 +73,7 @@ def _write_measured(found: Analysis, out: Path) -> None:
     table = {
         "signal": pa.DictionaryArray.from_arrays(places, list(series)),
         "stamp_ns": np.concatenate([stamps for stamps, _ in series.values()]),
-        "value": np.concatenate([values for _, values in series.values()]),
+        "value": np.concatenate([rows[:, 0] for _, rows in series.values()]),
     }
     _write_table(table, out / "measured.parquet")
 
@@ -107,9 +107,9 @@ def _picture(found: Analysis) -> str:
         axes[3].plot(times[:count:thin], force / 1e3, lw=0.7, label=label)
     for axis, name in zip(axes, ("x", "y", "theta"), strict=False):
         if name in found.measured.signals and start is not None:
-            stamps, values = found.measured.signals[name].series()
+            stamps, rows = found.measured.signals[name].series()
             at, thin = (stamps - start) * 1e-9, max(1, len(stamps) // _MOST_POINTS)
-            axis.plot(at[::thin], 1e3 * values[::thin], ".", ms=1.5, color="0.3", label="measured")
+            axis.plot(at[::thin], 1e3 * rows[::thin, 0], ".", ms=1.5, color="0.3", label="measured")
     for axis, text in zip(axes, ("x [mm]", "y [mm]", "θ [mrad]", "largest force [kN]"), strict=True):
         axis.set_ylabel(text)
         if axis.get_legend_handles_labels()[0]:
