@@ -1,9 +1,9 @@
 """Detection of rest. Once the decaying vibration of a head that is held by its contacts is small, it is omitted.
 
-Under constant loads, the sum of kinetic and potential energy cannot increase. If the stiffness is positive definite,
-this sum is an upper bound of the head's distance from its equilibrium for all time. When the bound is far below the
-tolerance, the head is set to its equilibrium, and the steps become as long as possible. Harmonic loads are admissible
-if they do not move the head beyond the bound (`small_harmonics`).
+Under constant loads, the sum of kinetic and potential energy cannot increase, so it bounds the head's distance from its
+equilibrium for all time if the stiffness is positive definite. When the bound is far below the tolerance, the head is
+set to its equilibrium, and the steps become as long as possible. Harmonic loads are admissible if they do not move the
+head beyond the bound (`small_harmonics`).
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def _speed(p, y) -> float:
 
 @kernel(inline="source")
 def slow_enough(p, y) -> bool:
-    """Return whether the head is slow enough to be at rest."""
+    """Return whether the head may be at rest by its speed."""
     return bool(_speed(p, y) <= 0.5 * _SHARE * p.velocity_tolerance)
 
 
@@ -50,7 +50,7 @@ def slow_enough(p, y) -> bool:
 def _still(p, acts, harmonics, state, w) -> bool:
     """Return whether the motion that is omitted at rest stays within its share of the tolerances for all time.
 
-    If the result is True, `w.rest[0]` contains the equilibrium of the head.
+    If so, `w.rest[0]` contains the equilibrium of the head.
     """
     y, z, rate = state.y, w.rest[0], w.rest[1]
     gyration, speed = _gyration(p), _speed(p, y)
@@ -63,7 +63,7 @@ def _still(p, acts, harmonics, state, w) -> bool:
     without_harmonics(p, harmonics, state.step_start, rate, w.rest[3, 3:])
     if not stiffer_than(w.hessian, 0.0):
         return False
-    # the energy bounds the speed; energy and smallest stiffness bound the distance from the equilibrium
+    # the energy bounds the speed and, with the smallest stiffness, the distance from the equilibrium
     energy = speed * speed + to_equilibrium(w.hessian, rate, z, gyration)
     if not (2.0 * energy < fast * fast and stiffer_than(w.hessian, 2.0 * energy / (way * way))):
         return False
@@ -86,7 +86,7 @@ def _still_as_before(p, acts, harmonics, state, w) -> bool:
 
 @kernel(inline="source")
 def own(parts):
-    """Return 1 if rest can be detected in the scene, and None otherwise."""
+    """Return 1 for a scene in which rest can be detected, else None."""
     return parts.terms.rest
 
 
@@ -111,7 +111,7 @@ def _lay_out(p, acts, harmonics, rest, state, w, span, penetrating) -> bool:
 
 @kernel()
 def _settle(p, acts, harmonics, state, w) -> bool:
-    """Return whether the head is at rest. If it is, set it to its equilibrium."""
+    """Set a head at rest to its equilibrium, and return whether it is at rest."""
     if not (state.at_rest == 1 and _still_as_before(p, acts, harmonics, state, w)):
         if not _still(p, acts, harmonics, state, w):
             return False

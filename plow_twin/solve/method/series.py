@@ -9,8 +9,8 @@ With the state in body coordinates (`model.geometry`) the equations of motion (p
 so each coefficient of the series follows from the coefficients of lower order by Cauchy products (Jorba and Zou, Exp.
 Math. 14 (2005) 99).
 
-The series variable is sigma. The time since the start of the step is t = alpha sigma + beta sigma^2 / 2. For (alpha,
-beta) = (1, 0), sigma is the time. For (0, 2), sigma is the square root of the time, in which a contact force with the
+The time since the start of the step is t = alpha sigma + beta sigma^2 / 2 with the series variable sigma. For (alpha,
+beta) = (1, 0), sigma is the time. For (0, 2), it is the square root of the time, in which a contact force with the
 exponent 1.5 is analytic at its touch.
 """
 
@@ -41,9 +41,8 @@ from plow_twin.solve.support import (
 
 #: Size of a term that is treated as zero, divided by the admissible size of the term of the last order.
 _VANISHED = 0.4
-#: Permutations of the components of the state, which are the lanes of a vector. `_turned` contains the components that
-#: are multiplied by omega. In lanes 4 and 7, the factor is the harmonic load S1 instead of omega. `_rates_of` contains
-#: the components that are rates of other components.
+#: Permutations of the state's components. `_turned` contains the components that are multiplied by omega, or by the
+#: harmonic load S1 in lanes 4 and 7. `_rates_of` contains the components that are rates of other components.
 _turned = permutation(Y, X, VY, VX, COS, SIN, COS, SIN)
 _rates_of = permutation(VX, VY, VX, VY, OMEGA, COS, SIN, OMEGA)
 
@@ -52,8 +51,7 @@ _rates_of = permutation(VX, VY, VX, VY, OMEGA, COS, SIN, OMEGA)
 def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:
     """Write the series of the harmonic forces S1 and S2 and of the harmonic moment M to `w.load`.
 
-    The coefficients of sine and cosine follow from (k+1) sin_{k+1} = omega (alpha cos_k + beta cos_{k-1}), and from the
-    corresponding equation for the cosine.
+    The coefficients follow from (k+1) sin_{k+1} = omega (alpha cos_k + beta cos_{k-1}), and likewise for the cosine.
     """
     load = w.load
     for k in range(order + 1):
@@ -80,7 +78,7 @@ def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:
 def _multiply_older(a, b, k):
     """Return coefficient k of the products of the columns of a and b, without the terms that contain row k of a or b.
 
-    The rows with the highest orders are added last, so the processor can start the sum before they are available.
+    The highest orders are added last, so that the sum can start before they are available.
     """
     low, high = splat(0.0), splat(0.0)
     half = k // 2
@@ -97,7 +95,7 @@ def _multiply_older(a, b, k):
 def _join(a, b, k, a_k, b_k):
     """Return coefficient k of the products of the columns of a and b, whose rows k are a_k and b_k.
 
-    The rows k are passed as values, because reading them from memory would wait until they are stored.
+    Reading the rows k from memory would wait until they are stored.
     """
     if k == 0:
         return a_k * b_k
@@ -118,7 +116,7 @@ def _raise(w, k, penetration, touching, exponent):
     other pairs it is zero.
     """
     if exponent == 1.5:
-        # d^1.5 is computed as d times its square root, which is faster than the general recurrence
+        # d sqrt(d) is faster than the general recurrence
         if k == 0:
             for pair in range(PAIR_COUNT):
                 w.power[1, 0, pair] = math.sqrt(w.penetration[0, pair]) if w.per_pair[BASE, pair] != 0.0 else 0.0
@@ -219,7 +217,7 @@ def _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, secon
     fx, fy = start[0] * c + start[1] * s, start[1] * c - start[0] * s
     moment = start[2] if k == 0 else 0.0
     if segments is not None:
-        # the series of start + slope t(sigma) has the coefficients alpha slope and beta slope / 2
+        # coefficients of start + slope t(sigma): alpha slope and beta slope / 2
         fx += alpha * (slope[0] * c1 + slope[1] * s1) + 0.5 * beta * (slope[0] * c2 + slope[1] * s2)
         fy += alpha * (slope[1] * c1 - slope[0] * s1) + 0.5 * beta * (slope[1] * c2 - slope[0] * s2)
         if k == 1:
@@ -247,7 +245,7 @@ def _loads_along_world(p, w, k, alpha, beta, harmonics, second, segments):
     load, start, slope = w.load, w.wrench[0], w.wrench[1]
     held, rising = 1.0 if k == 0 else 0.0, 0.0
     if segments is not None:
-        # the series of t(sigma) has the coefficients alpha and beta / 2
+        # coefficients of t(sigma): alpha and beta / 2
         rising = alpha if k == 1 else 0.5 * beta if k == 2 else 0.0
     fx, fy = held * start[0] + rising * slope[0], held * start[1] + rising * slope[1]
     moment = held * start[2] + rising * slope[2]
@@ -291,7 +289,7 @@ def _drag(p, w, k, c, s, x, y, om, dc, ds, dx, dy):
         set_row(rest, k, _multiply(tau, tau, k) * -1.0)
     force = _multiply(w.force, tau, k) * p.friction
     set_row(drag, k, force)
-    # the tangent is the wall's normal, rotated by +90 degrees; rows 2 and 3 of the penetration are minus the normal
+    # the tangent is the normal, rotated by +90 degrees; rows 2 and 3 are minus the normal
     return _applied(
         p, row(p.penetration_rows, 3) * force, row(p.penetration_rows, 2) * force * -1.0, _multiply(arm, drag, k)
     )
@@ -315,8 +313,7 @@ def _hold_on(p, state, w, k, c, s, x, y, theta, om, dc, ds, dx, dy):
 def _slide(p, w, k, om, dc, ds, dx, dy) -> None:
     """Write coefficient k of force times sliding distance per travel to `w.rub[2]`.
 
-    The sliding distance of a corner per travel is the root r of q = 1 + (s' / v)^2, with 2 r_0 r_k = q_k -
-    sum_{j=1}^{k-1} r_j r_{k-j}.
+    The sliding distance of a corner per travel is the root of q = 1 + (s' / v)^2 (`model.contact.root_terms`).
     """
     sliding, way = w.rub[0], w.rub[1]
     rate = rolled(p, row_values(p.slip_rows, dc, ds, dx, dy), om)
@@ -380,7 +377,7 @@ def _wear(p, state, w, k, alpha, beta, om, dc, ds, dx, dy, sliding, running_in) 
 
 @kernel(fast=True, inline="code")
 def _slide_size(p, w, k, sliding, running_in):
-    """Return the size of coefficient k - 1 of the sliding speed of loaded pads. Coefficient k is still unknown."""
+    """Return the size of coefficient k - 1 (the last known) of the sliding speed of loaded pads."""
     size = 0.0
     if sliding is not None:
         for pair in range(PAIR_COUNT):
@@ -391,7 +388,7 @@ def _slide_size(p, w, k, sliding, running_in):
 
 @kernel(inline="source")
 def one_by_one(terms):
-    """Return the terms as plain tuples for unpacking with a star: terms of the load, of the law, and other terms."""
+    """Return the terms as plain tuples, which kernels can unpack: of the load, of the law, and all other terms."""
     load = terms.harmonics, terms.second, terms.segments
     rub = terms.sliding, terms.running_in
     return load, law_terms(terms), terms.wear, rub, terms.offset, terms.free, terms.slip, terms.stick, terms.support
@@ -413,9 +410,8 @@ def _turn_frame(w, k, there, c, s):
 def _seen_rates(w, k, there, turned, om, turning):
     """Return coefficient k of the rates of the head's cosine, sine and position relative to the frame.
 
-    `turned` is the result of `_turn_frame`: R^T u and R^T w with the frame's displacement u and velocity w. R rotates
-    from head axes to world axes. The rate of R^T u is R^T w plus omega times R^T u, rotated by -90 degrees.
-    `turning` contains the rates of the head's position relative to the ground.
+    `turned` is the result of `_turn_frame`: R^T u and R^T w with the frame's displacement u and velocity w, where R
+    rotates from head axes to world axes. `turning` contains the rates of the head's position relative to the ground.
     """
     relative = om - lane(there, SPIN)
     left = pack(om, om, relative, relative, 0.0, 0.0, 0.0, 0.0)
@@ -432,9 +428,8 @@ def _seen_rates(w, k, there, turned, om, turning):
 def _push_frame(p, w, k, there, c, s, x, y, dc, ds, pushed):
     """Return coefficient k of the frame's rates under its springs, its dampers and the reactions of the contacts.
 
-    `pushed` contains the head's accelerations by the pairs (`_applied`). The moment of the forces about the frame's
-    centre is their moment about the head's centre of mass, plus the cross product of the head's position (x, y) and the
-    forces.
+    `pushed` contains the head's accelerations by the pairs (`_applied`), whose moment is moved from the head's centre
+    of mass (x, y) to the frame's centre.
     """
     fx, fy = lane(pushed, VX) / p.inverse_mass, lane(pushed, VY) / p.inverse_mass
     left, right = pack(c, s, s, c, x, y, 0.0, 0.0), pack(fx, fy, fx, fy, fy, fx, 0.0, 0.0)
@@ -459,7 +454,7 @@ def _push_frame(p, w, k, there, c, s, x, y, dc, ds, pushed):
 
 @kernel(fast=True, inline="source")
 def _turn_of_axes(p):
-    """Return the factors of products with omega in the state's rates. In fixed axes, four factors are 0."""
+    """Return the factors of products with omega in the state's rates, four of which are 0 in fixed axes."""
     if fixed_axes(p) is not None:
         return pack(0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0)
     return pack(1.0, -1.0, 1.0, -1.0, 0.0, -1.0, 1.0, 0.0)
@@ -500,8 +495,8 @@ def expand(
 ):
     """Write the series of state, penetration, rate and force up to order `limit` to `w`. Return their order.
 
-    If `penetrating` is false, no pair penetrates, and the contacts are omitted. The series ends early if its terms are
-    negligible at `sigma_limit`, the largest sigma of interest.
+    If no pair is `penetrating`, the contacts are omitted. The series ends early if its terms are negligible at
+    `sigma_limit`, the largest sigma of interest.
     """
     alpha, beta = state.alpha, state.beta
     left, right, load, inverse = w.left, w.right, w.load, w.inverse
@@ -535,8 +530,7 @@ def expand(
                 penetration = penetration - row(w.wear, k)
         set_row(w.penetration, k, penetration)
         if k > 0 and load_terms[2] is not None:
-            # under sampled loads most series end early, so waiting for the size of an order is faster than computing
-            # an unnecessary order
+            # under sampled loads most series end early
             reach *= sigma_limit
             size = _size(p, w, k, penetrating, sigma_limit, wear, support, *rub_terms)
             w.term_size[k] = size
@@ -554,7 +548,7 @@ def expand(
         turning = turning + _rates_of(here) * pack(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
         fx, fy, moment = _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, *load_terms)
         if offset is not None:
-            # the moment of the loads is about the cavity's centre; gravity acts at the centre of mass
+            # loads act at the cavity's centre, gravity at the centre of mass
             across = p.offset[0] * (fy + p.gravity * c) - p.offset[1] * (fx + p.gravity * s)
             moment -= across * p.inverse_inertia / p.inverse_mass
         applied = pack(0.0, 0.0, fx, fy, moment, 0.0, 0.0, 0.0)
@@ -585,7 +579,7 @@ def expand(
                 applied, pushed = applied + dragged, pushed + dragged
             if wear is not None:
                 _wear(p, state, w, k, alpha, beta, om, dc, ds, dx, dy, *rub_terms)
-            # the next order of the penetration depends only on the rates of this order, so it does not wait for forces
+            # the next order of the penetration does not wait for the forces of this order
             penetration = rate * steady + closing * bent
             closing = rate
         if support is not None:
@@ -600,7 +594,7 @@ def expand(
         here = rates * steady + before * bent
         before = rates
         if k > 0 and load_terms[2] is None:
-            # the size of this order is computed last, because the next order does not depend on it
+            # the next order does not depend on the size of this order
             size = _size(p, w, k, penetrating, sigma_limit, wear, support, *rub_terms)
             w.term_size[k] = size
             reach *= sigma_limit

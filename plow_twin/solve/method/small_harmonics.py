@@ -1,9 +1,8 @@
 """Proof that the motion of a head in contact stays below the tolerance under small harmonic loads.
 
 Near its equilibrium, the head satisfies e'' + C e' + K e = r. K and C are the matrices of stiffness and damping,
-divided by mass and inertia. e is the distance of the head from the linear response to the harmonic loads. The third
-coordinate of e is the angle times the radius of gyration. r is the remainder of the linearisation. The linear response
-is known in closed form, including resonance.
+divided by mass and inertia. e is the distance of the head from the linear response to the harmonic loads, with the
+angle times the radius of gyration as third coordinate. r is the remainder of the linearisation.
 
 Let s and c be the smallest eigenvalues of K and C, and S the largest eigenvalue of C. Choose eps at most c / 2,
 s / (10 S) and sqrt(s) / 10. For such an eps, the Lyapunov function V and the squared size W of the motion satisfy
@@ -38,7 +37,7 @@ EVALUATIONS = 4
 
 @kernel()
 def without_harmonics(p, harmonics, t, rate, spare) -> None:
-    """Subtract the harmonic loads at time t from the accelerations rate[3:]. `spare`, shape (3,), is scratch space."""
+    """Subtract the harmonic loads at time t from the accelerations rate[3:], with scratch space `spare`, shape (3,)."""
     if harmonics is not None:
         spare[0] = spare[1] = spare[2] = 0.0
         add_harmonics(p, harmonics, t, spare)
@@ -52,7 +51,7 @@ def _damping_at(p, acts, state, w, gyration) -> None:
     z, rate, moved = w.rest[0], w.rest[1], w.rest[2]
     accelerate(p, acts, True, state, state.step_start, z, w.rest[3, :3], rate)
     for j in range(3):
-        # a difference quotient with unit rate is the exact derivative, because the laws are linear in the rate
+        # exact, because the laws are linear in the rate
         unit = gyration if j == 2 else 1.0
         z[3 + j] = 1.0 / unit
         accelerate(p, acts, True, state, state.step_start, z, w.rest[3, :3], moved)
@@ -86,7 +85,7 @@ def _trace(p, h) -> float:
 
 @kernel(inline="code")
 def _dynamic_stiffness(p, w, omega, i, j):
-    """Return element (i, j) of K - omega^2 + i omega C. Locked coordinates have rows and columns of the unit matrix."""
+    """Return element (i, j) of K - omega^2 + i omega C, or of the unit matrix for locked coordinates."""
     if p.free[i] == 0.0 or p.free[j] == 0.0:
         return complex(1.0 if i == j else 0.0, 0.0)
     return complex(w.hessian[i, j] - (omega * omega if i == j else 0.0), omega * w.damping[i, j])
@@ -103,14 +102,14 @@ def _answer(p, one, w, gyration):
     sy, cy = amplitudes(p, one, 1)
     st, ct = amplitudes(p, one, 2)
     x, y, t = p.free[0] * complex(cx, -sx), p.free[1] * complex(cy, -sy), p.free[2] * gyration * complex(ct, -st)
-    # the inverse matrix is computed from the adjugate matrix
+    # inverse by the adjugate matrix
     first, second, third = e * k - f * h, f * g - d * k, d * h - e * g
     along_x = first * x + (c * h - b * k) * y + (b * f - c * e) * t
     along_y = second * x + (a * k - c * g) * y + (c * d - a * f) * t
     along_t = third * x + (b * g - a * h) * y + (a * e - b * d) * t
     size = math.sqrt(abs(along_x) ** 2 + abs(along_y) ** 2 + abs(along_t) ** 2)
     size /= abs(a * first + b * second + c * third)
-    # x K x is at most |x| times the sum of two amplitudes: those of the harmonic load and of the inertia force
+    # x K x is at most |x| times the amplitudes of the harmonic load and of the inertia force
     load = math.sqrt(abs(x) ** 2 + abs(y) ** 2 + abs(t) ** 2)
     return size, math.sqrt(load * size) + om * size
 
@@ -119,7 +118,7 @@ def _answer(p, one, w, gyration):
 def _left_out(p, state, w, reach, rate, gyration) -> float:
     """Return an upper bound of r in the module's docstring, for distances up to `reach` and rates up to `rate`.
 
-    The remainder r is due to the nonlinearity of the pairs' forces, and to the rotation of these forces with the head.
+    It is due to the nonlinearity of the pairs' forces and to their rotation with the head.
     """
     y, left_out = state.y, 0.0
     arm = (p.leverage + math.hypot(y[X], y[Y])) / gyration
@@ -140,8 +139,8 @@ def _left_out(p, state, w, reach, rate, gyration) -> float:
 def stays_at_rest(p, acts, harmonics, state, w, distance, way, fast, gyration) -> bool:
     """Return whether the head always stays within `way` [m] of its equilibrium and slower than `fast` [m/s].
 
-    `distance` is the current sqrt(W) of the module's docstring without the response to the harmonic loads. This
-    function adds the response. `w.hessian` contains the stiffness.
+    `distance` is the current sqrt(W) of the module's docstring without the response to the harmonic loads. `w.hessian`
+    contains the stiffness.
     """
     least = _least_eigenvalue(w.hessian)
     _damping_at(p, acts, state, w, gyration)

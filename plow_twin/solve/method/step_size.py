@@ -1,4 +1,4 @@
-"""Size of a step, over which its series is accurate. Where a series hides its error, bounds limit the size."""
+"""Size of a step over which its series is accurate, with bounds where a series hides its error."""
 
 from __future__ import annotations
 
@@ -14,18 +14,16 @@ from plow_twin.solve.method.series import expand, expand_harmonics, one_by_one
 from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import CLIPPED, ON
 
-#: `PARTING_REACH`: length of time in which the separation of a pair is searched, divided by the last step size.
-#: `PARTING_ORDER`: order of the series for this search.
+#: Time in which the separation of a pair is searched, divided by the last step size, and order of the series for it.
 PARTING_REACH, PARTING_ORDER = 1.3, 6
-#: Value of `PARTING_REACH` with friction with stick, where guard functions make steps shorter.
+#: `PARTING_REACH` for friction with stick, whose guard functions make steps shorter.
 _PARTING_REACH_STICK = 8.0
-#: Largest number of Newton iterations for the separation, and relative change at which they end. The next step corrects
-#: the remaining error.
+#: Largest number of Newton iterations for the separation, and relative change at which they end.
 _NEWTON_STEPS, _ROOT_FOUND = 6, 1e-9
-#: Largest usable term of a series. Products of larger terms would not be finite.
+#: Largest usable term of a series, whose products are finite.
 _FINITE = 1e300
-#: The largest term decreases when a step is shortened, so a step is shortened repeatedly. `_SHORTER`: largest number of
-#: repetitions. `_SHORT_ENOUGH`: ratio of successive sizes above which the repetition ends.
+#: Largest number of times that a step is shortened, because the largest term decreases with it, and ratio of successive
+#: sizes above which the repetition ends.
 _SHORTER, _SHORT_ENOUGH = 20, 0.9
 
 
@@ -33,9 +31,8 @@ _SHORTER, _SHORT_ENOUGH = 20, 0.9
 def accurate_step(p, w, order, sigma_limit):
     """Return the sigma up to which the series meets the admissible error of a step, or NaN if a term is not finite.
 
-    The admissible size of term k is `threshold[k]`. This size decreases geometrically with k to the admissible error at
-    the last order (root test of Jorba and Zou, sec. 3.2). Single terms can be zero, so the last `lacuna` terms are all
-    checked.
+    The admissible size `threshold[k]` of term k decreases geometrically with k to the admissible error at the last
+    order (root test of Jorba and Zou, sec. 3.2). Single terms can be zero, so the last `lacuna` terms are checked.
     """
     least = np.inf
     for k in range(order, order - max(p.lacuna, 2), -1):
@@ -45,7 +42,7 @@ def accurate_step(p, w, order, sigma_limit):
         if size > 0.0:
             least = min(least, math.log(p.threshold[k] / size) / k)
     sigma = min(sigma_limit, math.exp(least))
-    # a long step is shortened, because an admissible error of the velocity results in a large error of the position
+    # over a long step, an admissible error of the velocity is a large error of the position
     stretch = sigma * p.velocity_tolerance / (p.position_tolerance * (order + 1))
     if stretch > 1.0 and sigma < sigma_limit:
         sigma *= math.exp(-math.log(stretch) / order)
@@ -56,9 +53,9 @@ def accurate_step(p, w, order, sigma_limit):
 def before_sticking(p, state, w, order, sigma) -> float:
     """Return `sigma`, or the smaller value up to which the series of tanh r converges well enough.
 
-    r is the slip rate divided by the regularisation speed. During fast slip, tanh r is constant up to rounding, so its
-    coefficients do not show its poles at r = +-i pi/2. If |r - r_0| is at most theta times the distance of r_0 from the
-    poles, the remainder of the series is less than theta^order.
+    r is the slip rate divided by the regularisation speed. During fast slip, tanh r is constant up to rounding and does
+    not show its poles at r = +-i pi/2. If |r - r_0| is at most theta times the distance of r_0 from the poles, the
+    remainder of the series is less than theta^order.
     """
     theta = (p.threshold[p.order] / p.threshold[0]) ** (1.0 / order)
     within = sigma
@@ -70,7 +67,7 @@ def before_sticking(p, state, w, order, sigma) -> float:
             change = (change + abs(w.slip[0, k, pair])) * within
         limit = theta * math.hypot(w.slip[0, 0, pair], 0.5 * math.pi)
         if change > limit:
-            # the change is convex in sigma, so it decreases at least in proportion to sigma
+            # the change is convex in sigma
             within *= limit / change
     return within
 
@@ -79,10 +76,9 @@ def before_sticking(p, state, w, order, sigma) -> float:
 def before_pushing_again(p, state, w, order, sigma, integer, fraction) -> float:
     """Return `sigma`, or the smaller value up to which the ramped force of CLIPPED pairs has an accurate series.
 
-    This force does not act yet and appears only in a guard function, so its error is not limited by the test of the
-    motion. The root test of the motion is applied to the velocity that the force would cause. The test is necessary
-    because the active share of C, a cubic, has a longer series than the penetration. Moreover, d^n has a branch point
-    where the pair separates. If the series of the motion has ended early, the test uses the available orders.
+    This force appears only in a guard function, so the test of the motion does not limit its error. The root test is
+    applied to the velocity that the force would cause, because the active share of C, a cubic, has a longer series than
+    the penetration, and d^n has a branch point where the pair separates.
     """
     least, share = np.inf, math.log(p.threshold[p.order] / p.threshold[0]) / order
     for pair in range(PAIR_COUNT):
@@ -100,8 +96,7 @@ def before_pushing_again(p, state, w, order, sigma, integer, fraction) -> float:
 def before_gripping(p, state, w, order, sigma) -> float:
     """Return `sigma`, or the smaller value up to which the guard functions of stick and slip are accurate.
 
-    A force that is too small to move the head can still determine whether its corner sticks. The root test is therefore
-    relative to the largest term of the guard function.
+    The root test is relative to the largest term, because even a small force can determine whether a corner sticks.
     """
     guard = w.column[0]
     share = math.log(p.threshold[p.order] / p.threshold[0]) / order
@@ -116,8 +111,8 @@ def before_gripping(p, state, w, order, sigma) -> float:
 def _relatively_accurate(g, order, lacuna, share, sigma) -> float:
     """Return `sigma`, or the smaller value up to which the last terms of g are small relative to its largest term.
 
-    The admissible size of term k is exp(share k) times the largest term. Only the upper half of the terms is tested,
-    because the lower terms may be large near a root.
+    The admissible size of term k is exp(share k) times the largest term, for the upper half of the terms: lower terms
+    may be large near a root.
     """
     for _ in range(_SHORTER):
         largest, power = 0.0, 1.0
@@ -139,7 +134,7 @@ def _relatively_accurate(g, order, lacuna, share, sigma) -> float:
 def time_to_separation(p, parts, state, w, span, harmonics, stick):
     """Return the time in s until the first pair separates, or 0 if the separation is too far away to shorten steps.
 
-    A series of low order is sufficient, because the next step corrects its error.
+    The next step corrects the error of the series of low order.
     """
     near, reach = False, PARTING_REACH
     if stick is not None:

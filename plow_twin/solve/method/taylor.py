@@ -1,4 +1,4 @@
-"""Computation of a step by Taylor series, from the choice of the series variable to the size of the step."""
+"""Computation of a step by Taylor series: choice of the series variable, and size of the step."""
 
 from __future__ import annotations
 
@@ -15,12 +15,10 @@ from plow_twin.solve.method.step_size import (
     time_to_separation,
 )
 
-#: Length of time after a touch in which the series variable is the square root of the time since the touch, divided by
-#: the last step size.
+#: Time after a touch in which the series variable is its square root, divided by the last step size.
 TOUCH_REACH = 2.5
 #: Longest step in the square root of the time since the touch, divided by its value at the start of the step. The
-#: series of the force has the rounding error of 1 / sqrt(t), which grows by this factor with each order. The motion
-#: does not have this error, because the factor dt / dsigma cancels it.
+#: rounding error of the force's series, like 1 / sqrt(t), grows by this factor with each order.
 FURTHEST = 4.0
 
 
@@ -68,20 +66,20 @@ def _choose_map(p, parts, fraction, stick, state, w, span, penetrating):
     if fraction is None:
         return span, True
     if state.touching != 0:
-        # after a touch, a force like d^1.5 is analytic in the square root of the time since the touch
+        # d^1.5 is analytic in the square root of the time since a touch
         state.alpha, state.beta = 0.0, 2.0
         return math.sqrt(span), True
     if not penetrating or p.exponent != 1.5:
         return span, True
     parting = time_to_separation(p, parts, state, w, span, parts.harmonics, stick)
     if parting > 0.0:
-        # before a separation, a force like d^1.5 is analytic in the square root of the remaining time
+        # d^1.5 is analytic in the square root of the time until a separation
         root = math.sqrt(parting)
         state.alpha, state.beta = 2.0 * root, -2.0
         return (root if parting <= span else root - math.sqrt(parting - span)), parting > span
     since = state.step_start - state.touch_time
     if 0.0 < since < TOUCH_REACH * state.last_step_size:
-        # for some steps after a touch, the square root of the time since the touch is a better variable than time
+        # for some steps after a touch, its square root is a better variable than time
         root = math.sqrt(since)
         state.alpha, state.beta = 2.0 * root, 2.0
         return math.sqrt(since + span) - root, True
