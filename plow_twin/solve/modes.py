@@ -33,14 +33,14 @@ from plow_twin.solve.state import (
     Y,
 )
 
-#: Largest penetration that is treated as zero, divided by the release penetration. A speed is treated as zero below the
-#: same ratio times the speed that reaches the release penetration.
+#: Largest penetration that is treated as zero, divided by the release penetration, and largest speed that is treated as
+#: zero, divided by the speed that reaches the release penetration.
 SHALLOW = 1e-3
-#: Number of iterations in which damping and impact speed of a pair that starts in contact are computed in turn.
+#: Number of iterations for damping and impact speed of a pair that starts in contact.
 _ROUNDS = 8
-#: Number of bisections for the impact speed, sufficient to determine the last bit of a double.
+#: Number of bisections for the impact speed, down to the last bit.
 _BISECTIONS = 60
-#: Largest |theta| in rad at which each corner faces the walls of its pairs: 45 degrees, and a margin for rounding.
+#: Largest |theta| in rad at which each corner faces its walls: 45 degrees, and a margin for rounding.
 LARGEST_ANGLE = 0.25 * math.pi + 1e-12
 _ALL_PAIRS = 2**PAIR_COUNT - 1
 
@@ -53,14 +53,11 @@ def penetration_and_rate(p, state, pair):
 
 @kernel()
 def _fallen_number(p, y, pair, speed):
-    """Return the damping number D for a restitution that decreases with the impact speed (`model.scene.Contact`).
-
-    `speed` is the speed of approach in m/s.
-    """
+    """Return D for a restitution that decreases with the impact speed (`model.scene.Contact`), at `speed` [m/s]."""
     arm = row_value(p.arm_rows, pair, y[COS], y[SIN], y[X], y[Y])
     mobility = 1.0 + p.free[2] * arm * arm * p.inverse_inertia / p.inverse_mass
     impact = speed * mobility**-p.fall_mass
-    # rows 2 and 3 of the penetration contain the wall's normal, so `along` is the speed along the wall
+    # rows 2 and 3 of the penetration are minus the wall's normal
     along = p.penetration_rows[2, pair] * y[VY] - p.penetration_rows[3, pair] * y[VX]
     e = p.restitution * max(impact / p.fall_speed, 1.0) ** -p.fall - p.fall_along * abs(along)
     at = max(e, 1.0 / RESTITUTIONS) * RESTITUTIONS
@@ -69,7 +66,7 @@ def _fallen_number(p, y, pair, speed):
     return (low + (at - index) * (high - low)) * RESTITUTIONS / at
 
 
-#: Return the damping number D of an impact, which depends on the impact speed only if the restitution does.
+#: Return the damping number D of an impact at a speed.
 _damping_number = by_field(
     "fall", lambda p, y, pair, speed: _fallen_number(p, y, pair, speed), lambda p, y, pair, speed: p.damping_number
 )
@@ -95,8 +92,7 @@ def _impact_speed(number, rate, energy) -> float:
     if number <= 0.0 or (energy <= 0.0 and rate == 0.0):
         return 0.0
     full = number - math.log1p(number)
-    # `low` is the speed of the impact that has this energy at its turning point, where the rate is zero; a rate other
-    # than zero means that the impact was faster
+    # the impact at the speed `low` has this energy at its turning point, where the rate is zero
     low = math.sqrt(number * number * energy / full)
     high = max(low, abs(rate)) * (1.0 + number)
     low = max(low, rate, -number * rate)
@@ -115,12 +111,12 @@ def _impact_speed(number, rate, energy) -> float:
 def _start_inside(p, state, pair, energy) -> None:
     """Set the damping factor of a pair that starts in contact, as if an impact had led to its current state.
 
-    `energy` is the elastic energy of all pairs, because all of it may come from this impact.
+    `energy` is the elastic energy of all pairs, which may come from this impact.
     """
     if p.damping_number >= 0.0:
         y = state.y
         arm = row_value(p.arm_rows, pair, y[COS], y[SIN], y[X], y[Y])
-        # a frame on springs has its own mobility, with the arm about the frame's centre
+        # mobility of a frame on springs, with the arm about its centre
         arm_of_frame = row_value(p.arm_rows, pair, y[COS], y[SIN], 0.0, 0.0)
         mobility = p.inverse_mass + p.free[2] * arm * arm * p.inverse_inertia
         mobility += p.frame_mobility[0] + arm_of_frame * arm_of_frame * p.frame_mobility[2]
@@ -128,7 +124,7 @@ def _start_inside(p, state, pair, energy) -> None:
         number = p.damping_number
         speed = _impact_speed(number, rate, energy * mobility)
         if _falls(p) is not None:
-            # speed and damping depend on each other, so they are computed in turn
+            # speed and damping depend on each other
             for _ in range(_ROUNDS):
                 number = _damping_number(p, y, pair, speed)
                 speed = _impact_speed(number, rate, energy * mobility)
@@ -171,9 +167,9 @@ def settle_modes(p, state, stick) -> None:
 
 @kernel(entry=True)
 def settle_moved(params, states, which, places, time, stick) -> None:
-    """Set the states with the indices `which` to the body coordinates `places` at `time`, and set their modes.
+    """Set the states `which` to the body coordinates `places` at `time`, and set their modes.
 
-    A pair that was already in contact keeps the damping factor that was set at its touch.
+    A continuing contact keeps the damping factor of its touch.
     """
     touched = np.zeros(PAIR_COUNT, np.int64)
     damping = np.zeros(PAIR_COUNT)
@@ -210,7 +206,7 @@ def any_penetrates(state) -> bool:
 
 @kernel()
 def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
-    """Write the factors of each pair's force in the series to `w.per_pair`. Return whether any pair penetrates."""
+    """Write the factors of each pair's force to `w.per_pair`, and return whether any pair penetrates."""
     mode, per_pair = state.mode, w.per_pair
     for pair in range(PAIR_COUNT):
         per_pair[BASE, pair] = 0.0
@@ -221,8 +217,7 @@ def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
             if penetration > SHALLOW * p.release:
                 per_pair[BASE, pair] = 0.5 / math.sqrt(penetration) if p.exponent == 1.5 else 1.0 / penetration
             else:
-                # the step after the touch was too short: the penetration d is still too small for a series of d^n, so
-                # the pair becomes RELEASED
+                # after a short step, the penetration d is still too small for a series of d^n
                 mode[pair] = RELEASED
         acts = mode[pair] == ON
         per_pair[ACTS, pair] = p.stiffness if acts else 0.0
@@ -236,7 +231,7 @@ def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
 
 @kernel(inline="source")
 def slow_touch(p) -> float:
-    """Return the speed in m/s below which a touch does not lead to the release penetration by its speed alone."""
+    """Return the speed in m/s below which a touch alone does not lead to the release penetration."""
     acceleration = p.threshold[0] * p.weight / p.radius
     return SHALLOW * math.sqrt(2.0 * acceleration * p.release)
 

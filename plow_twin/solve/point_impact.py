@@ -1,4 +1,4 @@
-"""Many separate impacts of bodies that touch a wall at one point. Positions and arms are constant during an impact.
+"""Many separate impacts of bodies that touch a wall at one point, with constant positions and arms.
 
 The normal force is that of `model.contact`. Friction is regularised (`model.friction`) or modelled by the spring of
 `solve.grip`.
@@ -15,8 +15,8 @@ from plow_twin.model.contact import normal_force
 from plow_twin.model.friction import friction_force
 
 #: Constants of the contact, divided by the mass: stiffness K, exponent n, viscous damping C, ramp [m], friction
-#: coefficient mu, regularisation speed [m/s], and stiffness and damping of the tangential spring. The spring is used if
-#: the regularisation speed is 0.
+#: coefficient mu, regularisation speed [m/s], and stiffness and damping of the tangential spring, which is used if the
+#: regularisation speed is 0.
 POINT = np.dtype(
     [
         (name, "f8")
@@ -34,7 +34,7 @@ def _strike(point, damping, normal_arm, tangential_arm, inertia, speed, slip, ou
     normal = 1.0 + normal_arm * normal_arm / inertia
     along = 1.0 + tangential_arm * tangential_arm / inertia
     coupling = -normal_arm * tangential_arm / inertia
-    # the largest depth of the undamped impact determines the duration of the impact up to a factor near 1
+    # the largest depth of the undamped impact gives its duration up to a factor near 1
     power = point.exponent + 1.0
     deepest = (power * speed * speed / (2.0 * point.stiffness * normal)) ** (1.0 / power)
     h = math.pi * deepest / (speed * _STEPS)

@@ -1,4 +1,4 @@
-"""Many runs of one scene in one compiled call. Each run has its own initial state and time interval."""
+"""Many runs of one scene, with their own initial states and time intervals, in one compiled call."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _integrate = for_kernels(loop.integrate)
 def run_restarts(p, parts, states, w, totals, log, edges, budgets, t, q, v) -> int:
     """Run state m through the times t[edges[m]:edges[m + 1]], and write poses and rates to these rows of q and v.
 
-    The caller sets the coordinates, rates and time of each state; this function sets the modes of its pairs. If a run
-    fails, the function returns its `Status` and omits the remaining runs.
+    The caller sets the coordinates, rates and time of each state, but not its modes. The first failed run ends the call
+    with its `Status`.
     """
     first = np.zeros(1, np.int64)
     for m in range(states.size):

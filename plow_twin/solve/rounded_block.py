@@ -1,9 +1,8 @@
 """Short motions of many square blocks with rounded corners that are tossed on a table.
 
-Each block has its own parameters. Contacts have the normal force of `model.contact` and the spring friction of
-`solve.grip`. Restitution and friction decrease with the impact speed, and vary from touch to touch by a given scatter.
-In flight, the drag is linear in the velocity. A step in contact is a fixed fraction of the contact time. A step in
-flight is as long as possible before a corner can reach the table.
+Contacts have the normal force of `model.contact` and the spring friction of `solve.grip`. Restitution and friction
+decrease with the impact speed, and vary from touch to touch by a given scatter. In flight, the drag is linear in the
+velocity, and a step is as long as possible before a corner can reach the table.
 """
 
 from __future__ import annotations
@@ -36,13 +35,12 @@ BLOCK = np.dtype(
 CORNERS = 4
 #: Number of steps per half period of the stiffest contact.
 _STEPS = 70.0
-#: `_SLOWEST`: lower limit in m/s of the impact speed in the damping of a touch. `_LEAST`, `_LARGEST`: smallest and
-#: largest restitution.
+#: Lower limit in m/s of the impact speed in the damping of a touch, and smallest and largest restitution.
 _SLOWEST, _LEAST, _LARGEST = 0.01, 0.05, 0.9
 #: Impact speed in m/s below which restitution and friction are constant.
 _SMALLEST_IMPACT = 0.05
-#: Mobility of a corner times the mass, for a uniform square that lands on the end of an edge. The effective mass of an
-#: impact is computed relative to this value.
+#: Mobility of a corner times the mass, for a uniform square that lands on the end of an edge, to which the effective
+#: mass of an impact is relative.
 _USUAL_MOBILITY = 1.5
 
 
@@ -96,7 +94,7 @@ def _toss(block, numbers, scatter, dt, rows) -> None:
                 if depth <= 0.0:
                     touching[corner] = 0
                     continue
-                # the arc rolls on the table, so its touching point is one radius below its centre
+                # the touching point is one radius below the arc's centre
                 arm = az - block.radius
                 slip, rate = z[3] - z[5] * arm, -z[4] - z[5] * ax
                 place = z[0] + ax + block.radius * z[2]
@@ -141,8 +139,7 @@ def toss_blocks(blocks, numbers, scatter, dt, rows) -> None:
         Damping numbers D for evenly spaced restitutions from 0 to 1.
     scatter : ndarray, shape (m, touches, 3)
         Scatter of each touch: a term added to the restitution, a term added to the logarithm of friction, and the
-        distance [m] of the normal force from the lowest point of the corner. Touches beyond the last row use the last
-        row.
+        distance [m] of the normal force from the lowest point of the corner. Later touches use the last row.
     dt : float
         Time between rows in s.
     rows : ndarray, shape (m, n, 6)

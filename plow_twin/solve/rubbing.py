@@ -1,10 +1,10 @@
-"""Factors of a pad's wear by in-plane sliding and by running-in. These factors multiply the wear by force and travel.
+"""Factors by in-plane sliding and by running-in on a pad's wear by force and travel.
 
     dh/dt = (k_s v / A) F sqrt(1 + (s' / v)^2) (1 + a exp(-h / h0))
 
 v is the speed of travel along the face. s' is the rate at which the corner slides along its wall, perpendicular to the
-travel. A plough that stands still does not wear. At v = 0, the sliding distance has a kink where s' = 0, which a power
-series cannot represent. The v under the root is therefore at least `SLOWEST_TRAVEL`.
+travel. At v = 0, the root has a kink where s' = 0, which a power series cannot represent, so the v under the root is at
+least `SLOWEST_TRAVEL`.
 """
 
 from __future__ import annotations

@@ -9,10 +9,9 @@ from plow_twin.kernel.compiler import kernel
 
 @kernel(entry=True)
 def lay_out(before, samples, inertias, per) -> bool:
-    """Write load samples, divided by mass and inertia, to `per`, shape (n + 1, 3). Return whether they are finite.
+    """Write the load sample `before`, shape (3,), and n new samples, divided by mass and inertia, to `per`.
 
-    `samples`, shape (n, 3), contains the new samples, and `before`, shape (3,), the previous sample. Only the new
-    samples are checked.
+    Returns whether all new samples are finite.
     """
     finite = True
     for j in range(3):

@@ -1,7 +1,6 @@
 """Record types of the compiled kernels: constants of a scene, dynamic state, scratch space and totals.
 
-A part that is absent from a scene is `None`. `None` has its own type in the compiled signature, so numba does not
-compile the code of this part.
+A part that a scene lacks is None, so numba does not compile its code.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from plow_twin.model.pairs import PAIR_COUNT
 
 Array = NDArray[np.float64]
 
-#: Highest order of the Taylor series. The tolerance determines the order of a run.
+#: Highest order of the Taylor series.
 MAX_ORDER: Final = 30
 
 # indices into Work.per_pair
@@ -30,13 +29,12 @@ ACTS, DAMPS, BASE, SIGN, RATIO, SUM, FIRST, SECOND, RAMPS = range(9)
 OFF: Final = 0
 ON: Final = 1
 CLIPPED: Final = 2
-#: Mode RELEASED, for exponents that are not integers. The force of the pair is negligible, because its penetration is
-#: less than `Params.release`.
+#: Mode of a pair whose force is negligible, because its penetration is less than `Params.release`, for exponents that
+#: are not integers.
 RELEASED: Final = 3
-#: Code of the event at which a penetration crosses the end of the damping ramp. This event does not change the mode.
+#: Code of the event at which a penetration crosses the end of the damping ramp, without a change of mode.
 CROSSING: Final = 4
-#: Codes of the events at which a corner starts to slip forward along its wall, to slip backward, or to stick. These
-#: events do not change the mode.
+#: Codes of the events at which a corner starts to slip forward, slip backward or stick, without a change of mode.
 SLIPS_FORWARD: Final = 5
 SLIPS_BACKWARD: Final = 6
 STICKS: Final = 7
@@ -67,7 +65,7 @@ class Status(IntEnum):
     OUT_OF_RANGE = 1
     NON_FINITE = 2
     BUDGET = 3
-    #: internal: the event log is full, and the caller has to extend it before it continues
+    #: internal: the caller has to extend the full event log before it continues
     LOG_FULL = 4
     #: internal: a slice of the work is done, and the caller has to check its limits before it continues
     PAUSED = 5
@@ -88,8 +86,7 @@ _STATUS_TEXT: Final = {
 }
 
 
-# Because the types below are records instead of tuples of arrays, a kernel receives a single pointer, and the shapes of
-# arrays are constants. There is no reference counting.
+# A kernel receives a record as a single pointer to arrays of constant shape, without reference counting.
 
 _ROWS: Final = MAX_ORDER + 1
 _WIDE: Final = (_ROWS, PAIR_COUNT)
@@ -98,7 +95,7 @@ _LINE: Final = 64
 
 
 def _in_lines(fields: list[tuple[Any, ...]]) -> np.dtype[np.void]:
-    """Return a record type padded to whole cache lines, so that each record of an array begins at a cache line."""
+    """Return a record type padded to whole cache lines."""
     packed = np.dtype(fields)
     names = packed.names or ()
     parts: Any = packed.fields
@@ -112,11 +109,11 @@ def _in_lines(fields: list[tuple[Any, ...]]) -> np.dtype[np.void]:
     )
 
 
-#: Number of intervals of the restitution from 0 to 1 in the table of damping numbers. The smallest restitution in use
+#: Number of intervals of the restitution from 0 to 1 in the table of damping numbers, whose smallest restitution in use
 #: is one interval.
 RESTITUTIONS: Final = 1000
 
-#: Constants of one scene at one tolerance. They are divided by mass and inertia where the kernels need these quotients.
+#: Constants of one scene at one tolerance, divided by mass and inertia where the kernels need the quotients.
 _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("penetration_rows", "f8", (5, PAIR_COUNT)),  # coefficients of c, s, X, Y and 1 in the penetrations
     ("arm_rows", "f8", (4, PAIR_COUNT)),  # coefficients of c, s, X and Y in the arms
@@ -181,7 +178,7 @@ _OPTION_FIELDS: Final[dict[str, list[tuple[Any, ...]]]] = {
 
 
 class Options(NamedTuple):
-    """Options of a scene. Each option adds fields to the record of the scene's constants."""
+    """Options of a scene, each of which adds fields to its constants."""
 
     corners: bool  #: the head carries corners
     rounded: bool  #: the corners are rounded
@@ -246,13 +243,12 @@ _GRIP_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("anchor", "f8", (PAIR_COUNT,)),  # position along the wall in m at which the spring of a sticking corner is relaxed
     ("grip", "i8", (PAIR_COUNT,)),  # 0 for stick, 1 for slip forward, -1 for slip backward
 ]
-#: Additional state of a frame on springs: displacements x, y, theta from equilibrium, and their rates. If this field is
-#: present, `State.y` is relative to the frame.
+#: Additional state of a frame on springs, to which `State.y` is then relative: displacements x, y, theta from
+#: equilibrium, and their rates.
 _FRAME_FIELDS: Final[list[tuple[Any, ...]]] = [("frame", "f8", (6,))]
 
-#: Scratch space, mainly for the series of one step. Each row contains the coefficients of one order. The eight columns
-#: are components of the state, or pairs. Arrays of eight columns come first, so that each of their rows fills a cache
-#: line.
+#: Scratch space, mainly for the series of one step: a row for each order, and a column for each component of the state
+#: or for each pair. Arrays of eight columns come first, so that each of their rows fills a cache line.
 WORK: Final = np.dtype(
     [
         ("series", "f8", _WIDE),  # state
@@ -277,8 +273,7 @@ WORK: Final = np.dtype(
         ("grip", "f8", (3, PAIR_COUNT)),  # friction with stick: factors of normal force, position and slip rate
         ("per_pair", "f8", (9, PAIR_COUNT)),  # masks and sums of the eight pairs
         ("moved", "f8", (STATE_SIZE,)),
-        # the following fields have the types of the state's fields, so that one compiled kernel accepts state and
-        # scratch space
+        # the following fields have the types of the state's fields, for the same compiled kernels
         ("saved_y", "f8", (STATE_SIZE,)),  # body coordinates and wear depth at the start of an advance
         ("saved_wear", "f8", (PAIR_COUNT,)),
         ("read_y", "f8", (STATE_SIZE,)),  # body coordinates, rates and wear depths at an output time
@@ -325,8 +320,8 @@ TOTALS: Final = np.dtype(
 FOLLOWED: Final = 1
 WITH_INTERVALS: Final = 2
 
-#: Motion at the end of an advance, and sums over the advance. Rows of twins in lanes have this type. The first fields
-#: are eight single numbers, so that the numbers of the eight pairs begin at a cache line.
+#: Motion at the end of an advance, and sums over the advance. Eight single numbers come first, so that the numbers of
+#: the eight pairs begin at a cache line.
 _ADVANCE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("t", "f8"),
     ("q", "f8", (3,)),
@@ -341,12 +336,12 @@ _ADVANCE_FIELDS: Final[list[tuple[Any, ...]]] = [
 ]
 ADVANCE: Final = _in_lines(_ADVANCE_FIELDS)
 
-#: Row of `ADVANCE` with additional values of a published message. The rows are passed to the messages unchanged.
+#: Row of `ADVANCE` with additional values of a published message.
 ROW: Final = np.dtype(
     [
         *_ADVANCE_FIELDS,
-        # In a published row (`solve.totals.publish`), `makes` counts the touches since the start of the motion. Impulse
-        # and peak refer to the time since the previous publication.
+        # in a published row (`solve.totals.publish`), `makes` counts the touches since the start of the motion; impulse
+        # and peak refer to the time since the previous publication
         ("stamp_ns", "i8"),
         ("samples", "i8"),  # number of advances to a sample since the previous publication
         ("measured_peak", "f8", (PAIR_COUNT,)),  # largest force in these advances
@@ -355,9 +350,8 @@ ROW: Final = np.dtype(
         ("marked", "i8"),  # 1 if `held` or `corrected` is 1, in the current or the previous publication
         ("orientation", "f8", (2,)),  # z and w of the head's quaternion
         ("twist", "f8", (3,)),  # rates along the head's own axes [m/s], and about z [rad/s]
-        # The following fields are filled if the motion follows measurements. They contain the 5 % and 95 % quantiles
-        # over randomly drawn twins, and the clearances [m] with their quantiles. Quantiles of peak and impulse refer to
-        # the time since the previous publication.
+        # for a motion that follows measurements: 5 % and 95 % quantiles over randomly drawn twins, and clearances [m]
+        # with their quantiles
         ("followed", "i8"),  # `FOLLOWED` if only the clearances are filled, `WITH_INTERVALS` if all fields are filled
         *((f"{name}_{end}", "f8", (PAIR_COUNT,)) for name in ("force", "peak", "impulse") for end in ("low", "high")),
         ("known_clearance", "f8", (6,)),  # horizontal clearance, its quantiles; vertical clearance, its quantiles
@@ -375,8 +369,7 @@ Implicit: TypeAlias = np.record
 #: `Params.direction`, and of the moment M.
 HARMONIC: Final = np.dtype([("omega", "f8"), ("first", "f8", (2,)), ("second", "f8", (2,)), ("moment", "f8", (2,))])
 
-#: A linear piece of a load, divided by mass and inertia: the load at the knot at which the piece begins, and the slope
-#: after this knot.
+#: A linear piece of a load, divided by mass and inertia: the load at its first knot, and its slope.
 SEGMENT: Final = np.dtype([("knot", "f8"), ("start", "f8", (3,)), ("slope", "f8", (3,))])
 
 Harmonics: TypeAlias = NDArray[np.void]
@@ -384,11 +377,10 @@ Segments: TypeAlias = NDArray[np.void]
 
 
 class Terms(NamedTuple):
-    """Terms of the equations of motion. A term that is present is 1, and a term that is absent is `None`.
+    """Terms of the equations of motion, each 1 if it is present and None if it is absent.
 
-    `Params` contains the constants of the terms. The types of the terms are part of the compiled signature. Kernels
-    take the terms as separate arguments, because numba omits a branch from the compiled code only if a separate
-    argument is `None`.
+    Kernels take the terms as separate arguments, because numba omits a branch from the compiled code only if a separate
+    argument is None. `Params` contains the constants of the terms.
     """
 
     harmonics: int | None
@@ -420,8 +412,7 @@ class Parts(NamedTuple):
     implicit: Implicit | None
 
 
-#: Limit of the evaluations of an advance, and scratch space for the Runge-Kutta steps that complete an advance at this
-#: limit.
+#: Limit of the evaluations of an advance, and scratch space for the Runge-Kutta steps that complete it at this limit.
 BOUND: Final = np.dtype(
     [
         ("steps", "i8"),  # number of Runge-Kutta steps that are reserved for completing an advance
@@ -435,7 +426,7 @@ BOUND: Final = np.dtype(
 #: A change of contact mode: time in s, pair, mode before and after the change, and penetration rate in m/s.
 EVENT: Final = np.dtype([("time", "f8"), ("pair", "i8"), ("mode_from", "i8"), ("mode_to", "i8"), ("rate", "f8")])
 
-#: Progress of a call that makes many advances. The call returns after each slice of work.
+#: Progress of a call that makes many advances and returns after each slice of work.
 PACE: Final = np.dtype(
     [
         ("slice", "i8"),  # number of steps in a slice
@@ -458,7 +449,7 @@ def state_type(terms: Terms) -> np.dtype[np.void]:
 
 @cache
 def _state_type(stick: bool, support: bool) -> np.dtype[np.void]:
-    # additional fields come first; if they came last, numba would confuse the record with the record without them
+    # additional fields come first, because numba would confuse the record with the record without them
     more = (_FRAME_FIELDS if support else []) + (_GRIP_FIELDS if stick else [])
     return _in_lines([*more, *_STATE_FIELDS]) if more else STATE
 
@@ -481,7 +472,7 @@ def _with_attributes(dtype: np.dtype[np.void]) -> np.dtype[np.void]:
 
 
 def new_records(dtype: np.dtype[np.void], count: int) -> NDArray[np.void]:
-    """Return records filled with zeros, aligned with cache lines, so that each row of eight numbers is in one line."""
+    """Return records filled with zeros, aligned with cache lines."""
     memory = np.zeros(count * dtype.itemsize + _LINE, np.uint8)
     start = -memory.ctypes.data % _LINE
     return np.ndarray(count, dtype, memory.data, start)

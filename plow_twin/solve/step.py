@@ -1,7 +1,6 @@
-"""A step of the solver. It consists of the choice of the method, the first event, and the change of modes at its end.
+"""A step of the solver: choice of the method, first event, and change of modes at the end.
 
-Steps do not depend on the output times. A step ends at an event, at a knot of the load, or where its series is no
-longer accurate.
+A step ends at an event, at a knot of the load, or where its series is no longer accurate, not at output times.
 """
 
 from __future__ import annotations
@@ -26,19 +25,19 @@ from plow_twin.solve.state import COS, CROSSING, OFF, ON, RELEASED, SIN, SLIPS_F
 from plow_twin.solve.totals import log_event
 from plow_twin.solve.tumbling import turn_at, turn_corners
 
-#: Methods in the order in which a step tries them. `lay_out_step` calls the methods by name, in the same order.
+#: Methods in the order in which `lay_out_step` tries them.
 METHODS: Final[tuple[Method, ...]] = (flight, rest, implicit, taylor)
-#: Longest step in s. This bound ensures that all powers of a step are finite.
+#: Longest step in s, whose powers are finite.
 LONGEST_STEP = 100.0
-#: Size, in sigma (the variable of the series), of the step that ends an endless alternation of modes at one instant.
+#: Size, in sigma, of the step that ends an endless alternation of modes at one instant.
 PAST_AN_INSTANT = 1e-9
-#: Largest relative difference of two times that are treated as equal. It covers a few rounding errors.
+#: Largest relative difference of two times that are treated as equal, a few rounding errors.
 ONE_INSTANT = 1e-15
 
 
 @kernel()
 def _set_load(p, segments, state, w):
-    """Write the load at the start of the step and its slope to `w.wrench`. Return the time until which it is valid."""
+    """Write the load at the start of the step and its slope to `w.wrench`, and return the end of its validity."""
     for j in range(3):
         w.wrench[0, j], w.wrench[1, j] = p.constant[j], 0.0
     if segments is None:
@@ -78,7 +77,7 @@ def lay_out_step(p, parts, state, w, stop_time) -> bool:
     if flight.lay_out(p, parts, flight.own(parts), state, w, span, penetrating) or rest.lay_out(
         p, parts, rest.own(parts), state, w, span, penetrating
     ):
-        # the head does not touch a wall during a flight, and does not leave its walls at rest
+        # no contact changes in flight and at rest
         state.step_size = state.sigma_end
     elif implicit.lay_out(p, parts, implicit.own(parts), state, w, span, penetrating) or taylor.lay_out(
         p, parts, taylor.own(parts), state, w, span, penetrating
@@ -112,7 +111,7 @@ def _end_at_event(p, state, w, span, penetrating, law, stick) -> None:
     sigma, order = state.sigma_end, state.order
     end, pair, target = first_event(p, state, w, order, sigma, penetrating, *law, stick)
     if pair >= 0 and state.events_at_once > p.max_events:
-        # modes alternate at one instant: take a short step with the current modes
+        # if modes alternate at one instant, take a short step with the current modes
         state.recoveries += 1
         end, pair = max(end, min(sigma, PAST_AN_INSTANT)), -1
     turn = turn_at(p, state, w, order, end)
@@ -192,7 +191,7 @@ def _switch(p, state, pair, new, totals, log, fraction, stick) -> None:
                 state.mode[pair] = RELEASED
     if stick is not None and state.mode[pair] == ON and old != ON:
         grasp(p, state, pair, old)
-    # the log does not contain the mode RELEASED, so a RELEASED pair is logged as ON
+    # the log has ON in place of RELEASED
     old, new = ON if old == RELEASED else old, ON if new == RELEASED else new
     if log is not None and old != new:
         log_event(log, totals, state.step_start, pair, old, new, penetration_and_rate(p, state, pair)[1])

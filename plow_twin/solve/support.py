@@ -3,9 +3,8 @@
     m_f u'' = -k_x u - c_x u' - sum F_x      (v likewise)      I_f phi'' = -k_phi phi - c_phi phi' - sum (p x F)
 
 u, v, phi is the frame's displacement in world axes. F is the force of a pair on the head, and p is its point of action
-relative to the frame's centre. The head's equations of motion use its position relative to the ground. Penetrations,
-arms and slip depend on its position relative to the frame. `State.y` is relative to the frame, so that modes, events
-and outputs are computed as for a fixed frame. The series of both bodies are computed together (`solve.method.series`).
+relative to the frame's centre. The head's equations of motion use its position relative to the ground, but `State.y` is
+relative to the frame, so that modes, events and outputs are computed as for a fixed frame.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ FRAME_X, FRAME_Y, FRAME_VX, FRAME_VY, SPIN, SEEN_COS, SEEN_SIN, FRAME_THETA = ra
 
 @kernel()
 def to_ground(y, frame, out) -> None:
-    """Write the head's body coordinates relative to the ground to `out`. y contains them relative to the frame.
+    """Convert the head's body coordinates y relative to the frame to `out` relative to the ground.
 
     `frame` is the state of the frame, shape (6,).
     """
@@ -43,7 +42,7 @@ def to_ground(y, frame, out) -> None:
 
 @kernel()
 def from_ground(y, frame, out) -> None:
-    """Write the head's body coordinates relative to the frame to `out`, which may be y (inverse of `to_ground`)."""
+    """Invert `to_ground`. `out` may be y."""
     theta, spin = y[THETA], frame[5]
     c, s = math.cos(theta), math.sin(theta)
     bx, by = to_body_axes(c, s, frame[0], frame[1])
@@ -67,7 +66,7 @@ def to_world_both(p, y, frame, z) -> None:
 
 @kernel()
 def to_body_both(p, z, y, frame) -> None:
-    """Write the head's body coordinates relative to the frame, and the frame's state (inverse of `to_world_both`)."""
+    """Invert `to_world_both`."""
     head = np.empty(6)
     for j in range(3):
         head[j], head[3 + j] = z[j], z[6 + j]
@@ -78,7 +77,7 @@ def to_body_both(p, z, y, frame) -> None:
 
 @kernel()
 def start_frame(state, w) -> None:
-    """Write the first rows of the series of both bodies: the head's row to `w.moved`, the frame's row to `w.frame`."""
+    """Write the first rows of the series of head and frame to `w.moved` and `w.frame`."""
     frame, here = state.frame, w.frame[0]
     to_ground(state.y, frame, w.moved)
     for j in range(2):
@@ -89,10 +88,7 @@ def start_frame(state, w) -> None:
 
 @kernel(fast=True)
 def see_from_frame(w, order, sigma, y) -> None:
-    """Convert the head's coordinates y at `sigma` from relative to the ground to relative to the frame.
-
-    The state of the frame at `sigma` is written to `w.frame_now`.
-    """
+    """Convert the head's coordinates y at `sigma` to relative to the frame, whose state is written to `w.frame_now`."""
     value = row(w.frame, order)
     for k in range(order - 1, -1, -1):
         value = value * sigma + row(w.frame, k)

@@ -15,9 +15,8 @@ the change of the penetration by a clearance. df and dF are the changes of f and
 contacts' moment with respect to the angle. The coefficients of these equations are series over the step, so each order
 of a column is a sum of Cauchy products. Eight columns are computed in one vector.
 
-At a touch the Kelvin-Voigt force jumps by C d'. The displaced motion touches earlier by the time dd / d'. When the
-undisplaced motion touches, the displaced motion has therefore already received the impulse C dd. At all other changes
-of contact mode the force is continuous.
+At a touch the Kelvin-Voigt force jumps by C d'. The displaced motion touches earlier by the time dd / d', and so
+receives the additional impulse C dd. At all other changes of contact mode the force is continuous.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from plow_twin.solve.step import complete_step, lay_out_series_step
 
 #: Number of columns that are computed in one vector.
 WIDTH: Final = 8
-#: Number of columns that are derivatives with respect to the state. They precede the derivatives by parameters.
+#: Number of derivatives with respect to the state, which precede the derivatives with respect to parameters.
 STATE_COLUMNS: Final = 6
 #: Indices of the components of a column.
 PLACE_X, PLACE_Y, PLACE_THETA, RATE_X, RATE_Y, RATE_THETA = range(6)
@@ -67,7 +66,7 @@ COLUMNS: Final = np.dtype(
     ]
 )
 
-#: Series of one step that all columns share as factors of their Cauchy products. Lanes are state components or pairs.
+#: Series of one step that all columns share as factors of their Cauchy products. Lanes are components or pairs.
 ALONG: Final = np.dtype(
     [
         ("spin", "f8", (_ROWS, PAIR_COUNT)),  # omega in each lane
@@ -201,7 +200,7 @@ def _times(factor, pair, series, k):
 
 @kernel()
 def _change_force(p, state, w, along, columns, pair, k, moved, moved_rate, viscous, hysteretic, curved):
-    """Write and return coefficient k of the change of a pair's force. `moved` is n . xi with the rate `moved_rate`."""
+    """Write and return coefficient k of the change of a pair's force, for n . xi and its rate."""
     depth, rate, force, series = columns.depth[pair], columns.rate[pair], columns.force[pair], columns.series
     changed, changed_rate, by_angle = exact_splat(0.0), exact_splat(0.0), exact_splat(0.0)
     for j in range(k + 1):
@@ -321,7 +320,7 @@ def _second_rate(state, w, pair):
 
 @kernel()
 def _touch(p, state, w, columns, pair, viscous) -> None:
-    """Add the effects of a touch to eight columns: impulse of an earlier touch, and change of the impact speed."""
+    """Add the effects of a touch to eight columns: impulse of the earlier touch, and change of the impact speed."""
     y, now = state.y, columns.now
     c, s, om = y[COS], y[SIN], y[OMEGA]
     arm = row_value(p.arm_rows, pair, c, s, y[X], y[Y])
@@ -349,8 +348,8 @@ def _touch(p, state, w, columns, pair, viscous) -> None:
 def _start_columns(c, s, columns, first) -> None:
     """Begin a stretch: set columns of the state to a displacement of 1, and columns of parameters to 0.
 
-    A stretch is the part of the motion over which derivatives are taken. If a contact continues, the derivatives of its
-    lambda with respect to the parameters are unchanged, because its impact speed is fixed.
+    Derivatives are taken over a stretch of the motion. Those of a continuing contact's lambda are unchanged, because
+    its impact speed is fixed.
     """
     for lane in range(WIDTH):
         column = first + lane
@@ -381,8 +380,7 @@ def _read_columns(c, s, columns, first, out) -> None:
 def _is_clear(p, state, room) -> bool:
     """Return whether a new stretch (`_start_columns`) can begin.
 
-    The gap or penetration of every pair must be at least `room`. No contact may have a damping factor that depends on
-    its impact speed.
+    Every gap or penetration must be at least `room`, and no contact's damping factor may depend on its impact speed.
     """
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
@@ -424,7 +422,7 @@ def follow_columns(
     p, parts, state, w, along, columns, omegas, amplitudes, curved, ends, room, longest_wait, reached, budget, out,
     whole,
 ) -> int:  # fmt: skip
-    """Advance a motion and its columns to each of the times `ends`. If possible, a new stretch begins at each time.
+    """Advance a motion and its columns to each of the times `ends`, at which new stretches begin if possible.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ from plow_twin.solve.state import FIRST, ON, SECOND, SUM
 
 @kernel()
 def _seal(row_of, window) -> None:
-    """Write the sums since the previous publication, `window`, to a row. Reset all sums but the number of touches."""
+    """Write the sums since the previous publication to a row, and reset all but the number of touches."""
     for pair in range(PAIR_COUNT):
         row_of.makes[pair], row_of.impulse[pair] = window.makes[pair], window.impulse[pair]
         row_of.peak[pair], row_of.measured_peak[pair] = window.peak[pair], window.measured_peak[pair]
@@ -35,8 +35,8 @@ def _seal(row_of, window) -> None:
 def publish(rows, stamps, held, taken, windows, waits) -> int:
     """Sum up advances, and write the sums since the previous publication to each row that is published.
 
-    If the advance of a published row failed, its motion and sums are taken from the successful rows since the previous
-    publication. Without such rows, its stamp is set to 0.
+    A published row whose advance failed has the motion of the last successful row since the previous publication, or
+    the stamp 0 without such a row.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def publish(rows, stamps, held, taken, windows, waits) -> int:
     windows : ndarray of `ROW`, shape (1,)
         Sums since the previous publication, and motion of the last successful advance that has not been published.
     waits : int
-        1 if there is a successful advance that has not been published.
+        1 if a successful advance has not been published.
 
     Returns
     -------
@@ -115,7 +115,7 @@ def publish_window(windows, rows) -> None:
 
 @kernel(entry=True)
 def summary(rows, n) -> tuple[int, int, int, int, float, float, float, bool]:
-    """Return the fields of row `n` that every publication needs. One call is faster than access to each field.
+    """Return the fields of row `n` that every publication needs, faster than by access to each field.
 
     Returns
     -------
@@ -139,7 +139,7 @@ def summary(rows, n) -> tuple[int, int, int, int, float, float, float, bool]:
 def _sums(w, order, h) -> None:
     """Write an upper bound of each force over [0, h], and the sums of f_k h^k / (k+1) and f_k h^k / (k+2).
 
-    The bound is the larger end value of the force, plus h^2 / 8 times an upper bound of its downward curvature.
+    The bound is the larger end value plus h^2 / 8 times an upper bound of the downward curvature.
     """
     end = bend = first = second = splat(0.0)
     for k in range(order, -1, -1):
@@ -207,7 +207,7 @@ def add_set_times(totals, carrying, elapsed) -> None:
 
 @kernel()
 def log_event(log, totals, time, pair, mode_from, mode_to, rate) -> None:
-    """Write a change of contact mode to the event log. The caller ensures that the log is not full."""
+    """Write a change of contact mode to the event log, which is not full."""
     event = log[totals.logged]
     event.time, event.pair, event.rate = time, pair, rate
     event.mode_from, event.mode_to = mode_from, mode_to

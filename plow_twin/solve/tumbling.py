@@ -1,11 +1,9 @@
 """Tumbling of a block: its corners are renamed when it turns beyond 45 degrees, and after each further quarter turn.
 
-Up to 45 degrees, the corner with the name bottom left is the lower left corner. Beyond 45 degrees, another corner
-becomes the lower left corner and receives the name bottom left. The state of each pair (mode, damping, anchor) is
-copied to the pair with the same wall and the corner's new name.
-
-A square block looks the same after a quarter turn, so the coefficients of its geometry do not change. The angle whose
-cosine and sine are in the state changes by 90 degrees (`kinematics.named_angle`).
+Beyond 45 degrees, another corner becomes the lower left corner and receives its name. The state of each pair (mode,
+damping, anchor) is copied to the pair with the same wall and the corner's new name. The coefficients of a square
+block's geometry do not change, but the angle whose cosine and sine are in the state changes by 90 degrees
+(`kinematics.named_angle`).
 """
 
 from __future__ import annotations
@@ -20,8 +18,7 @@ from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import COS, OFF, OMEGA, ON, RELEASED, SIN, THETA
 from plow_twin.solve.totals import log_event
 
-#: The two pairs of each wall. The corner of the first pair leads in a counter-clockwise turn, and the corner of the
-#: second pair trails.
+#: The two pairs of each wall, first that of the leading corner in a counter-clockwise turn.
 _HANDED_OVER = tuple(
     (PAIR_NAMES.index(leading), PAIR_NAMES.index(following))
     for leading, following in (
@@ -31,7 +28,7 @@ _HANDED_OVER = tuple(
         ("top_right_right", "bottom_right_right"),
     )
 )
-#: Largest angle [rad] short of 45 degrees at which the corners are renamed. It covers the rounding error of a root.
+#: Largest angle [rad] short of 45 degrees at which the corners are renamed, the rounding error of a root.
 _THERE = 1e-12
 
 
@@ -70,7 +67,7 @@ def turn_corners(p, state, stick, totals, log) -> None:
 
 @kernel()
 def _hand_over(p, state, stick, totals, log, old, new) -> None:
-    """Copy the state of the pair `old` to the pair `new` at the same wall, unless the pair `new` cannot touch."""
+    """Copy the state of the pair `old` to the pair `new` at the same wall, if it can touch."""
     mode = state.mode[old] if p.enabled[new] == 1 else OFF
     if log is not None:
         rate = penetration_and_rate(p, state, old)[1]
@@ -88,7 +85,7 @@ def _hand_over(p, state, stick, totals, log, old, new) -> None:
 
 @kernel()
 def _log(log, totals, time, pair, old, new, rate) -> None:
-    # the log does not contain the mode RELEASED, so a RELEASED pair is logged as ON
+    # the log has ON in place of RELEASED
     old, new = ON if old == RELEASED else old, ON if new == RELEASED else new
     if old != new:
         log_event(log, totals, time, pair, old, new, rate)
