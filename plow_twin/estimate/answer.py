@@ -106,7 +106,7 @@ def forecast_from(scene: Scene, result: Estimate, load: Load, plan: Plan) -> dic
 
 
 def under_load(scene: Scene, result: Estimate, load: Load) -> Scene:
-    """Return the scene under the load of a window times the estimated gains; unchanged for too few load periods."""
+    """Return the scene under the load of a window times the estimated gains, if it has enough load periods."""
     gains = [1.0 if gain is None else gain.mean for gain in (result.gain_fx, result.gain_fy, result.gain_m)]
     felt = load.thinned() if result.load_harmonics is None else result.load_harmonics.added(load.thinned())
     seen = replace(scene, loads=(Table("window", felt.t - felt.t[0], felt.wrench * gains),))

@@ -1,8 +1,8 @@
 """Solution in linear time of the normal equations for the unknowns of the swings and the shared unknowns.
 
 A swing is a part of the measured motion that begins in flight. It is coupled only to its neighbours and to the unknowns
-that all swings share, so the matrix is block tridiagonal with a border. Cholesky's method factorises the block of the
-swings as a band matrix, and its Schur complement for the border.
+that all swings share, so the matrix is block tridiagonal with a border. The block of the swings is factorised as a band
+matrix by Cholesky's method, and the border by its Schur complement.
 
 Reference: Golub and Van Loan, Matrix Computations, ch. 4.3 and 3.2.6.
 """

@@ -45,7 +45,7 @@ _FREEDOM: Final = 4.0
 #: Upper bounds on the number of scales of the likelihood, and on the reweighting iterations for each scale.
 _SCALES, _ROUNDS = 40, 30
 #: Definition of the unknowns: two clearances, three biases (x, y, theta), two coordinates of the lever arm, and the
-#: change of the penetration relative to that with the scene's stiffness.
+#: change of the penetration relative to its value with the scene's stiffness.
 _CLEARANCES, _BIAS, _LEVER, _DEPTH, _SIZE = slice(0, 2), slice(2, 5), slice(5, 7), 7, 8
 
 
@@ -323,7 +323,7 @@ def _flight(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> Ar
 
 
 def _meeting(scene: Scene, inertia: Array, flights: list[Array], room: float) -> Impact | None:
-    """Return the impact between two flights; None if it hit no wall or is more than `room` s away."""
+    """Return the impact between two flights; None if it hit no wall, or if the flights do not meet within `room` s."""
     apart = flights[1] - flights[0]
     change = apart[:, 1]
     t = -float((inertia * apart[:, 0] * change).sum() / (inertia * change * change).sum())

@@ -213,7 +213,7 @@ def _widths(unknowns: Unknowns, q: Array, turns: Array) -> Array:
 def compare(
     forward: Forward, unknowns: Unknowns, poses: Poses, period: float, near: Array | None = None, seed: int = 0
 ) -> Bounced | None:  # fmt: skip
-    """Compare the measured motion with drawn motions. Return None for few drawn motions or a contact that is not hard.
+    """Compare the measured motion with drawn motions. The result is None after few draws or without a hard contact.
 
     By default, the drawn motions have hard contacts. If a vector of unknowns `near` is given, stiffness and damping are
     drawn about its values.
@@ -250,7 +250,7 @@ def compare(
         found = regress_near(like, targets, seen)
         moved = measured[:2] + found.value[:2] - centre
         centre = centre + moved
-        # the last change of a clearance is an error of its convergence
+        # the last change of a clearance shows how far it has converged
         deviation = np.hypot(found.deviation[:2], moved)
         if near is None and len(features) <= tuning.DRAWS[0] and found.distance > tuning.NOT_HARD:
             return None
@@ -340,7 +340,7 @@ def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: A
 
 @dataclass(frozen=True, eq=False)
 class _Spread:
-    """Mean and deviation of the logarithms of penetration and damping of the draws; bounds on the penetration in m."""
+    """Distribution of the draws: logarithms of penetration and damping, with `bounds` on the penetration in m."""
 
     mean: Array
     deviation: Array
@@ -724,7 +724,7 @@ class MotionFeatures:
     def _seen(self, q: Array, white: Array) -> Array:
         """Add noise to a motion so that its estimated noise level equals that of the measurement.
 
-        Bounces raise the estimated noise level, so adding the measured level would be too much.
+        Bounces raise the estimated noise level, so the added noise is smaller than the measured level.
         """
         noise = self.noise
         for _ in range(_NOISE_ROUNDS):
@@ -780,7 +780,7 @@ class MotionFeatures:
         return _reach(self._unknowns, q)
 
     def _by_phase(self, q: Array) -> Array:
-        """Return mean reaches in m, shape (3, 4), over the load phases in which the head rests (the farthest)."""
+        """Return mean reaches in m, shape (3, 4), over the load phases with the farthest reaches, at rest."""
         reach, phase = reaches(self._unknowns.scene, q), self._reach_phase
         count = np.bincount(phase, minlength=tuning.PATH_PHASES + 1)
         known = count > 0

@@ -22,7 +22,7 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Upper bound on the number of grid points, and half width of the grid in prior deviations (6e-5 lies outside).
+#: Upper bound on the number of grid points, and half width of the grid in prior deviations.
 _POINTS, _REACH = 801, 4.0
 #: Bounds on the simulated wear path, on which a clearance grows by `_FURTHER_M` [m] plus `_FURTHER` times the growth in
 #: the history.

@@ -134,8 +134,8 @@ class Feeling:
 def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> tuple[Array, Array]:
     """Return the penetrations in m and the forces in N, shape (n, 8) each, for poses and rates of shape (n, 3).
 
-    `depth`, shape (8,), contains the outward displacement of each pad in m. The scene must state the damping: that of a
-    restitution depends on the speed of each touch.
+    `depth`, shape (8,), contains the outward displacement of each pad in m. The scene must state a damping, not a
+    restitution.
     """
     x, y, vx, vy, omega, c, s, _ = body_states(np.hstack((q, v)), scene.head.com_offset_m).T
     rows = penetration_rows(scene)

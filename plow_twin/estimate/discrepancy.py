@@ -68,8 +68,8 @@ class Graded:
     Attributes
     ----------
     shared, covariance : ndarray, shape (SIZE,), (SIZE, SIZE)
-        The unknowns of the whole window and their covariance, for a machine that differs from the scene only in the
-        quantities of the fit if the fit passes all checks.
+        The unknowns of the whole window and their covariance. If the fit passes all checks, the machine is assumed to
+        differ from the scene only in them.
     clearance, clearance_deviation : ndarray, shape (2,)
         Clearances in m and their standard deviations, for a machine that may differ from the scene in any quantity.
     differs : dict of str to (float, float, float)
@@ -161,7 +161,7 @@ class _Column:
 def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
     """Return the further quantities, and the derivatives, (n, 3, 3), of the measurements with respect to a load.
 
-    A quantity without a prior deviation, or whose change leads to a failed simulation, is left out.
+    A quantity is left out if its prior deviation is zero, or if its change cannot be simulated.
     """
     point = found.point
 
@@ -248,7 +248,7 @@ class _Linearised:
 
     def __init__(self, problem: Problem, found: Fit, columns: dict[str, _Column], pushes: Array) -> None:
         every, waves = columns.values(), 0 if problem.harmonics is None else problem.harmonics.amplitude.size
-        # the harmonics are the last further quantities, in the slice `waves` of the border
+        # the harmonics are the last quantities, in the slice `waves` of the border
         self.names = list(columns)[: len(columns) - waves]
         self.waves = slice(SIZE + len(self.names), SIZE + len(columns))
         self._found, self._swing = found, found.point.swing

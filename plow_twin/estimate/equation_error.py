@@ -1,7 +1,7 @@
 """Estimate of walls and stiffness from the weak form of the equations of motion.
 
-No motion is simulated, so errors of the load do not accumulate. Multiplication by smooth test functions psi and
-integration by parts move the derivatives from the measured poses q to psi:
+No motion is simulated, so errors of the load do not accumulate. The equations are multiplied by smooth test functions
+psi. Integration by parts moves the derivatives from the measured poses q to psi:
 
     integral psi'' q  =  integral psi (load + contact) / M,
     contact = K sum n p (1 + d p'),   integral psi p p' = -1/2 integral psi' p^2,
@@ -202,7 +202,7 @@ class EquationError:
         return found, target - columns @ found
 
     def _weighed(self, values: Array, kernel: Array) -> Array:
-        """Return the integrals (m, ...) of `values`, (n, ...), times a test function or its derivative."""
+        """Return the integrals, (m, ...), of `values`, (n, ...), times the test function or derivative `kernel`."""
         windows = np.lib.stride_tricks.sliding_window_view(values, len(kernel), axis=0)[:: self._apart]
         out: Array = windows @ kernel
         return out

@@ -54,7 +54,7 @@ Array = NDArray[np.float64]
 #: the model; empty without a guess.
 Guess = tuple[float, ...]
 
-#: Upper bound on the length of a window: the longer of load periods and seconds.
+#: Upper bounds on the length of a window, in load periods and in s, of which the longer applies.
 MOST_PERIODS, MOST_SPAN_S = 20.0, 60.0
 #: Upper bound in s on the length of the data in which the period of the load is searched, the longest window of a node.
 _LONGEST_S = 600.0
@@ -121,7 +121,7 @@ def estimate_window(
     found, following = _estimate(units.scene(scene), *its, lost, guess, units.gaps(gaps), units.forces(forces))
     found = units.in_si(found, scene)
     if units.only_time and found.sensor == "ok":
-        # in units of the load's period, the duration of an impact would depend on the period, so repeat with times in s
+        # the duration of an impact does not depend on the load's period, so repeat with times in s
         period = _period(load, poses)
         unknowns = Unknowns.stated(scene, load, poses)
         found = under_uncertain_load(found, unknowns, thinned(load, period)[0], poses, period)
@@ -697,7 +697,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     if beside is not None:
         published = np.maximum(beside.clearance, LEAST_CLEARANCE)
         spread = np.hypot(beside.clearance_deviation, _between_optima(problem, shared))
-    # after a change at an unknown time, the mean over the window differs from the newest clearance by a uniform share
+    # a change at an unknown time: its share in the mean over the window is uniformly distributed
     moved = verdict.changed / math.sqrt(3.0)
     deviation[[GX, GY]] = np.hypot(deviation[[GX, GY]], moved)
     spread = np.hypot(np.hypot(spread, moved), _unseen(fit))
@@ -814,12 +814,12 @@ def _numbers(unknowns: Unknowns, normal: list[Interval]) -> dict[str, Any]:
 
 
 def _plain(problem: Problem, fit: Fit) -> Array:
-    """Return the covariance due to noise and to the uncertainty of the differences in the fit."""
+    """Return the covariance without the misfit: noise, and uncertainty of the differences in the fit."""
     return fit.covariance + of_differences(problem, fit) if problem.differences.any() else fit.covariance
 
 
 def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> Array:
-    """Return the covariance `plain` of the shared unknowns, widened by the misfit and by the step still to be made."""
+    """Return the covariance `plain` of the shared unknowns, widened by the misfit and by the fit's next step."""
     size = len(fit.shared)
     covariance: Array = plain * _widened(problem, fit, verdict) + np.outer(fit.left[:size], fit.left[:size])
     covariance[[GX, GY], [GX, GY]] += _between_optima(problem, fit.shared) ** 2

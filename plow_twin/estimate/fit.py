@@ -390,7 +390,7 @@ class Problem:
     def linearise(self, point: Point) -> Linear:
         """Return the Jacobians of the predicted measurements and of the ends of the swings."""
         rows, ends = np.zeros((len(point.residual), 3, SIZE + OWN)), np.zeros((len(point.defect), 6, SIZE + OWN))
-        # first the derivatives that need the unchanged scene, because only the latest scene is cached
+        # only the latest scene is cached, so the derivatives that need the unchanged scene come first
         displaced = self.steps * _DISPLACED
         together = self._evaluate(point.shared, point.states + np.diag(displaced)[:, None])
         for j in range(6):
@@ -458,7 +458,7 @@ class Problem:
             change = moved[index] - point.shared[index]
             other = self.evaluate(moved, point.states) if abs(change) > 0.5 * step else None
             if other is not None:
-                # residual: measured minus predicted
+                # a residual is measured minus predicted
                 return np.nan_to_num((point.residual - other.residual) / change), (point.defect - other.defect) / change
         return np.zeros_like(point.residual), np.zeros_like(point.defect)
 

@@ -5,9 +5,9 @@ at the start, and anew from each valid estimate. Newly drawn members start at th
 module `members` contains the Kalman filter by which measured poses move the members.
 
 The first member, the median twin, has the median of each parameter and no random noise, so its motion obeys the
-equations of motion. Before the first estimate, the median twin is the nominal twin, and poses move its copy, the second
-member: if the machine had larger clearances, they would press the nominal twin against its walls and falsify its
-forces.
+equations of motion. Before the first estimate, the median twin is the nominal twin. If the machine had larger
+clearances, poses would press the nominal twin against its walls and falsify its forces, so they move only its copy, the
+second member.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ Rows = NDArray[np.void]
 
 #: Default number of members, by definition.
 MEMBERS: Final = 128
-#: Lower bound on the time in s between two poses that are used. More poses add little information.
+#: Lower bound on the time in s between two poses that are used, because more poses add little information.
 APART_S: Final = 4e-3
 #: Lower and upper bound on the number of poses from which the noise is computed.
 _NOISE_ROWS: Final = (20, 400)
@@ -586,7 +586,7 @@ def follower(scene: Scene, follow: str, members: int, tol: float) -> Follower:
 
 
 def _harmonics_from(text: str, start: float | None) -> str:
-    """Return an estimate (JSON) with harmonics whose phases count from `start` [s], or without harmonics for None."""
+    """Return an estimate (JSON) with the harmonics' phases counted from `start` [s], or without harmonics for None."""
     if _HARMONICS not in text:
         return text
     found = json.loads(text)

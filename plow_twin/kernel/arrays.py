@@ -1,7 +1,7 @@
 """Functions by which kernels view, copy, search and check arrays and records.
 
-They compile faster than numba's own code: numba's assignment to a slice alone takes 2 s in each process that compiles a
-twin, because it includes the formatting of an error message.
+They compile faster than numba's own code. For example, numba's assignment to a slice takes 2 s in each process that
+compiles a twin, because it formats an error message.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from numba.extending import intrinsic
 
 from plow_twin.kernel.compiler import kernel
 
-#: Metadata of numba's templates (typing rules of operations) that numba tries before the general templates. The order
-#: saves a fifth of the compile time.
+#: Metadata of templates (numba's typing rules of operations) that numba tries before all general templates, which saves
+#: a fifth of the compile time.
 _FIRST: Final = {"target": "cpu"}
 
 

@@ -147,9 +147,9 @@ def kept(function: Callable[..., Any], **options: Any) -> Any:
 def share(cache_file: Any) -> None:
     """Make numba's disk cache of a function safe for processes that compile at the same time.
 
-    Numba numbers the files of machine code by the index, and writes the index first. Two processes could therefore
-    store the code of one signature under another signature. Here the name of a file is a hash of its content, and the
-    file is written before the index. Of two simultaneous entries in the index, one may be lost and compiled again.
+    Numba numbers the files of machine code, and writes its index before the files, so two processes could store the
+    code of one signature under another signature. Here the name of a file is a hash of its content, and the file is
+    written before the index. If two processes write the index at the same time, one entry is lost and compiled again.
 
     Parameters
     ----------

@@ -8,7 +8,7 @@ import numpy as np
 
 from plow_twin.kernel.compiler import kernel
 
-#: Lower bound in s of the interval between two rows, which is a divisor.
+#: Lower bound in s of the interval between two rows, because it is a divisor.
 _SHORTEST: Final = 1e-6
 
 

@@ -50,7 +50,7 @@ def sum_to_bernstein(b: Array, n: int) -> None:
 
 @kernel(inline="code")
 def _halve(left: Array, right: Array, n: int) -> None:
-    """Halve the interval of the coefficients `left`: its halves are written to `left` and `right`."""
+    """Halve an interval with the coefficients `left`, and write those of its halves to `left` and `right`."""
     for r in range(n + 1):
         right[n - r] = left[n]
         for j in range(n, r, -1):

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 #: Number of components of the state: X, Y, VX, VY, omega, c, s, theta.
 STATE_SIZE = 8
-#: 1 for pairs with a wall normal along x or along y, and 0 for all other pairs, shape (8,) each.
+#: 1 for the pairs with a wall normal along x (and y), 0 for all other pairs, shape (8,) each.
 _ALONG_X, _ALONG_Y = np.abs(NORMAL_X), np.abs(NORMAL_Y)
 
 
@@ -74,7 +74,7 @@ def outline(sides: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
 
 
 def roll(scene: Scene) -> float:
-    """Return the slip of a rounded corner along its wall per angle of the head about the arc's centre [m/rad]."""
+    """Return the slip of a rounded corner along its wall per rotation of the head about the arc's centre [m/rad]."""
     return corner_radius(scene) * (1.0 if scene.head.carries == "corners" else -1.0)
 
 
@@ -202,8 +202,8 @@ def state_of(
 ) -> NDArray[np.float64]:
     """Convert pose and rate of the centre of the cavity or block, shape (3,) each, to the solver's state, shape (8,).
 
-    The state of a head that carries walls is in body coordinates, that of a head that carries corners in world axes. If
-    a block tumbles, c and s belong to the angle modulo quarter turns.
+    A head that carries walls has body coordinates, and a head that carries corners has world axes. If a block tumbles,
+    c and s belong to the angle modulo quarter turns.
     """
     if scene.head.carries == "walls":
         return body_state(q, v, scene.head.com_offset_m)

@@ -77,7 +77,7 @@ def wrench_of(force: tuple[float, float], moment: float, at: tuple[float, float]
 
 
 def load_direction(load: Harmonic | Constant) -> Array:
-    """Return the wrench of a load per unit of its force, or of its moment without a force, shape (3,)."""
+    """Return the wrench of a load per unit of force, shape (3,), or per unit of moment if the force is zero."""
     size = float(np.hypot(*load.force_n)) or abs(load.moment_n_m) or 1.0
     return wrench_of(load.force_n, load.moment_n_m, load.at_m) / size
 

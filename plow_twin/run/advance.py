@@ -138,7 +138,7 @@ class AdvanceSeries(_Rows):
     t = _Column[np.float64]()
 
     def __getitem__(self, index: int) -> Advance:
-        # a view would keep the memory of all rows
+        # a view would keep the memory of all rows alive
         return Advance(self.rows[index].copy())
 
 

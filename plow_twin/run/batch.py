@@ -47,7 +47,7 @@ _NO_MARKS = np.zeros(0, np.int64)
 _LINE = 64
 #: Largest number of values that Python checks faster than numpy.
 _FEW = 32
-#: Terms without effect if their parameters are zero. Compiled code with such a term can run a scene without it.
+#: Terms without effect if their parameters are zero. Code with these terms can run scenes without them.
 _OPTIONAL = ("hysteretic", "wear", "sliding", "running_in", "offset", "free", "slip")
 
 
@@ -391,7 +391,7 @@ class TwinBatch:
             return rows
         before, after, begun = self._states, self._before, list[Future[None]]()
         if any(one.lanes is None or one.lanes.stale for one in self._workers):
-            # as bytes, because numpy would copy a record field by field
+            # numpy copies bytes faster than records
             after.view(np.uint8)[:] = before.view(np.uint8)
         try:
             self._states, self._before = after, before

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """Balance of energy and momentum of a run: integrals of the forces beside changes of the state.
+    """Balance of energy and momentum of a run, which compares integrals of the forces with changes of the state.
 
     Attributes
     ----------

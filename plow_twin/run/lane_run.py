@@ -18,7 +18,7 @@ from plow_twin.solve.state import EVENT, HARMONIC, STATE, TOTALS, Status, Work, 
 
 #: Number of steps of each lane in the first slice.
 _FIRST_SLICE: Final = 256
-#: Number of steps in the loop for one scene when a lane needs another method. A call costs some thirty steps.
+#: Number of steps per call of the loop for one scene. A call costs as much as some thirty steps.
 _OTHER_STEPS: Final = 32
 
 

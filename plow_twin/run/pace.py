@@ -13,7 +13,7 @@ from plow_twin.solve.state import PACE, first_of, new_records
 
 #: Default wall-clock time in s after which a call ends with an error.
 MOST_SECONDS: Final = 3600.0
-#: Number of steps in a slice without and with implicit steps, which take microseconds and up to a millisecond.
+#: Number of steps in a slice without and with implicit steps. An implicit step takes up to a millisecond.
 _SLICE, _SLICE_IMPLICIT = 2048, 64
 
 
@@ -42,7 +42,7 @@ class Pace:
         #: number of failed advances in the last call, shape (1,), as a view of the record
         self.failed = self._records["failed"]
         self.record.slice = _SLICE_IMPLICIT if implicit else _SLICE
-        # a copy of bytes, because numpy copies a record field by field, five times as slowly
+        # numpy copies bytes five times as fast as a record
         self._bytes = self._records.view(np.uint8).data
         self._start = self._bytes.tobytes()
         self.saved = new_records(state_type, 1)
@@ -66,7 +66,7 @@ class Pace:
 
 def check_limits(max_steps: int, max_wall_s: float) -> None:
     """Raise `ArgumentError` if a limit is not valid."""
-    # numba would compile the kernels again for a float
+    # for a float, numba would compile the kernels again
     if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or not max_steps >= 1:
         raise ArgumentError(f"max_steps: got {max_steps!r}, expected an integer >= 1")
     if not max_wall_s > 0.0:

@@ -356,7 +356,7 @@ def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str
 
 
 def _ends(t_end: float) -> Array:
-    """Return the times [s] at which stretches may end, with uneven spacing against alignment with the load's period."""
+    """Return the times [s] at which stretches may end, unevenly spaced so that they do not follow the load's period."""
     ends = np.arange(1, _STRETCHES + 1, dtype=np.float64)
     ends[:-1] += 0.4 * (np.mod(ends[:-1] * 0.5 * (math.sqrt(5.0) - 1.0), 1.0) - 0.5)
     ends *= t_end / _STRETCHES
@@ -386,15 +386,15 @@ def displacement_beside(
     length : float
         Reference length of displacements in m.
     held : bool
-        Whether overdamped contact holds the head, so that a small displacement suffices because it decays slowly.
+        Whether overdamped contact holds the head. Displacements then decay slowly, so a small displacement suffices.
     reads_speed : bool
         Whether the damping of a contact depends on the speed at first touch.
 
     Returns
     -------
     float or None
-        Displacement, or None if no stretch can begin: a pair is too close to its wall (`_CLEAR_OF_WALLS`), or in
-        contact with `reads_speed`.
+        Displacement, or None if no stretch can begin, because a pair is too close to its wall (`_CLEAR_OF_WALLS`), or
+        because a pair is in contact and `reads_speed` is True.
     """
     if reads_speed and bool((penetration > 0.0).any()):
         return None

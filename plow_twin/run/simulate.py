@@ -278,7 +278,7 @@ _ready: set[tuple[object, ...]] = set()
 
 
 def _make_ready(compiled: CompiledScene, energy_balance: bool, method: Method, dt: float | None) -> float:
-    """Compile or load the kernels by a run of length 0, and return the time in s, or 0 if they are loaded already."""
+    """Compile or load the kernels by a run of length 0. Return the time in s, which is 0 for loaded kernels."""
     parts = compiled.parts
     loads = parts.harmonics is None, parts.segments is None, None if parts.implicit is None else parts.implicit.dtype
     kind = parts.terms, *loads, options(compiled.scene), method == "events", energy_balance

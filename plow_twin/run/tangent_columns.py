@@ -21,7 +21,7 @@ _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "f
 def fits_tangents(compiled: CompiledScene) -> bool:
     """Return whether the linearised equations support all terms of a scene. Exponents must be integers or 1.5.
 
-    A law with a restitution is supported although it needs implicit steps for slow touches.
+    A law with a restitution is supported, although slow touches under it need implicit steps.
     """
     terms, contact = compiled.parts.terms, compiled.scene.contact
     there = {name for name, term in zip(Terms._fields, terms, strict=True) if term is not None}

@@ -31,9 +31,9 @@ from plow_twin.solve.state import Status
 
 Array = NDArray[np.float64]
 
-#: `_STRETCH_S`: length of a stretch in s. `_FAR`: growth of a shadow's distance from the twin that ends a stretch.
+#: `_STRETCH_S`: length of a stretch in s. `_FAR`: growth factor of a shadow's displacement at which a stretch ends.
 _STRETCH_S, _FAR = 0.1, 100.0
-#: Longest stretch in s, if a contact prevents the start of the next stretch.
+#: Longest stretch in s. A stretch continues while a contact prevents the start of the next stretch.
 _LONGEST_S = 0.5
 
 
