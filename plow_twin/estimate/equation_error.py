@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 
 #: Index of the wall of each pair, in the order right, left, top, bottom by definition.
 _WALL: Final = np.argmax(np.stack(WALLS), axis=0)
-#: Gauss-Newton iteration: upper bound on the number of steps, size in m of the last step, largest size in m of a step.
+#: Gauss-Newton iteration: upper bound on the number of steps, size in m of a step that ends it, largest step in m.
 _STEPS, _SMALL, _LONGEST = 8, 2e-5, 3e-3
 #: Lower bounds on the interval between rows in s, and on the number of rows in half of a test function.
 _SHORTEST, _FEWEST = 5e-3, 3

@@ -25,8 +25,8 @@ Array = NDArray[np.float64]
 
 #: Upper bound on the number of rows, about 200 per second in a window of ten load periods.
 _MOST_ROWS = 6000
-#: Gauss-Newton iteration: upper bound on the number of steps, number of first steps with random probes of the
-#: predictability, number of probes in each, and reduction of the cost (within the noise) by the last step.
+#: Gauss-Newton iteration: upper bound on the number of steps, number of steps with random probes of the predictability,
+#: number of these probes, and smallest reduction of the cost for a further step.
 _ROUNDS, _DRAWN_ROUNDS, _PROBES, _ENOUGH = 8, 3, 3, 0.5
 #: Steps of the two-sided difference quotients with respect to the delay in s and to a starting state. With the larger
 #: one-sided steps of the fit of the poses, clearances were wrong by 4 standard deviations.

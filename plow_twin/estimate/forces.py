@@ -240,7 +240,7 @@ def loads_of(t: Array, wrench: Array, gain: Array, harmonics: Harmonics | None, 
 
 
 def _normal(value: Interval, white: Array) -> Array:
-    """Convert standard normal numbers to numbers with the 5 % and 95 % quantiles of an interval."""
+    """Convert standard normal numbers `white` to numbers with the 5 % and 95 % quantiles of an interval."""
     below, above = (value.mean - value.p05) / NORMAL_P95, (value.p95 - value.mean) / NORMAL_P95
     return value.mean + np.where(white < 0.0, below, above) * white
 

@@ -263,7 +263,7 @@ def _exposure_at(exposure: Array, clearance: Array, limit: Array) -> Array:
 
 
 def with_load(scene: Scene, multiple: float) -> Scene:
-    """Return the scene with all loads, but not gravity, multiplied by `multiple`."""
+    """Return the scene with all loads except gravity multiplied by `multiple`."""
 
     def times(values: tuple[float, float]) -> tuple[float, float]:
         return multiple * values[0], multiple * values[1]

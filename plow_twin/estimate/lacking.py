@@ -67,7 +67,7 @@ def _alternated(
         step, covariance, states = whole_step(problem, found, columns, precision, -value * precision)
         (shared, change), covariance = np.split(step, [SIZE]), covariance[SIZE:, SIZE:]
         size = float(change @ np.linalg.solve(covariance, change))
-        # `discrepancy.graded` makes a last linearised step
+        # a change within the noise is left to the linearised step of `discrepancy.graded`
         if in_vain == _IN_VAIN or (index and size < tuning.SETTLED * len(COMPONENTS)):
             break
         harmonics = harmonics.moved(np.clip(change, -tuning.LACKING, tuning.LACKING), np.diag(covariance))

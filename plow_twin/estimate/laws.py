@@ -20,11 +20,11 @@ Array = NDArray[np.float64]
 
 #: Smallest variance of a feature, a guard against division by zero.
 _LEAST = 1e-9
-#: Definition of the polynomial: indices of penetration and damping, with terms up to the third degree, and of the
-#: clearances, with products with penetration and damping.
+#: Definition of the polynomial. It has terms up to the third degree in the parameters `_CURVED` (penetration, damping),
+#: and their products with the parameters `_CHANGING` (clearances).
 _CURVED, _CHANGING = (0, 1), (5, 6)
 #: Levenberg-Marquardt search for the most likely parameters: upper bound on the number of steps, damping of the first
-#: step, gain of the likelihood by the last step, and step of the difference quotients.
+#: step, smallest gain for a further step, and step of the difference quotients.
 _STEPS, _DAMPED, _ENOUGH, _SMALL = 30, 1e-2, 1e-2, 1e-4
 
 

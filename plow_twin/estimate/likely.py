@@ -1,9 +1,9 @@
 """Clearances of largest likelihood, given the measured path (the mean pose at each phase of the load).
 
 The features of simulated motions, including the path, are modelled as a quadratic function of the parameters plus
-normal noise (synthetic likelihood: Wood, Nature 466 (2010) 1102). The clearances of largest likelihood replace the path
-as features of a regression, because the path has more numbers than there are motions (semi-automatic approximate
-Bayesian computation: Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012) 419).
+normal noise (synthetic likelihood: Wood, Nature 466 (2010) 1102). The path has more numbers than there are motions, so
+a regression uses the clearances of largest likelihood instead (semi-automatic approximate Bayesian computation:
+Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012) 419).
 """
 
 from __future__ import annotations

@@ -220,7 +220,7 @@ class Load:
         return float(np.median(np.diff(self.t)))
 
     def gain_deviations(self) -> Array:
-        """Return the stated deviations divided by the root mean square of each component (0 for 0), shape (3,)."""
+        """Return the stated deviations divided by the root mean square of each component, shape (3,)."""
         size = np.sqrt((self.wrench**2).mean(axis=0))
         shares: Array = np.divide(self.deviation, size, out=np.zeros(3), where=size > 0.0)
         return shares
@@ -350,7 +350,7 @@ class Load:
     def averaged(self, count: int) -> Load:
         """Return the least-squares fit of a piecewise linear load with `count` equidistant knots.
 
-        The rest of the load has a mean of zero over several knots, so it hardly moves the head.
+        The difference from the load has a mean of zero over several knots, so it hardly moves the head.
         """
         knots = np.linspace(self.t[0], self.t[-1], count)
         within = max(_FINER, math.ceil(2.0 * len(self.t) / count))
@@ -448,8 +448,7 @@ def usable_rows(
     """Return stamps (n,) and rows (n, 8) in order of time, and the number of rows that are left out.
 
     A row is left out if its stamp is not finite or repeated, if it contains no number, or if a number exceeds
-    `largest`. For arrays of the wrong shape, an `error` is raised, whose message contains `names`: those of a set of
-    rows and of a number.
+    `largest`. For arrays of the wrong shape, an exception of the type `error` with the texts `names` is raised.
     """
     times, rows = np.asarray(t, dtype=np.float64), np.array(values, dtype=np.float64)
     if times.ndim != 1 or rows.shape != (len(times), PAIR_COUNT):

@@ -181,7 +181,7 @@ class Ensemble:
         self._newest = whole[:, -1]
 
     def settle(self) -> None:
-        """Copy rates, wear and penetration from the newest rows, before they are used."""
+        """Copy rates, wear and penetration from the newest rows. Call this before their use."""
         rows, self._newest = self._newest, None
         if rows is not None:
             self._v, self.worn, self._depth = rows["v"].copy(), rows["wear_depth"].copy(), rows["penetration"].copy()
@@ -230,7 +230,7 @@ class Ensemble:
     def clearance(self) -> Array:
         """Return the clearances of unworn pads in m, shape (2, 3): value, 5 % and 95 % quantile.
 
-        Members are weighted by the likelihood of the measured poses, tempered until enough members have a weight.
+        Members are weighted by the likelihood of the measured poses, which is tempered so that enough members count.
         """
         use = self._used()
         excess = np.clip(self.square - self.square[use].min(), 0.0, 1e9)
@@ -346,7 +346,7 @@ class Ensemble:
         if self._learner is not None:
             self._learner.add(self._numbers[use], seen[use], center, noise[there])
         off = _off(q, then, there)
-        # limited influence of a single wrong pose
+        # limit the influence of a single wrong pose
         most = tuning.OUTLYING * noise[there]
         self.square += ((off.clip(-most, most) / noise[there]) ** 2).sum(axis=1)
         weight = np.linalg.solve(scatter, seen[use].T @ about[use] / freedom)

@@ -1,9 +1,9 @@
 """Estimate of the differences from the model, and of the clearances between facing pads.
 
 The two pads of a wall may be worn differently, which rotates the wall. The sensor may have a lever arm and a low pass.
-These *differences* from the model are estimated in one linearised step from a fit, or as unknowns of the fit if it
-fails a check without them. Poses do not determine how a clearance is divided between the two sides of the head, because
-a bias of the sensor has the same effect.
+These *differences* from the model are estimated in one linearised step from a fit, or as unknowns of the fit if the fit
+fails a check without them. Poses do not determine the division of a clearance between the two sides of the head,
+because a bias of the sensor has the same effect.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from plow_twin.estimate.unknowns import GX, GY, SIZE
 
 Array = NDArray[np.float64]
 
-#: Definition of the clearance of each group of facing pads: index of the axis whose clearance is a term, and factors of
-#: the rotations of the left, right, top and bottom wall in the other terms.
+#: Definition of the clearance of each group of facing pads: the clearance of an axis, plus the rotations of the left,
+#: right, top and bottom wall times these factors.
 _MADE_OF: Final = {
     "horizontal_top": (GX, np.array([0.5, 0.5, 0.0, 0.0])),
     "horizontal_bottom": (GX, np.array([-0.5, -0.5, 0.0, 0.0])),
@@ -75,7 +75,7 @@ def with_differences(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None
         differences[LAG] = max(differences[LAG], 0.0)
         change = differences - problem.differences
         size = float(change @ np.linalg.solve(covariance[SIZE:, SIZE:], change))
-        # `discrepancy.graded` makes a last linearised step
+        # a change within the noise is left to the linearised step of `discrepancy.graded`
         if index and size < tuning.SETTLED:
             break
         problem = Problem(

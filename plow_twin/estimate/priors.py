@@ -14,8 +14,8 @@ from plow_twin.model.scene import Mark, Scene
 #: - frame: a drawing gives the sides up to a tolerance, and it does not show the rounding of the corners
 #: - exponent, friction: the contact law is idealised, and friction is seldom documented
 #:
-#: The deviations of clearance and frame are in m, those of stiffness and damping are of the logarithm, that of a
-#: restitution is of the logit, and those of mass and inertia are relative.
+#: The deviations of clearance and frame are in m, the deviations of mass and inertia are relative. For stiffness and
+#: damping they apply to the logarithm, for a restitution to the logit.
 DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
     "clearance": {Mark.GIVEN: 8e-3, Mark.MEASURED: 2e-3, Mark.RECONSTRUCTED: 8e-3, Mark.ASSUMED: 8e-3},
     "stiffness": {Mark.GIVEN: 2.5, Mark.MEASURED: 0.5, Mark.RECONSTRUCTED: 2.5, Mark.ASSUMED: 2.5},
@@ -28,7 +28,7 @@ DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
 }
 #: Scale in m of the half-normal prior of the corner radius if the scene states no radius.
 ROUNDING: Final = 3e-3
-#: Prior standard deviations of a sensor's scale factors of x, y and theta. An angle is often computed from distances.
+#: Prior standard deviations of a sensor's scale factors of x, y and theta.
 SCALES: Final = (5e-3, 5e-3, 1e-2)
 #: Prior standard deviations of a sensor's bias of x, y [m] and theta [rad].
 BIAS: Final = (5e-3, 5e-3, 0.02)

@@ -1,7 +1,7 @@
 """Search for the best fit in several stages.
 
-From stage to stage, the *horizon* grows and the number of candidates decreases. The horizon is the part at the
-beginning of each swing (a part of the motion that begins in flight) that is fitted.
+A swing is a part of the motion that begins in flight. From stage to stage, a longer part of each swing (the *horizon*)
+is fitted, and the number of candidates decreases.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Models of a sensor with a lever arm, and of a sensor with a low pass.
 
 A sensor with a lever arm measures a point away from the centre of the head. A first-order low pass y of the pose u
-obeys tau dy/dt = u - y. Its mean delay tau is part of the delay of the stamps, and the remaining difference is tau^2 /
-2 times the acceleration for a small tau.
+obeys tau dy/dt = u - y. Its mean delay tau is part of the delay of the stamps. For a small tau, the remaining
+difference is tau^2 / 2 times the acceleration.
 """
 
 from __future__ import annotations

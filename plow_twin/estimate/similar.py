@@ -105,7 +105,7 @@ class Units:
         return Poses(poses.t / self.time, poses.q / length, deviation)
 
     def gaps(self, gaps: Gaps | None) -> Gaps | None:
-        """Return gaps in these units. The default of their error is the same in m for any machine."""
+        """Return gaps in these units. The default error of a gap sensor in m is the same for any machine."""
         if gaps is None:
             return None
         return Gaps(gaps.t / self.time, gaps.gap / self.length, (gaps.deviation or tuning.CONSTANT_ERROR) / self.length)

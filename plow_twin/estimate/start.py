@@ -147,9 +147,9 @@ def first_vectors(problem: Problem, most: int) -> list[Array]:
 
 
 def _matched(problem: Problem, vector: Array, measured: Array) -> list[tuple[float, Array]]:
-    """Return the loss, and `vector` with clearances adjusted to the range of motion `measured` in m, as one item.
+    """Return the loss, and `vector` with clearances adjusted to the range of motion `measured` in m.
 
-    The result is empty if the motion cannot be simulated.
+    The result is a list of one item, or empty if the motion cannot be simulated.
     """
     poses, unknowns = problem.window.poses, problem.unknowns
     found = []

@@ -1,7 +1,7 @@
 """All numbers of the estimator that were chosen and not derived, with the data on which each choice is based.
 
 Other modules read a number as `tuning.NAME`, so that `benchmark/tuning_sensitivity.py` can vary it (results in
-`benchmark/results/tuning.md`). Seeds are those of `benchmark/estimate.py`. A penetration is that under the reference
+`benchmark/results/tuning.md`). Seeds are those of `benchmark/estimate.py`. Penetrations are given for the reference
 force of 100 kN.
 """
 

@@ -5,9 +5,9 @@ regression over the simulated motions near the measured motion corrects the resu
 the range of motion if theta was not measured (approximate Bayesian computation with local-linear adjustment, as in the
 module `bouncing`).
 
-If the load was not measured, the load of each draw would cause the measured motion between the drawn walls, averaged
-over a time longer than an impact. With this load, only the true walls give the measured impacts. The sensor's biases of
-x and y are assumed to be zero.
+If the load was not measured, each draw has the load that would cause the measured motion between the drawn walls,
+averaged over a time longer than an impact. With this load, only the true walls give the measured impacts. The sensor's
+biases of x and y are assumed to be zero.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ def compare_under_uncertain_load(
         return None, work
     share, least = by.unexplained
     unexplained = np.hypot(share * value[:2], least)
-    # the last change of a clearance is an error of its convergence
+    # the last change of a clearance shows how far it has converged
     moved = spread.centre - before
     return Compared(
         spread.centre,

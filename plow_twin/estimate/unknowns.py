@@ -56,9 +56,9 @@ class Quantity:
     probe: float = 0.0
 
 
-#: The estimated quantities with their prior deviations, in the order of a vector of unknowns, which contains the
-#: softness psi, and the logarithm of the damping or the logit of the restitution. First come the quantities with a
-#: `step`, which change the motion of the head. All other quantities change only the measurement.
+#: The estimated quantities with their prior deviations, in the order of a vector of unknowns. The vector contains the
+#: softness psi, and the logarithm of the damping or the logit of the restitution. Quantities with a `step` change the
+#: motion of the head, all other quantities only the measurement.
 QUANTITIES: Final = (
     Quantity("horizontal", "horizontal clearance [mm]", 1e3, ".3f", 8e-3, (1, 0, 0), 2e-4, 1e-5, 5e-5),
     Quantity("vertical", "vertical clearance [mm]", 1e3, ".3f", 8e-3, (1, 0, 0), 2e-4, 1e-5, 5e-5),
@@ -172,7 +172,7 @@ class Unknowns:
         return vector
 
     def deviations(self) -> Array:
-        """Return the prior standard deviations, shape (SIZE,), practically zero for a damping that the law lacks."""
+        """Return the prior standard deviations, shape (SIZE,). Without damping, its deviation is practically zero."""
         deviations = self.deviation.copy()
         if not self.damped:
             deviations[DAMPING] = 1e-6

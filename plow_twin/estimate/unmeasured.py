@@ -1,7 +1,7 @@
 """Fit of poses in which one or two components were never measured.
 
-Without a component, the range of motion gives no starting point for the clearances. In a soft contact, the load alone
-determines the motion after some periods. The fit has these steps:
+If a component is missing, the range of motion gives no starting point for the clearances. In a soft contact, the load
+alone determines the motion after some periods. The fit has these steps:
 
 1. Vectors of unknowns are drawn from the prior, and their motions are compared with the measured components.
 2. Levenberg-Marquardt steps improve the vectors with the nearest motions.
@@ -205,7 +205,7 @@ def _starts(whole: _Whole, rows: int, rng: np.random.Generator) -> list[Array]:
 
 
 def _like_measured(whole: _Whole) -> Array:
-    """Return the noise of all components in m, m, rad, for missing components the mean of the measured ones."""
+    """Return the noise of all components in m, m, rad. Missing components have the mean noise of the others."""
     arm = geometry.half_diagonal(whole.unknowns.scene)
     level = float((whole.noise * [1.0, 1.0, arm])[whole.measured].mean())
     return level * np.array([1.0, 1.0, 1.0 / arm])

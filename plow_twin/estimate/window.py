@@ -2,8 +2,8 @@
 
 Each window ends at a multiple of the interval between windows. It is formed as soon as a load sample arrives with a
 stamp later than its end plus the waiting time for late data. The order of arrival within the waiting time has no
-effect, so a replay of the journal gives the same windows as the live node. After half of a window's length without a
-load, poses form windows without a load.
+effect, so a replay of the journal gives the same windows as the live node. If no load arrives for half of a window's
+length, windows are formed from poses alone.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ class Windows:
     gaps : float
         Standard deviation of a gap sensor in m.
     early : bool
-        Whether shorter windows are formed at the beginning, from the share `tuning.WINDOW_SHARES[1]` of the full length
-        on and with at least the share `tuning.NEW_MOTION` of new motion.
+        Whether shorter windows are formed at the beginning, the first with the share `tuning.WINDOW_SHARES[1]` of the
+        full length, each with at least the share `tuning.NEW_MOTION` of new motion.
     """
 
     def __init__(

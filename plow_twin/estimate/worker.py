@@ -258,7 +258,7 @@ def _request_short_slices() -> None:
 
 
 def main() -> None:
-    """Run the far side, for a descriptor of the pipe and names of modules with contact laws in `sys.argv`."""
+    """Run the far side. `sys.argv` contains the pipe's descriptor and the names of modules with contact laws."""
     # Ctrl-C sends SIGINT to the whole process group, but only the near side ends the far side
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
