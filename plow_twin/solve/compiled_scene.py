@@ -157,14 +157,14 @@ def _check_tolerance(tol: float) -> None:
 
 
 class _Shared:
-    """Cache of the `most` newest results by the objects on which they depend."""
+    """Cache of the `most` newest results, by the identity of the objects on which they depend."""
 
     def __init__(self, most: float = math.inf) -> None:
         self._most = most
         self._known: OrderedDict[tuple[Any, ...], tuple[Any, Any]] = OrderedDict()
 
     def of(self, compute: Callable[..., _Found], *sources: object, given: tuple[Any, ...] | None = None) -> _Found:
-        """Return compute(*sources), or compute(*given) for a `given` that the sources determine."""
+        """Return compute(*sources), or compute(*given). The sources must determine `given`."""
         key = (compute, *map(id, sources))
         known = self._known.get(key)
         if known is None:
@@ -257,7 +257,7 @@ def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Desc
         given=(scene, sampled, shared),
     )  # fmt: skip
     length, radius = geometry.length_scale(scene), unchanged["radius"]
-    # speed under the largest load after half the length scale
+    # speed after half the length scale under the largest load
     speed = max(math.sqrt(length * acceleration), start_speed, 1e-3 * length)
     admissible = min(tol * (STEP_SHARE if terms.fraction is None else STEP_SHARE_FRACTION), LARGEST_STEP_ERROR)
     order = order_for(admissible)
@@ -494,7 +494,7 @@ def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
     impulse = share * tol * speed * scene.head.mass_kg
     release = float((impulse * (exponent + 1.0) * speed / scene.contact.stiffness) ** (1.0 / (exponent + 1.0)))
     if not float(exponent).is_integer():
-        # the series of the power of a smaller depth would have non-finite terms
+        # the series of d^n would have non-finite terms at a smaller depth
         release = max(release, _NOISE * geometry.half_diagonal(scene))
     friction = scene.friction
     if friction is not None and friction.stick_stiffness_n_m is not None and friction.coefficient > 0.0:

@@ -1,4 +1,4 @@
-"""Energy balance of a run: work and impulse of the forces beside changes of energy and momentum.
+"""Energy balance of a run, which compares changes of energy and momentum with work and impulse of the forces.
 
 The forces are computed at single instants, independently of the series, by `model.contact` and `model.friction`. They
 and their powers are integrated by Gauss-Legendre quadrature over each step of the series, or by the trapezoidal rule

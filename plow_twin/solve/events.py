@@ -268,7 +268,7 @@ def first_event(p, state, w, order, sigma, penetrating, viscous, hysteretic, int
             for k in range(order + 1):
                 column[k], w.halves[0, k] = w.guard[k, pair], w.bernstein[k, pair]
             if _stays(column, order, best):
-                # it cannot become negative before the event that has already been found
+                # it cannot become negative before the event at `best`
                 continue
             state.guard_roots += 1
             root = first_root_within(column, order, sigma, w)

@@ -152,7 +152,7 @@ def integrate_fixed(
         if not within_range(p, state, y):
             return _RANGE
         if n % stride == 0 or n == steps:
-            # rounded up for the last row, which may follow earlier
+            # rounded up, because the last row may follow after fewer steps
             row = (n + stride - 1) // stride
             pose_of(p, y, parts.terms.offset, q[row], v[row])
             if frame is not None:

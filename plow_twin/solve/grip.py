@@ -89,8 +89,8 @@ def _normal_force(p, state, pair, depth):
 def grasp(p, state, pair, old) -> None:
     """Make the corner of a pair that begins to push stick with a relaxed spring, or slip if |T| exceeds mu_s N.
 
-    Against rounding of the depth, N depends on the previous mode `old`: it is the force at depth 0 at a touch, and 0
-    for a CLIPPED pair.
+    N depends on the previous mode `old`, not on a rounded depth: it is the force at depth 0 after a touch, and 0 for a
+    CLIPPED pair.
     """
     place, rate = _along(p, pair, state.y)
     depth = 0.0 if old == OFF else penetration_of(p, state, pair, state.y)
@@ -170,7 +170,7 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         # a pair with mode ON can be slightly outside its wall, because of the error of its touch time
         g[0] = p.static_friction * max(force[0, pair], 0.0) - sign * drag[0, pair]
         size, noise = p.static_friction * abs(force[0, pair]) + abs(drag[0, pair]), 0.0
-        # without the rounding error of T, a corner could slip as soon as it sticks
+        # an allowance for the rounding error of T, so that a corner does not slip as soon as it sticks
         late = _FINEST * (p.stick_stiffness * p.leverage + p.stick_damping * p.threshold[0])
     else:
         for k in range(order - 1):

@@ -51,7 +51,7 @@ def _next(p, parts, state, w, stop_time, budget) -> int:
 
 @kernel()
 def _present(p, harmonics, flight, support, state, w, y) -> None:
-    """Write the body coordinates at the current time, which may be within a step, to y, and a frame's state to `w`."""
+    """Write body coordinates and the frame's state at the current time, even within a step, to y and `w`."""
     if state.step_size >= 0.0:
         evaluate(p, harmonics, flight, support, state, w, sigma_at(state, state.elapsed), y)
     else:
@@ -74,7 +74,7 @@ def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
         if code != _OK:
             return code
         low = sigma_at(state, state.elapsed)
-        # rounding can place the stop time slightly beyond the end of the step
+        # by rounding, the stop time can be slightly beyond the end of the step
         stopped = state.ends_at_stop == 1 and target >= state.stop_time
         if target < t0 + state.step_size and not stopped:
             if totals is not None:

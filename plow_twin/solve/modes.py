@@ -231,7 +231,7 @@ def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
 
 @kernel(inline="source")
 def slow_touch(p) -> float:
-    """Return the speed in m/s below which a touch alone does not lead to the release penetration."""
+    """Return the speed in m/s below which a touch does not lead to the release penetration by its speed alone."""
     acceleration = p.threshold[0] * p.weight / p.radius
     return SHALLOW * math.sqrt(2.0 * acceleration * p.release)
 

@@ -1,4 +1,4 @@
-"""Factors by in-plane sliding and by running-in on a pad's wear by force and travel.
+"""Factors of a pad's wear due to in-plane sliding and running-in.
 
     dh/dt = (k_s v / A) F sqrt(1 + (s' / v)^2) (1 + a exp(-h / h0))
 

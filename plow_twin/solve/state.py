@@ -29,8 +29,8 @@ ACTS, DAMPS, BASE, SIGN, RATIO, SUM, FIRST, SECOND, RAMPS = range(9)
 OFF: Final = 0
 ON: Final = 1
 CLIPPED: Final = 2
-#: Mode of a pair whose force is negligible, because its penetration is less than `Params.release`, for exponents that
-#: are not integers.
+#: Mode of a pair with a penetration below `Params.release`, whose force is negligible. Only exponents that are not
+#: integers need it.
 RELEASED: Final = 3
 #: Code of the event at which a penetration crosses the end of the damping ramp, without a change of mode.
 CROSSING: Final = 4
@@ -243,8 +243,8 @@ _GRIP_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("anchor", "f8", (PAIR_COUNT,)),  # position along the wall in m at which the spring of a sticking corner is relaxed
     ("grip", "i8", (PAIR_COUNT,)),  # 0 for stick, 1 for slip forward, -1 for slip backward
 ]
-#: Additional state of a frame on springs, to which `State.y` is then relative: displacements x, y, theta from
-#: equilibrium, and their rates.
+#: Additional state of a frame on springs: displacements x, y, theta from equilibrium, and their rates. With this field,
+#: `State.y` is relative to the frame.
 _FRAME_FIELDS: Final[list[tuple[Any, ...]]] = [("frame", "f8", (6,))]
 
 #: Scratch space, mainly for the series of one step: a row for each order, and a column for each component of the state
@@ -449,7 +449,7 @@ def state_type(terms: Terms) -> np.dtype[np.void]:
 
 @cache
 def _state_type(stick: bool, support: bool) -> np.dtype[np.void]:
-    # additional fields come first, because numba would confuse the record with the record without them
+    # additional fields come first; if they came last, numba would confuse the record with the record without them
     more = (_FRAME_FIELDS if support else []) + (_GRIP_FIELDS if stick else [])
     return _in_lines([*more, *_STATE_FIELDS]) if more else STATE
 

@@ -37,7 +37,7 @@ ONE_INSTANT = 1e-15
 
 @kernel()
 def _set_load(p, segments, state, w):
-    """Write the load at the start of the step and its slope to `w.wrench`, and return the end of its validity."""
+    """Write the load at the start of the step and its slope to `w.wrench`. Return the time until which it is valid."""
     for j in range(3):
         w.wrench[0, j], w.wrench[1, j] = p.constant[j], 0.0
     if segments is None:
@@ -77,7 +77,7 @@ def lay_out_step(p, parts, state, w, stop_time) -> bool:
     if flight.lay_out(p, parts, flight.own(parts), state, w, span, penetrating) or rest.lay_out(
         p, parts, rest.own(parts), state, w, span, penetrating
     ):
-        # no contact changes in flight and at rest
+        # contacts do not change in flight and at rest
         state.step_size = state.sigma_end
     elif implicit.lay_out(p, parts, implicit.own(parts), state, w, span, penetrating) or taylor.lay_out(
         p, parts, taylor.own(parts), state, w, span, penetrating

@@ -26,7 +26,7 @@ FRAME_X, FRAME_Y, FRAME_VX, FRAME_VY, SPIN, SEEN_COS, SEEN_SIN, FRAME_THETA = ra
 
 @kernel()
 def to_ground(y, frame, out) -> None:
-    """Convert the head's body coordinates y relative to the frame to `out` relative to the ground.
+    """Convert the head's body coordinates y from relative to the frame to relative to the ground (`out`).
 
     `frame` is the state of the frame, shape (6,).
     """
@@ -88,7 +88,7 @@ def start_frame(state, w) -> None:
 
 @kernel(fast=True)
 def see_from_frame(w, order, sigma, y) -> None:
-    """Convert the head's coordinates y at `sigma` to relative to the frame, whose state is written to `w.frame_now`."""
+    """Make the head's coordinates y at `sigma` relative to the frame, and write the frame's state to `w.frame_now`."""
     value = row(w.frame, order)
     for k in range(order - 1, -1, -1):
         value = value * sigma + row(w.frame, k)

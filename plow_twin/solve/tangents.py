@@ -348,8 +348,8 @@ def _touch(p, state, w, columns, pair, viscous) -> None:
 def _start_columns(c, s, columns, first) -> None:
     """Begin a stretch: set columns of the state to a displacement of 1, and columns of parameters to 0.
 
-    Derivatives are taken over a stretch of the motion. Those of a continuing contact's lambda are unchanged, because
-    its impact speed is fixed.
+    A stretch is the part of the motion over which derivatives are taken. The derivatives of a continuing contact's
+    lambda do not change, because its impact speed is fixed.
     """
     for lane in range(WIDTH):
         column = first + lane

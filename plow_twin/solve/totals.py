@@ -207,7 +207,7 @@ def add_set_times(totals, carrying, elapsed) -> None:
 
 @kernel()
 def log_event(log, totals, time, pair, mode_from, mode_to, rate) -> None:
-    """Write a change of contact mode to the event log, which is not full."""
+    """Write a change of contact mode to the event log, which must not be full."""
     event = log[totals.logged]
     event.time, event.pair, event.rate = time, pair, rate
     event.mode_from, event.mode_to = mode_from, mode_to

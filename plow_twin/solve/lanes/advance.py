@@ -51,7 +51,7 @@ from plow_twin.solve.method.rest import slow_enough
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, Status, X, Y
 from plow_twin.solve.step import LONGEST_STEP
 
-#: Number of steps under constant load after which a lane is checked for rest. The check costs as many steps.
+#: Number of steps under constant load after which a lane is checked for rest. The check costs as much as these steps.
 _MAY_REST: Final = 32
 #: Size of a term that is treated as zero, divided by the admissible size of the term of the last order
 #: (`method.series`).
@@ -287,7 +287,7 @@ def _fail(s, lanes, lane, code) -> None:
 def _tell(lanes, reached, viscous, hysteretic, power, fraction) -> None:
     """Write poses and rates of all lanes to `lanes.out`, and penetrations, their rates and forces to `lanes.told`.
 
-    `reached` is a bit mask of the lanes that have reached a sample, whose force enters their peaks.
+    `reached` is a bit mask of the lanes that have reached a sample. Their peaks include the force at the sample.
     """
     for i in range(COMPONENTS):
         set_row(lanes.out, i, exact_row(lanes.y, i))

@@ -35,7 +35,7 @@ _AT_ONCE = 1e-12
 #: `_STRAIGHT`: effect of the curvature on the change. `_ROUNDED`: relative change due to rounding.
 _FOUND, _STRAIGHT, _ROUNDED = 1e-6, 1e-3, 2e-16
 _MOST_CHANGES = 80
-#: Factor for rounding, by which a root is certainly beyond a shortened step.
+#: Factor for rounding. A root that exceeds a shortened step by this factor is certainly beyond the step.
 _SURELY_LATER = 1.0 + 1e-9
 #: Indices in `lanes.chosen` after the five coefficients of a penetration: factor of d, factor of d', constant.
 _DEPTH, _RATE, _CONSTANT = 5, 6, 7
@@ -402,7 +402,7 @@ def _write_chosen(lanes, at, order, full, fraction):
 
 @kernel()
 def _search(lanes, w, at, order, bits) -> None:
-    """Search the first root of each guard function, which stays listed if a shorter step may change its root."""
+    """Search the first root of each guard function. A function stays listed if a shorter step may change its root."""
     guard = lanes.guard[at]
     single, several = isolate(lanes, guard, w, order, bits)
     if single != 0:

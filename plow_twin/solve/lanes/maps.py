@@ -50,7 +50,7 @@ def sigma_of(lanes, lane, used, fraction) -> float:
 
 @kernel()
 def choose_maps(harmonics, extent, waves, second, hysteretic, fraction, segments, lanes, w) -> None:
-    """Choose the series variable of each lane, and convert `lanes.whole` to it. Release too shallow pairs."""
+    """Choose the series variable of each lane, convert `lanes.whole` to it, and release pairs that are too shallow."""
     shallow, near = _look_at_pairs(lanes)
     if shallow != 0:
         _release(lanes)

@@ -1,7 +1,7 @@
 """Record of eight scenes that run together. Each row of its series and constants contains one number for each scene.
 
 The position of a scene in a row is its lane. The acting pairs of each lane are assigned to slots 0, 1, ..., so that one
-vector operation processes an acting pair of every lane, which may be a different pair in each.
+vector operation processes one acting pair of every lane. The pairs in a slot may differ.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ WIDTH: Final = 8
 COMPONENTS: Final = 8
 #: Indices in `moment` of the factors of cosine, sine, X and Y in the contacts' moment.
 DC, DS, DX, DY = range(4)
-#: Numbers of guard functions: the first of each pair from 0, the second of each pair from `SECOND`, and those for a new
-#: touch after a separation in the same step from `AGAIN`.
+#: Numbers of guard functions. Each pair has a first guard function (numbers from 0), a second guard function (from
+#: `SECOND`), and a guard function for a new touch after a separation in the same step (from `AGAIN`).
 SECOND: Final = PAIR_COUNT
 AGAIN: Final = 2 * PAIR_COUNT
 GUARDS: Final = 3 * PAIR_COUNT
@@ -191,7 +191,7 @@ _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "f
 
 
 def fits_lanes(compiled: CompiledScene, *, sampled: bool = False) -> bool:
-    """Return whether a scene can run in lanes, which exclude all terms but `_COVERED` or samples, and `Options`."""
+    """Return whether a scene can run in lanes: it has only the terms `_COVERED` or samples, and no `Options`."""
     parts = compiled.parts._replace(terms=compiled.parts.terms._replace(segments=None)) if sampled else compiled.parts
     there = (name for name, term in zip(Terms._fields, parts.terms, strict=True) if term is not None)
     return parts.implicit is None and _COVERED.issuperset(there) and not any(options(compiled.scene))
@@ -404,7 +404,7 @@ def read_block(lanes, block) -> None:
 
 @kernel()
 def write_block(block, lanes, new) -> None:
-    """Copy the state of the lanes to their block, with changed data derived from modes and a new block's constants."""
+    """Copy the state of the lanes to their block, data derived from modes after changes, and constants if it is new."""
     copy_part(block, lanes, 0 if new else _STATE, _NOTES if lanes.noted[0] < 0 else _SIZE)
 
 

@@ -1,8 +1,8 @@
 """Taylor series of eight scenes with fixed contact modes. `method.series` contains the equations.
 
 If the contact force is linear in penetration and rate, the sum over a scene's acting pairs is one affine map of the
-state, with twelve Cauchy products in an order. For each slot of acting pairs (`record`), the force K d (1 + lambda d')
-= K (d + lambda / 2 (d^2)') adds half a product, and the force K d^n (1 + lambda d') adds three.
+state, and an order needs twelve Cauchy products. For each slot of acting pairs (`record`), the force K d (1 + lambda
+d') = K (d + lambda / 2 (d^2)') adds half a product, and the force K d^n (1 + lambda d') adds three.
 """
 
 from __future__ import annotations

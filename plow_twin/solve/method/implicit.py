@@ -53,7 +53,7 @@ STAGES = 9
 #: Ratio of the decay rate of a contact's dampers to the angular frequency of its springs, above which the contact is
 #: overdamped and the scene may need implicit steps.
 OVERDAMPED_RATIO = 20.0
-#: Cost of an implicit step in explicit steps. It must be longer than this number of stable explicit steps.
+#: Cost of an implicit step in explicit steps. An implicit step must be longer than that.
 _WORTH = 30.0
 #: Admissible error of an implicit step, which replaces many explicit steps, divided by that of an explicit step.
 _GAIN = 100.0
@@ -189,7 +189,7 @@ def stable_decay(order):
 
 @kernel(inline="source")
 def has_decayed(p, state) -> bool:
-    """Return whether fast motion has decayed since the last change of contact, later after failed attempts."""
+    """Return whether fast motion has decayed since the last change of contact. Failed attempts lengthen the wait."""
     wait = 5.0 - math.log(p.velocity_tolerance / p.threshold[0])
     return bool(state.decay_times >= wait * 2.0**state.refused)
 

@@ -42,7 +42,7 @@ def _speed(p, y) -> float:
 
 @kernel(inline="source")
 def slow_enough(p, y) -> bool:
-    """Return whether the head may be at rest by its speed."""
+    """Return whether the head is slow enough for rest."""
     return bool(_speed(p, y) <= 0.5 * _SHARE * p.velocity_tolerance)
 
 

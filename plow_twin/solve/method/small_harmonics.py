@@ -102,7 +102,7 @@ def _answer(p, one, w, gyration):
     sy, cy = amplitudes(p, one, 1)
     st, ct = amplitudes(p, one, 2)
     x, y, t = p.free[0] * complex(cx, -sx), p.free[1] * complex(cy, -sy), p.free[2] * gyration * complex(ct, -st)
-    # inverse by the adjugate matrix
+    # the inverse matrix, from the adjugate matrix
     first, second, third = e * k - f * h, f * g - d * k, d * h - e * g
     along_x = first * x + (c * h - b * k) * y + (b * f - c * e) * t
     along_y = second * x + (a * k - c * g) * y + (c * d - a * f) * t

@@ -14,7 +14,7 @@ from plow_twin.solve.method.series import expand, expand_harmonics, one_by_one
 from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import CLIPPED, ON
 
-#: Time in which the separation of a pair is searched, divided by the last step size, and order of the series for it.
+#: Time in which a separation is searched, divided by the last step size, and order of the series for this search.
 PARTING_REACH, PARTING_ORDER = 1.3, 6
 #: `PARTING_REACH` for friction with stick, whose guard functions make steps shorter.
 _PARTING_REACH_STICK = 8.0
@@ -22,8 +22,8 @@ _PARTING_REACH_STICK = 8.0
 _NEWTON_STEPS, _ROOT_FOUND = 6, 1e-9
 #: Largest usable term of a series, whose products are finite.
 _FINITE = 1e300
-#: Largest number of times that a step is shortened, because the largest term decreases with it, and ratio of successive
-#: sizes above which the repetition ends.
+#: Largest number of times that a step is shortened, and ratio of successive sizes above which this ends. The largest
+#: term decreases with the step.
 _SHORTER, _SHORT_ENOUGH = 20, 0.9
 
 

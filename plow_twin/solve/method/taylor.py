@@ -15,10 +15,10 @@ from plow_twin.solve.method.step_size import (
     time_to_separation,
 )
 
-#: Time after a touch in which the series variable is its square root, divided by the last step size.
+#: Time since a touch up to which its square root is the series variable, divided by the last step size.
 TOUCH_REACH = 2.5
 #: Longest step in the square root of the time since the touch, divided by its value at the start of the step. The
-#: rounding error of the force's series, like 1 / sqrt(t), grows by this factor with each order.
+#: rounding error of the force's series grows by this factor with each order.
 FURTHEST = 4.0
 
 
@@ -79,7 +79,7 @@ def _choose_map(p, parts, fraction, stick, state, w, span, penetrating):
         return (root if parting <= span else root - math.sqrt(parting - span)), parting > span
     since = state.step_start - state.touch_time
     if 0.0 < since < TOUCH_REACH * state.last_step_size:
-        # for some steps after a touch, its square root is a better variable than time
+        # soon after a touch, the square root of the time since the touch is a better variable than time
         root = math.sqrt(since)
         state.alpha, state.beta = 2.0 * root, 2.0
         return math.sqrt(since + span) - root, True
