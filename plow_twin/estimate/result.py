@@ -19,7 +19,7 @@ from plow_twin.estimate.unknowns import CORRELATED, QUANTITIES
 
 Array = NDArray[np.float64]
 
-#: 95 % quantile of the standard normal distribution, by definition the end of a 90 % interval.
+#: 95 % quantile of the standard normal distribution, from which the ends of a 90 % interval are derived.
 NORMAL_P95: Final = float(ndtri(0.95))
 #: Lower bound in standard deviations of the tail of the normal distribution that is treated as exponential.
 _FAR = 30.0
@@ -270,7 +270,6 @@ class Estimate:
         )  # fmt: skip
 
     def _repr_html_(self) -> str:
-        """Return a table of the values with intervals for notebooks."""
         states = {"horizontal": self.horizontal_state, "vertical": self.vertical_state}
         values, rows = self.values(), []
         for one in (quantity for quantity in QUANTITIES if quantity.name in values):

@@ -2,8 +2,7 @@
 
 Motions with random clearances, contact parameters and load errors are simulated with the sensor's noise and gaps. A
 regression over the simulated motions near the measured motion corrects the result of the module `equation_error`, or
-the range of motion if theta was not measured (approximate Bayesian computation with local-linear adjustment, as in the
-module `bouncing`).
+the range of motion if theta was not measured. The method is that of the module `bouncing`.
 
 If the load was not measured, each draw has the load that would cause the measured motion between the drawn walls,
 averaged over a time longer than an impact. With this load, only the true walls give the measured impacts. The sensor's

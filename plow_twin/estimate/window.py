@@ -207,7 +207,6 @@ class Windows:
         return Window(start_ns, end_ns, load, pose, len(rows), len(poses) + len(measured), lost, tabled)
 
     def _without_load(self, start_ns: int, end_ns: int) -> Window | None:
-        """Return a window that contains only poses; None if there are few poses."""
         poses = [row for row in self._poses if start_ns <= row[0] < end_ns]
         if len(poses) < FEWEST_POSES:
             return None

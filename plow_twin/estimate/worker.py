@@ -100,7 +100,7 @@ class Worker:
     def __init__(self, scene: Scene, windows: Windows, asked: Asked = _ESTIMATE_ALONE) -> None:
         near, far = Pipe()
         command = [sys.executable, "-m", "plow_twin.estimate.worker", str(far.fileno()), *loaded_laws()]
-        # at most one core
+        # the far side uses at most one core
         environment = os.environ | dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
         self._process = subprocess.Popen(
             command, pass_fds=[far.fileno()], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment

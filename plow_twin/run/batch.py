@@ -428,7 +428,6 @@ class TwinBatch:
         return joined
 
     def _stop(self, begun: Sequence[Future[None]]) -> None:
-        """Stop the other threads at the end of their slices of work."""
         for worker in self._workers:
             worker.pace.stopped = True
         wait(begun)

@@ -96,7 +96,6 @@ class Result:
     frame: Array | None = None
 
     def _repr_html_(self) -> str:
-        """Return the statistics of the contacts as an HTML table for notebooks."""
         duration = float(self.t[-1]) if len(self.t) else 0.0
         title = f"{duration:g} s of motion, {len(self.t)} rows, {len(self.events)} changes of contact"
         heads = ("pair", "largest force [kN]", "mean in contact [kN]", "impulse [kN s]", "in contact [s]", "makes")

@@ -25,7 +25,6 @@ _BUDGET, _LOG_FULL, _PAUSED = int(Status.BUDGET), int(Status.LOG_FULL), int(Stat
 
 @kernel(inline="source")
 def _unowned_loads(parts):
-    """Return the parts with loads that are not reference counted."""
     return Parts(parts.terms, unowned(parts.harmonics), unowned(parts.segments), parts.implicit)
 
 
@@ -89,7 +88,6 @@ def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
 
 @kernel()
 def _worn_at(state, w, wear, sigma, out) -> None:
-    """Write each pad's wear depth at a value `sigma` of the step's series variable."""
     if wear is not None:
         wear_depth_at(state, w, sigma, out)
     else:

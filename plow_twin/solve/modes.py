@@ -33,8 +33,8 @@ from plow_twin.solve.state import (
     Y,
 )
 
-#: Largest penetration that is treated as zero, divided by the release penetration, and largest speed that is treated as
-#: zero, divided by the speed that reaches the release penetration.
+#: Largest penetration that is treated as zero, divided by the release penetration. It also applies to speeds, relative
+#: to the speed that reaches the release penetration.
 SHALLOW = 1e-3
 #: Number of iterations for damping and impact speed of a pair that starts in contact.
 _ROUNDS = 8

@@ -27,7 +27,7 @@ from plow_twin.solve.tumbling import turn_at, turn_corners
 
 #: Methods in the order in which `lay_out_step` tries them.
 METHODS: Final[tuple[Method, ...]] = (flight, rest, implicit, taylor)
-#: Longest step in s, whose powers are finite.
+#: Longest step in s, so that all powers of a step are finite.
 LONGEST_STEP = 100.0
 #: Size, in sigma, of the step that ends an endless alternation of modes at one instant.
 PAST_AN_INSTANT = 1e-9

@@ -306,7 +306,6 @@ def _leave(members, lanes, w, order, lane, code, t) -> None:
 
 @kernel(inline="source")
 def _unowned_members(members):
-    """Return the members with arrays that are not reference counted."""
     return Members(
         unowned(members.params),
         unowned(members.states),

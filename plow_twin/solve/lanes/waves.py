@@ -18,7 +18,7 @@ from plow_twin.kernel.simd import (
     significand_of,
 )
 
-#: Largest angle whose number of quarter turns times the first part of pi / 2 is exact.
+#: Largest angle for which the product of the number of quarter turns and the first part of pi / 2 is exact.
 _LARGEST = 1e5
 #: Number whose addition and subtraction rounds a double to an integer.
 _ROUNDS = 6755399441055744.0

@@ -15,7 +15,7 @@ from plow_twin.solve.method.step_size import (
     time_to_separation,
 )
 
-#: Time since a touch up to which its square root is the series variable, divided by the last step size.
+#: The series variable is the square root of the time since a touch up to this time, divided by the last step size.
 TOUCH_REACH = 2.5
 #: Longest step in the square root of the time since the touch, divided by its value at the start of the step. The
 #: rounding error of the force's series grows by this factor with each order.
