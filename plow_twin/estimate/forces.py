@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 MEMBERS: Final = 256
 #: Definition of an interval by the probabilities of its lower end, middle and upper end.
 POINTS: Final = (0.05, 0.5, 0.95)
-#: Smallest number of members, derived from one member below the 5 % quantile.
+#: Smallest number of members, derived from the condition that at least one member lies below the 5 % quantile.
 FEWEST: Final = 20
 #: Lower bound on the clearance of a member, as a share of the estimated clearance.
 _LEAST_SHARE = 0.02

@@ -27,8 +27,8 @@ from plow_twin.run.simulate import simulate
 
 Array = NDArray[np.float64]
 
-#: Wear depth in m of a trial simulation that measures the sliding distance, below the bound at which wear changes the
-#: motion.
+#: Wear depth in m of the trial simulation that measures the sliding distance, far below the bound at which wear would
+#: change the motion.
 _TRACE_M = 1e-12
 #: Upper bound on the number of interpolated rows between two rows of a path with running-in.
 _FINER = 16

@@ -205,8 +205,8 @@ class Estimate:
         Probability, mean and standard deviation of a difference from the scene, for each further quantity of the
         machine and of the sensor.
     apparent : tuple of (Interval, Interval), optional
-        Clearances in m with which a machine with exactly the scene's frame would move like the measured machine, if
-        they are more accurate than the true clearances. Twins are drawn from them.
+        Clearances in m that a machine with exactly the scene's frame would need to move like the measured machine. If
+        they are more accurate than the true clearances, they are present, and twins are drawn from them.
     load_harmonics : Harmonics, optional
         Harmonics that are missing from the measured load, with times of the window; None without evidence of
         harmonics.

@@ -214,7 +214,7 @@ class _Run:
                 self._on_progress(self.done)
 
     def _run_lanes(self, run: LaneRun, share: NDArray[np.int64]) -> None:
-        """Run some members, whose scenes must fit (`fits_lanes`), in lanes."""
+        """Run some members in lanes. Their scenes must fit (`fits_lanes`)."""
         waiting = share
         while len(waiting):
             self._look()
