@@ -162,13 +162,16 @@ def check_word(path: str, word: str) -> str:
     return word
 
 
-def is_usable(scene: Scene, values: Mapping[str, Value]) -> bool:
-    """Return whether the scene can be run with these values."""
-    try:
-        with_parameters(scene, values)
-    except SceneError:
-        return False
-    return True
+def usable_scenes(scene: Scene, candidates: Iterable[Mapping[str, Value]]) -> tuple[list[Scene], list[int]]:
+    """Return the scenes of the candidates that can be run, and the indices of these candidates."""
+    scenes, places = [], []
+    for place, values in enumerate(candidates):
+        try:
+            scenes.append(with_parameters(scene, values))
+        except SceneError:
+            continue
+        places.append(place)
+    return scenes, places
 
 
 def _labelled(frame: Any, word: str) -> Any:

@@ -127,7 +127,7 @@ def _summary(reader: RunReader, curves: RunCurves, log: _Log) -> dict[str, str]:
     span = "" if log.first_ns is None or log.last_ns is None else f"{(log.last_ns - log.first_ns) * 1e-9:.3f} s"
     clearance, contact = scene.clearance, scene.contact
     return {
-        "recording": str(reader.path.name),
+        "recording": reader.path.name,
         "ended": reader.status.value,
         "first sample": "none" if log.first_ns is None else time_text(log.first_ns),
         "span of the samples": span or "none",

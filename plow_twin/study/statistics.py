@@ -88,7 +88,7 @@ def _statistics_of_scene(scene: Scene) -> Mapping[str, Statistic]:
     for kind, reduce in _OF_PAIRS.items():
         for suffix, pairs in _groups(scene).items():
             known[f"{kind}{suffix}"] = partial(reduce, pairs=pairs)
-    for sense, row in zip(SENSES, (0, 1), strict=True):
+    for row, sense in enumerate(SENSES):
         for name, mask in _sets(scene).items():
             known[f"contact_sets.{sense}.{name}"] = partial(_share, row=row, masks=[mask])
             known[f"contact_set_time.{sense}.{name}"] = partial(_set_time, row=row, mask=mask)

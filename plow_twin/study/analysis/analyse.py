@@ -34,6 +34,7 @@ from plow_twin.record.walking import JournalWalk, Walked, Walker
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
+from plow_twin.stream.driven import Driven
 from plow_twin.stream.intake import Intake
 from plow_twin.stream.journal import Loss, Pose, Reset, Restore, SetWear
 from plow_twin.stream.outputs import CLEARANCE_NAMES
@@ -336,19 +337,20 @@ def analyse(
     for other in others:
         with_scene = load_scene(scene_path(str(other)))
         predictions.append(Prediction(str(other), with_scene, LoadTotals(with_scene)))
-    measured = Measured()
     if reader is not None:
         if units:
             raise RecordingError(f"{path}: got units, expected no units: a run of plow_twin is in SI")
         found = _walk_own(reader, path, mapping, predictions, on_progress, on_caught_up)
     else:
-        found = _walk_other(path, mapping, units, predictions, measured, out)
+        found = _walk_other(path, mapping, units, predictions, out)
     found.wall_s = time.perf_counter() - begin
     return found
 
 
-def _session(scene: Scene, tol: float, origin_ns: int | None = None) -> Session:
-    return Session(Twin(scene, tol=tol, excitation="sampled"), origin_ns)
+def _walker(prediction: Prediction, session: Session, writer: Any = None) -> Walker:
+    walker = Walker(session, prediction.walked, writer)
+    walker.on_reset = prediction.restart
+    return walker
 
 
 def _walk_own(
@@ -363,12 +365,11 @@ def _walk_own(
     if header.excitation_source == "scene":
         raise RecordingError(f"{reader.path}: excitation_source: got scene, expected a run under sampled loads")
     own = predictions[0].name == _OF_THE_RUN
-    sessions = [_session(prediction.scene, header.tol, header.origin_ns) for prediction in predictions]
+    twins: list[Driven] = [Twin(prediction.scene, tol=header.tol, excitation="sampled") for prediction in predictions]
     if own and header.follow != "off":
-        sessions[0] = Session(following_twin(header, predictions[0].scene), header.origin_ns)
-    walkers = [Walker(session, prediction.walked) for session, prediction in zip(sessions, predictions, strict=True)]
-    for walker, prediction in zip(walkers, predictions, strict=True):
-        walker.on_reset = prediction.restart
+        twins[0] = following_twin(header, predictions[0].scene)
+    pairs = zip(predictions, twins, strict=True)
+    walkers = [_walker(prediction, Session(twin, header.origin_ns)) for prediction, twin in pairs]
     walk = JournalWalk(walkers[:1], walkers[1:], whole=not header.part, same_scene=own)
     journalled = Measured()
     run_time = RunTime(header.parameters)
@@ -429,7 +430,6 @@ def _walk_other(
     mapping: Path | None,
     units: Mapping[str, str],
     predictions: list[Prediction],
-    measured: Measured,
     out: Path | None,
 ) -> Analysis:
     source = open_source(path)
@@ -442,11 +442,10 @@ def _walk_other(
     check_units(messages_of(open_source(path), roles), roles, predictions[0].scene, path)
     writer = _writer(out, predictions[0], roles) if out is not None else None
     walkers = [
-        Walker(_session(prediction.scene, _TOLERANCE), prediction.walked, writer if number == 0 else None)
-        for number, prediction in enumerate(predictions)
+        _walker(one, Session(Twin(one.scene, tol=_TOLERANCE, excitation="sampled")), writer if number == 0 else None)
+        for number, one in enumerate(predictions)
     ]
-    for walker, prediction in zip(walkers, predictions, strict=True):
-        walker.on_reset = prediction.restart
+    measured = Measured()
 
     def add(role: str, stamp_ns: int, numbers: dict[str, float]) -> None:
         measured.add(role, stamp_ns, numbers, predictions[0].resets)

@@ -12,14 +12,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.errors import SceneError
 from plow_twin.model.geometry import half_diagonal, length_scale
 from plow_twin.model.scene import Scene
 from plow_twin.run.ensemble import simulate_many
 from plow_twin.solve.state import Status
 from plow_twin.study.calibration.pose_recording import PoseRecording
 from plow_twin.study.calibration.targets import FAILED_RESIDUAL, TargetSet
-from plow_twin.study.parameters import Value, with_parameters
+from plow_twin.study.parameters import Value, usable_scenes, with_parameters
 from plow_twin.study.statistics import statistics_of
 
 Array = NDArray[np.float64]
@@ -80,22 +79,16 @@ class TargetObjective:
     def _fill(
         self, table: Array, candidates: Sequence[Values], rows: NDArray[np.int64], columns: list[int], paths: list[str]
     ) -> None:
-        scenes, places = [], []
-        for row in rows:
-            for column in columns:
-                try:
-                    scenes.append(with_parameters(self.scene, {**self.targets.settings[column], **candidates[row]}))
-                except SceneError:
-                    continue
-                places.append((row, column))
+        cells = [(row, column) for row in rows for column in columns]
+        values = ({**self.targets.settings[column], **candidates[row]} for row, column in cells)
+        scenes, places = usable_scenes(self.scene, values)
         if not scenes:
             return
         t_end = self.targets.t_end_s
         members = simulate_many(scenes, t_end, t_end, self.targets.tol, self.workers)
         self.runs += len(scenes)
-        statistics = statistics_of(members, scenes, paths)
-        for place, numbers in zip(places, statistics, strict=True):
-            table[place] = numbers
+        for place, numbers in zip(places, statistics_of(members, scenes, paths), strict=True):
+            table[cells[place]] = numbers
 
     def _rows(self, table: Array, paths: list[str], missing: float) -> Array:
         settings = list(self.targets.settings)
@@ -137,13 +130,7 @@ class RecordingObjective:
         del cut
         rows = self.recording.q.size
         result = np.full((len(candidates), rows), FAILED_RESIDUAL / np.sqrt(rows))
-        scenes, places = [], []
-        for index, candidate in enumerate(candidates):
-            try:
-                scenes.append(with_parameters(self.scene, candidate))
-            except SceneError:
-                continue
-            places.append(index)
+        scenes, places = usable_scenes(self.scene, candidates)
         if scenes:
             t_end, dt = float(self.recording.t[-1]), self.recording.output_dt
             members = simulate_many(scenes, t_end, dt, self.tol, self.workers)

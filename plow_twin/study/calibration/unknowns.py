@@ -18,8 +18,8 @@ from plow_twin.study.parameters import (
     Value,
     check_path,
     check_word,
-    is_usable,
     parameter_of,
+    usable_scenes,
     with_parameters,
 )
 
@@ -147,5 +147,5 @@ class Space:
 def check_usable(space: Space, scene: Scene) -> None:
     """Raise a `SceneError` if none of 100 random points gives a usable scene."""
     points = np.random.default_rng(0).random((100, space.size))
-    if not any(is_usable(scene, values) for values in space.values_of(points)):
+    if not usable_scenes(scene, space.values_of(points))[0]:
         with_parameters(scene, space.values(points[0]))

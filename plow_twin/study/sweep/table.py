@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -19,7 +19,7 @@ from plow_twin.model.scene import Scene
 from plow_twin.run.ensemble import simulate_many
 from plow_twin.scene_file import loads_scene
 from plow_twin.solve.state import Status
-from plow_twin.study.parameters import WORDS, StudyError, Value, check_path, check_word, with_parameters
+from plow_twin.study.parameters import WORDS, StudyError, Value, check_path, check_word, usable_scenes, with_parameters
 from plow_twin.study.statistics import statistic, statistics_of
 
 Array = NDArray[np.float64]
@@ -128,7 +128,7 @@ class Table:
     #: Statistics, shape (m, statistics); NaN for a member whose status is not 0.
     numbers: Array
     #: Versions, processor and platform of each build that computed members.
-    builds: tuple[str, ...] = field(default=())
+    builds: tuple[str, ...] = ()
 
     @property
     def failed(self) -> list[int]:
@@ -157,13 +157,7 @@ def run_members_of(
     scene = replace(sweep.scene(), marks={})
     table = np.full((len(members), 1 + len(sweep.statistics)), np.nan)
     table[:, 0] = UNUSABLE
-    scenes, rows = [], []
-    for row, member in enumerate(members):
-        try:
-            scenes.append(with_parameters(scene, sweep.values(member)))
-        except SceneError:
-            continue
-        rows.append(row)
+    scenes, rows = usable_scenes(scene, map(sweep.values, members))
     if not scenes:
         return table
     result = simulate_many(scenes, sweep.t_end_s, sweep.t_end_s, sweep.tol, workers, on_done)
