@@ -280,11 +280,9 @@ def _watching() -> Iterator[tuple[Watch, Any]]:
         node.destroy_node()
 
 
-@contextmanager
-def _progress(console: Console, quiet: bool) -> Iterator[Progress]:
+def _progress(console: Console, quiet: bool) -> Progress:
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.1f} s"), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True, disable=quiet) as bar:
-        yield bar
+    return Progress(*columns, console=console, transient=True, disable=quiet)
 
 
 def _view(folder: Path) -> Path | None:

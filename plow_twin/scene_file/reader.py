@@ -27,7 +27,7 @@ from plow_twin.model.scene import (
 from plow_twin.scene_file.presets import PRESETS, scene_path
 from plow_twin.scene_file.schema import LOAD_KINDS, scene_schema
 from plow_twin.scene_file.table import read_table, sample_table
-from plow_twin.scene_file.validation import Schema, validate
+from plow_twin.scene_file.validation import validate
 from plow_twin.scene_file.yaml_text import load_yaml, read_yaml
 
 _SECTIONS: Final = "the sections of a scene"
@@ -87,9 +87,7 @@ def loads_scene(text: str, base: str | Path | None = ".", *, source: str = "scen
     return _scene(*load_yaml(text, "scene", _SECTIONS), None if base is None else Path(base), source)
 
 
-@cache
-def _schema() -> Schema:
-    return scene_schema()
+_schema = cache(scene_schema)
 
 
 def _scene(raw: Any, problems: list[Problem], base: Path | None, source: str) -> Scene:

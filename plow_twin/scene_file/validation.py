@@ -62,7 +62,7 @@ MOST_PROBLEMS: Final = 50
 
 def validate(raw: Any, schema: Schema, name: str) -> list[Problem]:
     """Return the problems of plain data in the order of the schema. In messages, the name of the data is `name`."""
-    problems = (problem for error in _validator(schema).iter_errors(raw) for problem in _explain(error, name))
+    problems = (problem for error in _validator()(schema).iter_errors(raw) for problem in _explain(error, name))
     # jsonschema reports one error for each missing key, and `_explain` yields all missing keys for each error
     unique: dict[str, Problem] = {}
     for problem in islice(map(_brief, problems), 2 * MOST_PROBLEMS):
@@ -70,13 +70,8 @@ def validate(raw: Any, schema: Schema, name: str) -> list[Problem]:
     return list(unique.values())[:MOST_PROBLEMS]
 
 
-def _validator(schema: Schema) -> Validator:
-    validator: Validator = _validator_class()(schema)
-    return validator
-
-
 @cache
-def _validator_class() -> Callable[[Schema], Validator]:
+def _validator() -> Callable[[Schema], Validator]:
     """Return a validator for which NaN, infinity and integers beyond float64 are no numbers, and 1.0 is no integer."""
     checker = Draft202012Validator.TYPE_CHECKER.redefine_many(
         {
