@@ -218,11 +218,8 @@ def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool,
             said = f"{facts['run']}: {facts['without_samples']}; in these intervals the load is interpolated linearly"
             console.print(said, highlight=False, soft_wrap=True)
         if not facts["signals"]:
-            console.print(
-                f"{facts['run']}: no measured values to compare with the model",
-                highlight=False,
-                soft_wrap=True,
-            )
+            said = f"{facts['run']}: no measured values to compare with the model"
+            console.print(said, highlight=False, soft_wrap=True)
             continue
         shown = table(
             f"{facts['run']}: predicted minus measured", "signal", "n", "bias", "RMS", "correlation [1]", "lag [s]"

@@ -126,10 +126,7 @@ def _show(found: Comparison) -> None:
         quantities = [names.get(quantity, quantity) for quantity in next(iter(by_pair.values()))]
         view = table(f"{name} compared with {first}: change of the means [%]", "pad", *quantities)
         for pair, by_quantity in by_pair.items():
-            view.add_row(
-                pair,
-                *map(_text, by_quantity.values()),
-            )
+            view.add_row(pair, *map(_text, by_quantity.values()))
         console.print(view)
         changes = (f"{axis} {_text(change)}" for axis, change in found.clearance_changes[name].items())
         console.print(f"clearance [%]: {', '.join(changes)}", highlight=False)

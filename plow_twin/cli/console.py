@@ -194,8 +194,3 @@ def say_lost(recording: object, lost: Mapping[str, int]) -> None:
         say_end(recording, status)
     if left := {name: count for name, count in lost.items() if name not in ends}:
         say_error(f"plow-twin: {recording}: lost {counts(left)}")
-
-
-def kilonewton(force_n: float) -> str:
-    """Return a force [N] as text in kN."""
-    return f"{force_n / 1e3:.2f}"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +11,7 @@ import click
 from click.core import ParameterSource
 
 from plow_twin.cli.console import DONE, say_error
-from plow_twin.cli.options import FILE, PLACE, node_options, wait_option
+from plow_twin.cli.options import FILE, PLACE, find_ros_wheels, node_options, wait_option
 
 if TYPE_CHECKING:
     from plow_twin.dashboard.access import PageAccess
@@ -107,8 +105,7 @@ def dashboard(
     access = access_of(options)
     with interruptible() as stopped:
         if run is None:
-            # if ROS was installed from wheels, the message definitions are in this folder
-            os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
+            find_ros_wheels()
             from plow_twin.dashboard.node import show_node
 
             show_node(namespace, name, scene, access, wait, stopped, lambda screen: say_where(screen, access))

@@ -253,24 +253,21 @@ def _repeated(source: Path) -> _Task | None:
 
     reader = RunReader(source)
     found = list(live_estimates(reader))
-    whole = [one for one in found if one.window is not None]
+    whole = [(one.entry, one.window) for one in found if one.window is not None]
     if not whole:
         return None
+    entry, window = whole[-1]
     scene = reader.header.scene(reader.path)
     losses = {**reader.lost, "damaged_chunks": reader.damaged_chunks, **reader.lost_parts}
     losses = {name: count for name, count in losses.items() if count}
 
     def run() -> tuple[Estimate, dict[str, Any]]:
-        entry, window = whole[-1].entry, whole[-1].window
-        assert window is not None
         again = answer(scene, window, entry.guess, asked_of(settings(reader.header.parameters)))
         same = again.text == entry.result
         live = {"estimates": len(found), "repeated": same, "start_ns": entry.start_ns, "end_ns": entry.end_ns}
         return again.estimate, {**again.also, "live": live, "losses": losses}
 
-    newest = whole[-1].window
-    assert newest is not None
-    return _Task(scene, newest.load, newest.pose, run, whole[-1].entry.start_ns)
+    return _Task(scene, window.load, window.pose, run, entry.start_ns)
 
 
 def _title(source: Path, scene: Path | None, task: _Task) -> str:

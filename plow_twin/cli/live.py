@@ -92,9 +92,7 @@ def live(source: str, as_json: bool, quiet: bool, lines: bool, seconds: float | 
     from plow_twin.live.stop import StopSignals
 
     with StopSignals() as stop:
-        return _live(
-            source, stop, {**options, "source": source}, as_json=as_json, quiet=quiet, lines=lines, seconds=seconds
-        )
+        return _live(source, stop, options, as_json=as_json, quiet=quiet, lines=lines, seconds=seconds)
 
 
 def _live(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
@@ -39,6 +41,11 @@ def node_options(command: Callable[..., Any]) -> Callable[..., Any]:
     ):
         command = option(command)
     return command
+
+
+def find_ros_wheels() -> None:
+    """Let ROS 2 find its message definitions if it was installed from wheels."""
+    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
 
 
 def unit_option(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import sys
 from pathlib import Path
 
 import click
 
 from plow_twin.cli.console import DONE, DONE_WITH_LOSS, output_console, say_error, show_facts
-from plow_twin.cli.options import FOLDER, json_option, quiet_option, wait_option
+from plow_twin.cli.options import FOLDER, find_ros_wheels, json_option, quiet_option, wait_option
 
 
 @click.command(
@@ -41,8 +39,7 @@ def record(
         raise click.BadParameter(
             f"got {exclude!r}, expected a regular expression: {error}", param_hint="--exclude"
         ) from None
-    # if ROS was installed from wheels, the message definitions are in this folder
-    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
+    find_ros_wheels()
     from plow_twin.cli.interruption import interruptible
     from plow_twin.record.reader import RunReader
     from plow_twin.record.running import running_run

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
 import click
 
-from plow_twin.cli.console import DONE, kilonewton, output_console, progress, table
+from plow_twin.cli.console import DONE, output_console, progress, table
 from plow_twin.cli.options import NEW_FILE, POSITIVE, json_option, quiet_option
 
 if TYPE_CHECKING:
@@ -255,15 +255,8 @@ def _print_statistics(result: Result, scene: str, t_end: float) -> None:
     columns = ("max kN", "mean in contact kN", "mean kN", "impulse kN s", "contact s", "makes")
     forces = table(f"{scene}, {t_end:g} s", "pair", *columns)
     for name, row in result.statistics.items():
-        forces.add_row(
-            name,
-            kilonewton(row["max"]),
-            kilonewton(row["mean_in_contact"]),
-            kilonewton(row["mean_over_time"]),
-            kilonewton(row["impulse"]),
-            f"{row['time_in_contact']:.3f}",
-            f"{row['makes']}",
-        )
+        kilo = (f"{row[key] / 1e3:.2f}" for key in ("max", "mean_in_contact", "mean_over_time", "impulse"))
+        forces.add_row(name, *kilo, f"{row['time_in_contact']:.3f}", f"{row['makes']}")
     console.print(forces)
     sets = table("contact sets, share of contact time", "corners in contact", "counter-clockwise", "clockwise")
     ccw, cw = result.contact_sets["ccw"], result.contact_sets["cw"]

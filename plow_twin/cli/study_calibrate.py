@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,7 +106,7 @@ def calibrate(
     plain = {key: str(value) if isinstance(value, Path) else value for key, value in arguments.items()}
     write_fit(fit, space, plain, out)
     if plot is not None:
-        _plot(fit, space, objective, f"Calibration of {scene} to {source}, drawn {_today()}", plot)
+        _plot(fit, space, objective, f"Calibration of {scene} to {source}, drawn {datetime.now(UTC):%Y-%m-%d}", plot)
     if not quiet:
         _show(fit, space, out)
     return DONE
@@ -142,12 +143,6 @@ def _plot(fit: Fit, space: Space, objective: Objective, title: str, path: Path) 
         draw_targets(fit, space, title, path)
 
 
-def _today() -> str:
-    from datetime import UTC, datetime
-
-    return f"{datetime.now(UTC):%Y-%m-%d}"
-
-
 def _check_options(options: dict[str, Any]) -> None:
     for name, value in (("--without", options["without"]), ("--t-end", options["t_end"])):
         if value and options["target"] is None:
@@ -175,12 +170,8 @@ def _objective(
         check_poses(poses.t, poses.q, model, recording)
         if poses.load is not None:
             model = replace(model, loads=(poses.load,))
-        return (
-            model,
-            RecordingObjective(model, poses, options["tol"] or 1e-8, workers),
-            f"the motion {recording.name}",
-            (),
-        )
+        objective = RecordingObjective(model, poses, options["tol"] or 1e-8, workers)
+        return model, objective, f"the motion {recording.name}", ()
     path = config_folder() / "paper_targets.yaml" if target == "paper" else Path(target)
     targets = load_targets(path, model).without(options["without"])
     targets = replace(targets, t_end_s=options["t_end"] or targets.t_end_s, tol=options["tol"] or targets.tol)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from plow_twin.cli.console import DONE, DONE_WITH_LOSS, say_error
-from plow_twin.cli.options import FILE, POSITIVE, node_options, wait_option
+from plow_twin.cli.options import FILE, POSITIVE, find_ros_wheels, node_options, wait_option
 
 if TYPE_CHECKING:
     from plow_twin.telemetry.access import WayOut
@@ -88,8 +86,7 @@ def telemetry(namespace: str, name: str, scene: str | None, wait: float, **optio
     from plow_twin.live.stop import StopRequested, StopSignals
 
     with StopSignals() as stop:
-        # if ROS was installed from wheels, the message definitions are in this folder
-        os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
+        find_ros_wheels()
         from plow_twin.telemetry.node import send_node
 
         def on_error(text: str) -> None:
