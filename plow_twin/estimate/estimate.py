@@ -643,8 +643,8 @@ def _next_guess(problem: Problem, fit: Fit) -> Guess:
 def thinned(load: Load, period: float) -> tuple[Load, bool]:
     """Return a load without samples that hardly move the head, and whether the load is broad-band.
 
-    A load is broad-band if nearly all its samples move the head, or if its samples are too rare to show. A broad-band
-    load is averaged.
+    A load is broad-band if nearly all its samples move the head. It is then averaged. A load whose samples are too rare
+    to show a broad-band part also counts as broad-band.
     """
     load = load.believable()
     most = tuning.KNOTS[0] * max(1.0, float(load.t[-1] - load.t[0]) / period)
