@@ -2,9 +2,9 @@
 
 Three kinds of differences are considered:
 
-- Further unknowns, each with a prior: inertia, size of the frame, friction, exponent, differences between the walls,
-  and errors of the sensor. They are estimated in one linearised step from the fit. Bayesian variable selection samples
-  which of them differ from the scene.
+- Further unknowns, each with a prior: inertia, size and compliance of the frame, friction, exponent, differences
+  between the walls, and errors of the sensor. They are estimated in one linearised step from the fit. Bayesian variable
+  selection samples which of them differ from the scene. Unknowns that cannot be negative have one-sided priors.
 - The load is assumed to have a constant error in each swing (a part of the motion that begins in flight). The size of
   the errors is estimated from all swings (empirical Bayes).
 - The remaining residuals are treated as noise. The variance of the measurements is increased if the residuals are
@@ -26,9 +26,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
+from scipy.special import log_ndtr
 
 from plow_twin.estimate import tuning
-from plow_twin.estimate.fit import DIFFERENCES, FEWEST_OF_SWING, WALLS, Fit, Point, Problem, freed, huber_weight
+from plow_twin.estimate.compliance import by_compliance
+from plow_twin.estimate.fit import DIFFERENCES, FEWEST_OF_SWING, LAG, WALLS, Fit, Point, Problem, freed, huber_weight
 from plow_twin.estimate.harmonics import Harmonics
 from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER
 from plow_twin.estimate.pads import deviations
@@ -48,6 +50,7 @@ STATED: Final = {
     "contact.exponent": 0.02,
     "friction.coefficient": 0.01,
 }
+_FRICTION: Final = "friction.coefficient"
 #: Steps of the difference quotients with respect to the relative stiffness of a wall and to a constant load, in units
 #: of half the load's range.
 _WALL_STEP, _PUSH_STEP = 0.02, 5e-3
@@ -151,11 +154,13 @@ class _Column:
     deviation : prior standard deviation
     derivative : (n, 3) derivative of the predicted measurements
     value : value in the fit; None if the fit uses the value of the scene
+    least : smallest possible value
     """
 
     deviation: float
     derivative: Array
     value: float | None = None
+    least: float = -math.inf
 
 
 def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
@@ -176,11 +181,15 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
         change = partial(_moved, path=path, step=step, depth=depth)
         column = by(step, change=change) if deviation > 0.0 else None
         if column is not None:
-            out[path] = _Column(deviation, column)
+            least = -(scene.friction.coefficient if scene.friction else 0.0) if path == _FRICTION else -math.inf
+            out[path] = _Column(deviation, column, least=least)
     sides = [out[path].derivative for path in ("frame.width_m", "frame.height_m") if path in out]
     if len(sides) == 2 and scene.frame.corner_radius_m is None:
         # at small angles, a radius has the effect of sides that are shorter by twice the radius
-        out["corner_radius"] = _Column(ROUNDING, -2.0 * (sides[0] + sides[1]))
+        out["corner_radius"] = _Column(ROUNDING, -2.0 * (sides[0] + sides[1]), least=0.0)
+    column = by_compliance(problem, point)
+    if column is not None:
+        out["compliance"] = _Column(UNSTATED["compliance"], column, least=0.0)
     for wall, pads in zip(("left", "right", "top", "bottom"), WALLS, strict=True):
         share, name, step = np.ones(PAIR_COUNT), f"stiffness_{wall}", problem.steps * _WALL_STEP
         share[list(pads)] += step
@@ -189,10 +198,11 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
             out[name] = _Column(UNSTATED[name], column)
     held, columns, prior = problem.differences.any(), problem.by_differences(point), deviations()
     for index, name in enumerate(DIFFERENCES):
+        least = 0.0 if index == LAG else -math.inf
         if held:
-            out[name] = _Column(prior[index], columns[:, :, index], float(problem.differences[index]))
+            out[name] = _Column(prior[index], columns[:, :, index], float(problem.differences[index]), least)
         else:
-            out[name] = _Column(UNSTATED[name], columns[:, :, index])
+            out[name] = _Column(UNSTATED[name], columns[:, :, index], least=least)
     out |= {name: _Column(UNSTATED[name], np.nan_to_num(column)) for name, column in _of_sensor(problem, point)}
     if problem.harmonics is not None:
         columns, values = problem.by_harmonics(point, problem.harmonics), problem.harmonics.amplitude.ravel()
@@ -257,6 +267,7 @@ class _Linearised:
         # values of the further quantities, and whether the fit includes them, shape (k,) each
         self._value = np.array([one.value or 0.0 for one in every])
         self._held = np.array([one.value is not None for one in every])
+        self._least = np.array([one.least for one in every])
         self._pull = np.concatenate([problem.mean - found.shared, -self._value]) * self._precision
         rows = [np.flatnonzero(self._swing == index) for index in range(problem.window.swings)]
         self._rows = [some for some in rows if len(some) >= FEWEST_OF_SWING]
@@ -328,47 +339,51 @@ class _Linearised:
             self.inflation[index] = max(1.0, square / usual) * _lasting(column, self._swing, square)
 
     def exact(self) -> tuple[Array, Array]:
-        return self._of(self._held)
+        _, mean, covariance = self._given(self._held)
+        return mean, covariance
 
-    def _of(self, differs: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Return mean and covariance of the unknowns if only the marked quantities differ from the scene."""
+    def _given(self, differs: NDArray[np.bool_]) -> tuple[float, Array, Array]:
+        """Return the log evidence, and mean and covariance of the unknowns, if only the marked quantities differ from
+        the scene.
+        """
         size, use = len(self._precision), np.append(np.arange(SIZE), SIZE + np.flatnonzero(differs))
         mean, covariance = np.zeros(size), np.zeros((size, size))
-        inverse = np.linalg.inv(self._normal[np.ix_(use, use)])
+        lower = np.linalg.cholesky(self._normal[np.ix_(use, use)])
+        inverse = cho_solve((lower, True), np.eye(len(use)))
         mean[use], covariance[np.ix_(use, use)] = inverse @ self._score[use], inverse
-        return mean, covariance
+        evidence = 0.5 * float(self._score[use] @ mean[use]) - float(np.log(np.diag(lower)).sum())
+        evidence += 0.5 * float(np.log(self._precision[use]).sum())
+        for index in np.flatnonzero(differs & np.isfinite(self._least)).tolist():
+            evidence += _truncate(mean, covariance, SIZE + index, self._least[index] - self._value[index])
+        return evidence, mean, covariance
 
     def averaged(self, rng: np.random.Generator, prior: float) -> tuple[Array, Array, Array]:
         """Return mean and covariance of the samples, and the share of samples in which each quantity differs.
 
         `prior` is the prior probability of a difference. A quantity that the fit includes differs in all samples.
         """
-        size, log_precision = len(self._precision), np.log(self._precision)
-        known: dict[bytes, float] = {}
+        size, odds = len(self._precision), math.log(prior / (1.0 - prior))
+        known: dict[bytes, tuple[float, Array, Array]] = {}
 
-        def evidence(which: NDArray[np.bool_]) -> float:
-            key = which.tobytes()  # the sampler visits most sets several times
+        def given(which: NDArray[np.bool_]) -> tuple[float, Array, Array]:
+            key = which.tobytes()  # cached, because the sampler visits most sets several times
             if key not in known:
-                use = np.append(np.arange(SIZE), SIZE + np.flatnonzero(which))
-                lower = np.linalg.cholesky(self._normal[np.ix_(use, use)])
-                half = np.linalg.solve(lower, self._score[use])
-                odds = which.sum() * np.log(prior / (1.0 - prior))
-                inside = np.log(np.diag(lower)).sum()
-                known[key] = float(0.5 * half @ half - inside + 0.5 * log_precision[use].sum() + odds)
+                evidence, mean, covariance = self._given(which)
+                known[key] = evidence + odds * int(which.sum()), mean, covariance
             return known[key]
 
         differs, counted = self._held.copy(), _SWEEPS - _BURNT
-        now = evidence(differs)
+        now = given(differs)[0]
         mean, second, often = np.zeros(size), np.zeros((size, size)), np.zeros(len(differs))
         for sweep in range(_SWEEPS):
             for index in rng.permutation(np.flatnonzero(~self._held)):
                 other = differs.copy()
                 other[index] = not other[index]
-                instead = evidence(other)
+                instead = given(other)[0]
                 if np.log(rng.random()) < instead - now:
                     differs, now = other, instead
             if sweep >= _BURNT:
-                step, covariance = self._of(differs)
+                _, step, covariance = given(differs)
                 second += covariance + np.outer(step, step)
                 mean += step
                 often += differs
@@ -397,6 +412,23 @@ class _Linearised:
             name: (float(share), float(value / max(share, 1e-9)), float(spread))
             for name, share, value, spread in zip(self.names, often, self._value + mean[SIZE:], deviation, strict=False)
         }
+
+
+def _truncate(mean: Array, covariance: Array, index: int, least: float) -> float:
+    """Change the mean and covariance of normal unknowns, in place, to those given that unknown `index` is at least
+    `least`.
+
+    Return the logarithm of the probability of this condition, divided by its prior probability of a half.
+    Reference: Minka, Expectation propagation (2001), section 3.2 (moment matching).
+    """
+    spread = math.sqrt(covariance[index, index])
+    z = (mean[index] - least) / spread
+    log_inside = float(log_ndtr(z))
+    ratio = math.exp(-0.5 * z * z - 0.5 * math.log(2.0 * math.pi) - log_inside)
+    column = covariance[:, index] / spread
+    mean += ratio * column
+    covariance -= ratio * (ratio + z) * np.outer(column, column)
+    return log_inside + math.log(2.0)
 
 
 def _lasting(left: Array, swing: NDArray[np.int64], square: float) -> float:

@@ -130,9 +130,11 @@ class Units:
         unit["damping"] = 1.0 if contact.damping is None else self._damping(contact)
         converted: dict[str, Any] = {name: value.times(unit[name]) for name, value in found.values().items()}
 
-        def length_of(name: str) -> float:
+        def unit_of(name: str) -> float:
             if name == "filter":
                 return time**2
+            if name == "compliance":
+                return length / self.force
             return length if name.startswith(("frame.", "corner_", "turn_", "lever_")) else 1.0
 
         scale = (
@@ -146,7 +148,7 @@ class Units:
             **converted,
             noise=None if found.noise is None else (found.noise[0] * length, found.noise[1] * length, found.noise[2]),
             differs={
-                name: (share, by * length_of(name), deviation * length_of(name))
+                name: (share, by * unit_of(name), deviation * unit_of(name))
                 for name, (share, by, deviation) in found.differs.items()
             },
             groups={name: (value.times(length), state) for name, (value, state) in found.groups.items()},

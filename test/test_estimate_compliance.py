@@ -1,0 +1,46 @@
+"""Frames that yield to the contact forces."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from estimate_support import KINDS, mismatched
+from mismatched_machine import Machine, poses_of
+from scenes import preset
+
+from plow_twin.estimate.compliance import by_compliance
+from plow_twin.estimate.estimate import estimate
+from plow_twin.estimate.fit import Problem, Window
+from plow_twin.estimate.forward import Forward
+from plow_twin.estimate.measurements import Load, Poses
+from plow_twin.estimate.unknowns import Unknowns
+from plow_twin.model.loads import compile_loads
+
+
+def test_the_derivative_by_the_compliance_is_that_of_another_integrator_with_a_frame_on_springs() -> None:
+    paper, t = preset("paper"), np.arange(0.0, 3.0, 1e-3)
+    contact = replace(paper.contact, law="hunt_crossley", stiffness=1.5e7, exponent=1.0, damping=0.7)
+    scene, wrench, stiff = replace(paper, contact=contact), compile_loads(paper.loads).at(t), 4e9
+    fixed, yielding = (
+        poses_of(scene, Machine(np.ones(8), np.zeros(8), spring=spring), t, wrench, t[::10]) for spring in (0.0, stiff)
+    )
+    unknowns = Unknowns(scene)
+    window = Window(Poses(t[::10], fixed), np.array([0.0, 3.0]), np.zeros((1, 6)))
+    problem = Problem(Forward(scene, Load(t, wrench)), unknowns, window)
+    point = problem.evaluate(unknowns.nominal(), window.states)
+    assert point is not None and np.nanmax(np.abs(point.residual)) < 1e-5
+    derivative, true = by_compliance(problem, point), stiff * (yielding - fixed)
+    assert derivative is not None
+    error, size = derivative - true, true.std(axis=0)
+    assert (error.std(axis=0) < 0.1 * size).all(), error.std(axis=0) / size
+
+
+def test_a_frame_on_springs_is_found_and_the_clearances_hold() -> None:
+    truth = mismatched(KINDS["spring"], 30403)
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    probability, compliance, _ = result.differs["compliance"]
+    assert probability > 0.9 and 0.5 < compliance * KINDS["spring"].spring < 1.5
+    for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):
+        # with a fixed frame, both errors are 0.12 mm
+        assert value.p05 <= true <= value.p95 and abs(value.mean - true) < 6e-5
