@@ -20,6 +20,7 @@ from plow_twin import (
     Harmonic,
     Head,
     Initial,
+    Result,
     Scene,
     SceneError,
     Support,
@@ -32,7 +33,9 @@ from plow_twin.estimate.forward import Forward
 
 SIDE, MASS = 0.06, 1.0
 INERTIA = MASS * SIDE**2 / 6.0
-STIFFNESS, DAMPING, MU, SLIP_SPEED = 3e6, 0.8, 0.2, 0.05
+STIFFNESS, DAMPING, MU, SLIP_SPEED = 3e6, 600.0, 0.2, 0.05
+#: A load that moves nothing. With it, a mirrored head with walls has the terms of a pinned motion.
+NOTHING = Harmonic("nothing", (1e-12, 0.0), 9.0)
 WALL = 1.0
 
 
@@ -42,8 +45,9 @@ def block(**changes: object) -> Scene:
         Head(MASS, INERTIA, carries="corners"),
         Frame(SIDE, SIDE),
         Clearance(2.0 * WALL - SIDE, 2.0 * WALL - SIDE),
-        Contact("hunt_crossley", stiffness=STIFFNESS, exponent=1.0, damping=DAMPING),
+        Contact("kelvin_voigt", stiffness=STIFFNESS, damping=DAMPING),
         Gravity(),
+        (NOTHING,),
         initial=Initial(q=(0.0, -0.85, 0.3), v=(0.4, 0.0, 6.0)),
         friction=Friction(MU, SLIP_SPEED),
     )
@@ -59,7 +63,7 @@ def on_table(t: float, z: np.ndarray) -> list[float]:
         ax, ay = c * cx - s * cy, s * cx + c * cy
         depth, rate = -WALL - (y + ay), -(vy + omega * ax)
         if depth > 0.0:
-            normal = max(STIFFNESS * depth * (1.0 + DAMPING * rate), 0.0)
+            normal = max(STIFFNESS * depth + DAMPING * rate, 0.0)
             drag = -MU * normal * math.tanh((vx - omega * ay) / SLIP_SPEED)
             fx, fy, moment = fx + drag, fy + normal, moment + ax * normal - ay * drag
     return [vx, vy, omega, fx / MASS, fy / MASS - 9.81, moment / INERTIA]
@@ -92,7 +96,7 @@ def test_corners_pass_their_contact_on_at_45_degrees() -> None:
     # the block is pressed on the table by ten times its weight, and rolls over its lower right corner
     push = Constant("push", force_n=(0.0, -90.0), moment_n_m=-3.3)
     lying = Initial(q=(0.0, -WALL + 0.5 * SIDE, 0.0), v=(0.0, 0.0, -0.3))
-    scene = block(initial=lying, loads=(push,), friction=Friction(1.0, 0.02))
+    scene = block(initial=lying, loads=(push, NOTHING), friction=Friction(1.0, 0.02))
     # this call uses the kernels of the fixture `falls`
     result = simulate(scene, t_end=0.25, output_dt=1e-3, energy_balance=True)
     turned = np.flatnonzero(result.q[:, 2] < -0.25 * math.pi)
@@ -139,27 +143,31 @@ GUIDED = block(
     head=Head(MASS, 1e12, carries="corners"),
     frame=Frame(0.3, 0.2),
     clearance=Clearance(0.01, 0.012),
-    contact=Contact("exact_restitution", stiffness=1e7, exponent=1.5, restitution=0.5),
     loads=(Harmonic("push", force_n=(120.0, 40.0), omega_rad_s=9.0),),
     initial=Initial(q=(0.001, 0.002, 0.0), v=(0.3, -0.2, 0.0)),
-    friction=STICK,
 )
+RESTITUTION = Contact("exact_restitution", stiffness=1e7, exponent=1.5, restitution=0.5)
+
+
+def both(scene: Scene, **options: float) -> tuple[Result, Result]:
+    """Return the run of a block, with the kernels of `falls`, and that of its mirrored head."""
+    return simulate(scene, energy_balance=True, **options), simulate(mirrored(scene), **options)
 
 
 @pytest.mark.parametrize(
     "changes",
     [
-        pytest.param({}, id="stick"),
+        pytest.param({}, id="regularised friction"),
+        pytest.param({"friction": STICK, "contact": RESTITUTION}, id="stick", marks=pytest.mark.stress),
         pytest.param({"friction": None, "loads": ()}, id="smooth and free", marks=pytest.mark.stress),
         pytest.param({"friction": None}, id="smooth", marks=pytest.mark.stress),
         pytest.param({"loads": ()}, id="free", marks=pytest.mark.stress),
     ],
 )
 def test_corners_without_rotation_are_a_mirrored_head_with_walls(changes: dict[str, object]) -> None:
-    scene = replace(GUIDED, **changes)  # type: ignore[arg-type]
-    block_run = simulate(scene, t_end=0.5, output_dt=1e-3, tol=1e-9)
-    head_run = simulate(mirrored(scene), t_end=0.5, output_dt=1e-3, tol=1e-9)
+    block_run, head_run = both(replace(GUIDED, **changes), t_end=0.5, output_dt=1e-3, tol=1e-9)  # type: ignore[arg-type]
     np.testing.assert_allclose(block_run.q, -head_run.q, atol=1e-8)
+    assert sum(pair["makes"] for pair in block_run.statistics.values()) > 4
     assert {n: s["makes"] for n, s in block_run.statistics.items()} == {
         n: s["makes"] for n, s in head_run.statistics.items()
     }
@@ -171,20 +179,21 @@ def test_corners_that_turn_little_are_nearly_a_mirrored_head_with_walls() -> Non
             GUIDED,
             head=block().head,
             # friction and load are negligible but present, because the kernels of the test above contain both
-            friction=replace(STICK, coefficient=1e-12),
-            loads=(Harmonic("push", force_n=(1e-9, 0.0), omega_rad_s=9.0),),
+            friction=Friction(1e-12, SLIP_SPEED),
+            loads=(NOTHING,),
             initial=Initial(q=(0.0, 0.0, angle), v=(0.4, -0.3, 0.0)),
         )
-        ends = [simulate(one, t_end=0.03, output_dt=1e-3, tol=1e-10).q for one in (scene, mirrored(scene))]
-        return float(np.abs(ends[0] + ends[1]).max())
+        block_run, head_run = both(scene, t_end=0.03, output_dt=1e-3, tol=1e-10)
+        return float(np.abs(block_run.q + head_run.q).max())
 
     # the arms of the contacts differ between block and head, by the ratio of clearance to size and by the angle
     assert difference(1e-3) < 0.1 * 0.03
 
 
 def test_corners_move_the_same_by_fixed_steps(falls) -> None:
-    fixed = simulate(block(), t_end=0.2, output_dt=0.004, method="rk4", dt=1e-5)
-    np.testing.assert_allclose(fixed.q, falls.q[:51], atol=2e-4)
+    # the Kelvin-Voigt force jumps at a touch, for which fixed steps are accurate to first order only
+    fixed = simulate(block(), t_end=0.2, output_dt=0.004, method="rk4", dt=1e-6)
+    np.testing.assert_allclose(fixed.q, falls.q[:51], atol=1e-3)
 
 
 # in the quick run, test_solve_falling tests a live twin of a block
@@ -201,7 +210,7 @@ def test_senses_of_corners_are_those_of_the_block() -> None:
     # must be compiled
     scene = block(
         frame=Frame(0.3, 0.2), clearance=Clearance(0.01, 0.01), friction=Friction(1e-12, 0.05), gravity=Gravity(0.0),
-        loads=(Constant("turn", moment_n_m=5.0),), initial=Initial(),
+        loads=(Constant("turn", moment_n_m=5.0), NOTHING), initial=Initial(),
     )  # fmt: skip
     result = simulate(scene, t_end=0.2, output_dt=1e-2, energy_balance=True)
     assert result.contact_sets["ccw"] and not result.contact_sets["cw"]
