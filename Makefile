@@ -66,15 +66,16 @@ bench: $(INSTALLED)
 	$(PIP) -e ".[bench]" || $(PIP) matplotlib
 	"$(VENV)/bin/python" benchmark/run.py $(BENCH_ARGS)
 
+# no bytecode: it would take two fifths of the time, most of it for modules that are never imported
 $(INSTALLED): setup.py setup.cfg package.xml pyproject.toml requirements/constraints.txt
 	@test -n "$(PYTHON)" || { echo "no Python 3.11 or 3.12 with venv on PATH; name one: make PYTHON=/path/to/python" >&2; exit 1; }
 	test -x "$(VENV)/bin/python" || "$(PYTHON)" -m venv "$(VENV)"
-	"$(VENV)/bin/python" -m pip install --quiet --disable-pip-version-check -c requirements/constraints.txt -e ".[$(EXTRAS)]"
+	"$(VENV)/bin/python" -m pip install --no-compile --quiet --disable-pip-version-check -c requirements/constraints.txt -e ".[$(EXTRAS)]"
 	@touch "$@"
 
 $(LOWEST)/.installed: setup.py requirements/lowest.txt
 	test -x "$(LOWEST)/bin/python" || "$(PYTHON)" -m venv "$(LOWEST)"
-	"$(LOWEST)/bin/python" -m pip install --quiet --disable-pip-version-check -c requirements/lowest.txt \
+	"$(LOWEST)/bin/python" -m pip install --no-compile --quiet --disable-pip-version-check -c requirements/lowest.txt \
 		-e ".[$(if $(AMENT_PREFIX_PATH),,ros,)record,mqtt,sparkplug,metrics,test]"
 	@touch "$@"
 
