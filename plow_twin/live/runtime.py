@@ -6,7 +6,6 @@ each sample. A valid sample advances the twin and causes a publication, which is
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
@@ -32,7 +31,7 @@ from plow_twin.record.wear_state import scene_identity
 from plow_twin.stream.driver import Arrival, Driver, Policy
 from plow_twin.stream.health import Periods
 from plow_twin.stream.intake import Verdict
-from plow_twin.stream.journal import Entry, Gaps, PartOfPose, Pose
+from plow_twin.stream.journal import Entry, Gaps, Pose, pose_entry
 from plow_twin.stream.limits import Limits, excitation_limits, pose_limits, value_limits
 from plow_twin.stream.model_changes import changed_scene, changed_twin
 from plow_twin.stream.session import Series, Session
@@ -432,7 +431,7 @@ class Runtime:
     def _journal(self) -> Callable[[Entry], object]:
         recording, estimation = self.recording, self.estimation
         if estimation is None:
-            return recording.recorder.journal if recording else _ignore
+            return recording.recorder.journal if recording else lambda entry: None
         if recording is None:
             return estimation.add
 
@@ -451,12 +450,9 @@ class Runtime:
         """Check and use a measured pose. The arguments are described in `Inputs.uses_pose`."""
         if not self.inputs.uses_pose(stamp_ns, pose, deviation):
             return
-        known = tuple(index for index, value in enumerate(pose) if math.isfinite(value))
-        if len(known) < len(pose):
-            self.driver.session.apply(PartOfPose(stamp_ns, known, tuple(pose[index] for index in known)))
-            return
-        self.driver.session.apply(Pose(stamp_ns, pose, deviation))
-        if self.alarms.feed_pose(stamp_ns, pose):
+        entry = pose_entry(stamp_ns, pose, deviation)
+        self.driver.session.apply(entry)
+        if isinstance(entry, Pose) and self.alarms.feed_pose(stamp_ns, pose):
             self._send(self.publishing.alarms_changed(stamp_ns))
 
     def add_gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> None:
@@ -512,8 +508,7 @@ class Runtime:
             while count and self._behind:
                 time.sleep(_CATCH_UP_S)
                 count -= 1
-        unsteady = self.driver.unsteady(time.monotonic_ns())
-        seen = (self.driver.state, tuple(self.inputs.other_senders()), unsteady)
+        seen = (self.driver.state, tuple(self.inputs.other_senders()), self.unsteady)
         if seen != self._seen:
             self._seen = seen
             self._front.changed()
@@ -546,7 +541,3 @@ def limits(settings: Settings, scene: Scene) -> Limits:
     return excitation_limits(
         scene, settings.limit_force, settings.limit_moment, settings.limit_force_rate, settings.limit_moment_rate
     )
-
-
-def _ignore(entry: Entry) -> None:
-    """Ignore a journal entry, because the run is not recorded."""

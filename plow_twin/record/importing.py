@@ -16,7 +16,7 @@ from plow_twin.record.sources import Arrived
 from plow_twin.record.walking import BATCH, Walker
 from plow_twin.stream.driver import Policy
 from plow_twin.stream.intake import Intake, Verdict
-from plow_twin.stream.journal import PartOfPose, Pose, Reset, Travel
+from plow_twin.stream.journal import PartOfPose, Pose, Reset, Travel, pose_entry
 from plow_twin.stream.silences import Silences
 from plow_twin.stream.steps import Steps
 
@@ -104,7 +104,7 @@ class Feed:
         elif stamp_ns > 0:
             self.measured(name, stamp_ns, values)
             if self.with_poses and name == "head_pose":
-                self._poses.append(_pose(stamp_ns, values))
+                self._poses.append(pose_entry(stamp_ns, tuple(values.get(axis, math.nan) for axis in DOF_NAMES)))
         else:
             self.unfit[f"{name}: {self.roles[name].topic} has stamps of 0"] += 1
 
@@ -138,11 +138,3 @@ class Feed:
         self.silences.add(stamps)
         for walker in self.walkers:
             walker.samples(stamps, wrench, times)
-
-
-def _pose(stamp_ns: int, values: dict[str, float]) -> Pose | PartOfPose:
-    pose = tuple(values.get(name, math.nan) for name in DOF_NAMES)
-    known = tuple(place for place, value in enumerate(pose) if math.isfinite(value))
-    if len(known) < len(pose):
-        return PartOfPose(stamp_ns, known, tuple(pose[place] for place in known))
-    return Pose(stamp_ns, pose)

@@ -289,7 +289,7 @@ def _exported_tables(recording: Recording, kind: str, out: Path) -> dict[str, in
 
 def _poses(batch: Batch) -> Batched | None:
     found = [
-        (entry.stamp_ns, entry.pose if isinstance(entry, Pose) else whole_pose(entry))
+        (entry.stamp_ns, whole_pose(entry))
         for _, entry in sorted(batch.entries.others.items())
         if isinstance(entry, Pose | PartOfPose)
     ]

@@ -118,7 +118,8 @@ class Driver:
         self._steps = Steps(intake)
         self.clock = Intake(jump_back_s=intake.jump_back_s, jump_forward_s=intake.jump_forward_s)
         self._received_ns = 0
-        self._newest_ns: int | None = None
+        #: stamp of the newest sample used [ns]; None before the first sample and after a reset
+        self.newest_ns: int | None = None
         #: stamp up to which the model time is counted in `real_time` [ns]
         self._counted_ns: int | None = None
         self._zeroed = False
@@ -137,11 +138,6 @@ class Driver:
         self._policy = policy
         self.silences.timeout_s = policy.excitation_timeout_s
 
-    @property
-    def newest_ns(self) -> int | None:
-        """Stamp of the newest sample used [ns]; None before the first sample and after a reset."""
-        return self._newest_ns
-
     def samples(self, arrived: Iterable[Arrival], now_ns: int) -> Iterator[Published]:
         """Judge samples in order of arrival, advance to the accepted samples, and yield the publications.
 
@@ -153,7 +149,7 @@ class Driver:
         for stamp_ns, wrench in arrived:
             if self.every_sample and not run and self._may_go_on(stamp_ns, wrench):  # fast path for most samples
                 self.intake.accept(stamp_ns, wrench)
-                self._newest_ns, self._received_ns, self._zeroed = stamp_ns, now_ns, False
+                self.newest_ns, self._received_ns, self._zeroed = stamp_ns, now_ns, False
                 self.silences.add_one(stamp_ns)
                 published = self._apply([Sample(stamp_ns, wrench)], now_ns)
                 if len(published.rows):
@@ -161,7 +157,7 @@ class Driver:
                 continue
             for settled in self._steps.settle(stamp_ns, wrench, now_ns, self.session.stamp_ns):
                 yield from self._use_samples(run, *settled[:2], now_ns)
-        if run or self._newest_ns is None:
+        if run or self.newest_ns is None:
             yield from self._use(run, now_ns)
 
     def series(
@@ -195,14 +191,14 @@ class Driver:
             else:
                 newest_ns, newest = stamps.item(end - 1), tuple(wrench[end - 1].tolist())
                 self.intake.accept(newest_ns, newest, end - place)
-                self._newest_ns, self._received_ns, self._zeroed = newest_ns, now_ns, False
+                self.newest_ns, self._received_ns, self._zeroed = newest_ns, now_ns, False
                 self.silences.add(stamps[here])
                 self._advanced(now_ns)
                 self.failed.end()
                 self.state = StreamState.RUNNING
                 yield found
             place = end
-        if run or self._newest_ns is None:
+        if run or self.newest_ns is None:
             yield from self._use(run, now_ns)
 
     def _may_go_on(self, stamp_ns: int, wrench: tuple[float, float, float]) -> bool:
@@ -232,8 +228,8 @@ class Driver:
             yield from self._use(run, now_ns)
         if verdict.resets:
             self._restart_model(stamp_ns, verdict.value, None if self.intake.returned else now_ns)
-        if self._newest_ns is None or stamp_ns > self._newest_ns:
-            self._newest_ns = stamp_ns
+        if self.newest_ns is None or stamp_ns > self.newest_ns:
+            self.newest_ns = stamp_ns
         self.silences.add_one(stamp_ns)
         self._received_ns, self._zeroed = now_ns, False
         insort(run, Sample(stamp_ns, wrench), key=lambda sample: sample.stamp_ns)
@@ -246,7 +242,7 @@ class Driver:
         """Advance without samples if the last sample is older than `excitation_timeout_s`; the caller calls this at
         intervals.
         """
-        if self._newest_ns is None:
+        if self.newest_ns is None:
             return NOTHING
         timeout_ns = round(self.policy.excitation_timeout_s * NS_PER_S)
         jumped = self._steps.unopposed(now_ns, timeout_ns)
@@ -257,8 +253,8 @@ class Driver:
         if silent_ns <= 0:
             return NOTHING
         limit_ns = round(self.policy.hold_limit_s * NS_PER_S)
-        reached_ns = self.session.stamp_ns if self.session.stamp_ns is not None else self._newest_ns
-        stamp_ns = min(self._newest_ns + min(silent_ns, limit_ns), reached_ns + _LARGEST_HOLD_NS)
+        reached_ns = self.session.stamp_ns if self.session.stamp_ns is not None else self.newest_ns
+        stamp_ns = min(self.newest_ns + min(silent_ns, limit_ns), reached_ns + _LARGEST_HOLD_NS)
         if stamp_ns <= reached_ns:
             if silent_ns > limit_ns:
                 self.state = StreamState.ENDED
@@ -272,7 +268,7 @@ class Driver:
     def quiet_ns(self, now_ns: int) -> int:
         """Return a time [ns] during which a call of `silence` would have no effect."""
         timeout_ns = round(self.policy.excitation_timeout_s * NS_PER_S)
-        left_ns = timeout_ns if self._newest_ns is None else self._received_ns + timeout_ns - now_ns
+        left_ns = timeout_ns if self.newest_ns is None else self._received_ns + timeout_ns - now_ns
         return max(0, min(left_ns, _LONGEST_QUIET_NS))
 
     def clock_tick(self, stamp_ns: int, now_ns: int) -> Published:
@@ -432,7 +428,7 @@ class Driver:
         self._begin_again()
 
     def _begin_again(self) -> None:
-        self._newest_ns = self._counted_ns = None
+        self.newest_ns = self._counted_ns = None
         self.silences.restart()
         self.state = StreamState.WAITING
 
@@ -443,9 +439,9 @@ class Driver:
             published = self._apply(part, now_ns)
             if len(published.rows):
                 yield published
-        if self._newest_ns is None:
+        if self.newest_ns is None:
             # after a reset, a silence is measured from the stamp that the model has reached
-            self._newest_ns = self.session.stamp_ns
+            self.newest_ns = self.session.stamp_ns
 
     def _apply(self, samples: Sequence[Sample], now_ns: int) -> Published:
         applied = self.session.apply_samples(samples, each=self.every_sample)

@@ -75,11 +75,8 @@ class History:
 
     def clear(self) -> None:
         """Drop everything."""
-        for part in (
-            *(self._snapshots, self._kept_ns, self._samples),
-            *(self._stamps_ns, self._travels, self._resumed_ns),
-        ):
-            part.clear()
+        self._snapshots, self._samples, self._travels = [], [], []
+        self._kept_ns, self._stamps_ns, self._resumed_ns = [], [], []
         self._later.clear()
         self._newest_kept_ns, self._due = None, True
 
@@ -150,8 +147,12 @@ class History:
             del self._travels[place]
         self._travels.insert(place, travel)
 
-    def add_snapshot(self, stamp_ns: int, data: bytes, *, kept: bool = True) -> None:
-        """Add a snapshot at `stamp_ns`. If `kept` is set, the stamp is recorded as the first stamp of a cell."""
+    def add_snapshot(self, stamp_ns: int, data: bytes, *, kept: bool = True, resumed: bool = False) -> None:
+        """Add a snapshot at `stamp_ns`.
+
+        If `kept` is set, the stamp is recorded as the first stamp of a cell. If `resumed` is set, the load was held
+        before the sample at this stamp.
+        """
         if not self._span_ns:
             return
         if not self._snapshots or self._snapshots[-1][0] < stamp_ns:
@@ -159,10 +160,7 @@ class History:
         self._due = False
         if kept and not (self._kept_ns and stamp_ns <= self._kept_ns[-1]):
             self._keep(np.array([stamp_ns]))
-
-    def add_resumed(self, stamp_ns: int) -> None:
-        """Store the stamp of the first sample after a held load."""
-        if self._span_ns:
+        if resumed:
             self._resumed_ns = [*(found for found in self._resumed_ns if found > self._kept_ns[0]), stamp_ns]
 
     def correction_limit_ns(self, stamp_ns: int) -> int:

@@ -70,9 +70,6 @@ class Verdict(Enum):
         self.used = self.resets or name in ("accepted", "worked_in")
 
 
-def _ignore(verdict: Verdict, stamp_ns: int, values: Sequence[float]) -> None: ...
-
-
 class Intake:
     """Judge the samples of one stream in order of arrival.
 
@@ -98,7 +95,7 @@ class Intake:
         jump_forward_s: float = 10.0,
         expected_rate_hz: float = 0.0,
         limits: Limits | None = None,
-        on_unused: Callable[[Verdict, int, Sequence[float]], object] = _ignore,
+        on_unused: Callable[[Verdict, int, Sequence[float]], object] = lambda verdict, stamp_ns, values: None,
     ) -> None:
         self._on_unused = on_unused
         self.jump_back_s = jump_back_s

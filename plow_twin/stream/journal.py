@@ -253,7 +253,17 @@ Entry = (
 )
 
 
-def whole_pose(part: PartOfPose) -> tuple[float, ...]:
+def pose_entry(stamp_ns: int, pose: tuple[float, ...], deviation: tuple[float, ...] = ()) -> Pose | PartOfPose:
+    """Return the entry of a measured pose (x, y [m], theta [rad]), in which a missing component is NaN."""
+    known = tuple(index for index, value in enumerate(pose) if math.isfinite(value))
+    if len(known) < len(pose):
+        return PartOfPose(stamp_ns, known, tuple(pose[index] for index in known))
+    return Pose(stamp_ns, pose, deviation)
+
+
+def whole_pose(entry: Pose | PartOfPose) -> tuple[float, ...]:
     """Return x, y [m] and theta [rad] of a pose, with NaN for each component that was not measured."""
-    known = dict(zip(part.components, part.values, strict=True))
+    if isinstance(entry, Pose):
+        return entry.pose
+    known = dict(zip(entry.components, entry.values, strict=True))
     return tuple(known.get(index, math.nan) for index in range(3))

@@ -32,11 +32,8 @@ from plow_twin.stream.journal import (
     Digest,
     Entry,
     Estimated,
-    Failed,
-    Gaps,
     Hold,
     Loss,
-    Mark,
     Parameter,
     PartOfPose,
     Pose,
@@ -46,10 +43,8 @@ from plow_twin.stream.journal import (
     SetModel,
     SetWear,
     Snapshot,
-    Spread,
     Travel,
     Unload,
-    Unused,
     whole_pose,
 )
 from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
@@ -74,9 +69,6 @@ _AHEAD_NS: Final = 3_600_000_000_000
 _WEAR_SIZE: Final = 8 * PAIR_COUNT
 _NO_LOAD: Final = np.zeros((1, 3))
 _NO_ROWS: Final = NOTHING.rows
-
-
-def _ignore(entry: Entry) -> None: ...
 
 
 class _Measured(NamedTuple):
@@ -178,7 +170,7 @@ class Session:
         self,
         twin: Driven,
         origin_ns: int | None = None,
-        on_entry: Callable[[Entry], object] = _ignore,
+        on_entry: Callable[[Entry], object] = lambda entry: None,
         *,
         rollback_span_s: float = 0.0,
         wear_depth: Sequence[float] | None = None,
@@ -251,49 +243,40 @@ class Session:
                 return self.apply_samples([entry]).rows[-1:]
             case Hold() | Unload():
                 return self._apply_hold(entry)
+            case Digest() | Loss():
+                return None
             case Travel(_, speed):
                 check_travel_speed(self.twin.scene, speed)
-                self._on_entry(entry)
+        self._on_entry(entry)
+        match entry:
+            case Travel():
                 self._apply_travel(entry)
             case Reset():
-                self._on_entry(entry)
                 self._restart(self.wear_depth)
             case SetWear(_, depth):
-                self._on_entry(entry)
                 self._restart(np.array(depth))
                 # the estimate refers to the wear before this change
                 self.outputs.clear_shift()
             case Estimated(shift=shift):
-                self._on_entry(entry)
                 self.outputs.set_shift(shift)
                 if self.stamp_ns is not None:
                     self._follow(self.stamp_ns, entry)
             case SetModel(_, changes):
-                self._on_entry(entry)
                 self._change_model(read_changes(changes))
             case Restore(_, data):
-                self._on_entry(entry)
                 self._restore_motion(data)
             case Pose(stamp_ns) | PartOfPose(stamp_ns):
-                self._on_entry(entry)
                 if self.following is not None and self.stamp_ns is not None and stamp_ns > self.stamp_ns + _AHEAD_NS:
                     self.poses_dropped += 1
                 else:
                     self._follow(stamp_ns, entry)
             case Parameter("follow", "parameters") if self.following is not None:
-                self._on_entry(entry)
                 self.following.follow_parameters()
                 self._forget()
-            case Parameter() | Gaps() | Mark() | Failed() | Spread() | Unused():
-                # these entries have no direct effect on the motion
-                self._on_entry(entry)
             case Snapshot(_, data):
-                self._on_entry(entry)
                 self._restore(data)
                 self._forget()
-            case Digest() | Loss():
-                pass
-        return None
+        return None  # entries of other types do not change the motion
 
     def parts(self, samples: Sequence[Sample], *, each: bool = False) -> Iterator[Sequence[Sample]]:
         """Yield parts of the samples for `apply_samples`. Each part must be applied before the next part is requested.
@@ -454,8 +437,7 @@ class Session:
             out = None if rows is None else rows[here]
             parts.append(self._advance(stamps[here], wrench[here], out, chosen, here_after, resumed=resumed))
             if resumed:
-                self._remember()
-                self.history.add_resumed(int(stamps[begin]))
+                self._remember(resumed=True)
             begin, resumed = end, False
         published = Published.joined([part.published for part in parts])
         digests = [digest for part in parts for digest in part.digests]
@@ -555,7 +537,7 @@ class Session:
         if isinstance(entry, Estimated):
             self.following.add_estimate(entry.result, time, (entry.start_ns - self.origin_ns) * 1e-9)
         else:
-            self.following.add_pose(time, entry.pose if isinstance(entry, Pose) else whole_pose(entry), known)
+            self.following.add_pose(time, whole_pose(entry), known)
         measured, earliest_ns, reached_ns = self._measured, self.history.earliest_ns, self.stamp_ns or 0
         known = max(known, self.following.time)
         measured.append(_Measured(self.following.added, reached_ns, known, stamp_ns, entry))
@@ -705,9 +687,9 @@ class Session:
         if before // DIGEST_INTERVAL != self._advances // DIGEST_INTERVAL and self.stamp_ns is not None:
             self._on_entry(Digest(self.stamp_ns, self.twin.digest()))
 
-    def _remember(self, *, kept: bool = True) -> None:
+    def _remember(self, *, kept: bool = True, resumed: bool = False) -> None:
         if self.stamp_ns is not None:
-            self.history.add_snapshot(self.stamp_ns, self.snapshot().data, kept=kept)
+            self.history.add_snapshot(self.stamp_ns, self.snapshot().data, kept=kept, resumed=resumed)
 
     def _forget(self) -> None:
         self._forget_past()
