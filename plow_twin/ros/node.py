@@ -108,11 +108,6 @@ class TwinNode(WithoutEvents, LifecycleNode):
         """Whether configure would not have to wait for the solver."""
         return self._preparation is None or self._preparation.done
 
-    def _take_preparation(self) -> Preparation:
-        preparation, self._preparation = self._preparation, None
-        assert preparation is not None
-        return preparation
-
     def start(self) -> bool:
         """Configure and activate the node; return False if a transition fails."""
         done = TransitionCallbackReturn.SUCCESS
@@ -123,7 +118,9 @@ class TwinNode(WithoutEvents, LifecycleNode):
         settings = self._table.settings
         try:
             self.prepare()
-            prepared = self._take_preparation().result(self._stop_asked)
+            preparation, self._preparation = self._preparation, None
+            assert preparation is not None
+            prepared = preparation.result(self._stop_asked)
             self._front = RosFront(self, settings, self._publish_status, prepared, self._kept_wear)
         except (PlowTwinError, OSError, ModuleNotFoundError) as error:
             self.reason = f"scene {settings.scene!r}, record_path {settings.record_path!r}: {error}"

@@ -49,9 +49,7 @@ class Model:
         mining = await self._server.get_namespace_index(_MINING)
         interval = await self._interval_type()
         equipment = self._server.get_node(ua.NodeId(_EQUIPMENT, mining))
-        device_type = await equipment.add_object_type(
-            self.node_id("PloughHeadTwinType"), self._name("PloughHeadTwinType")
-        )
+        device_type = await equipment.add_object_type(self.node_id(_TYPE), self._name(_TYPE))
         for name, group in groups.items():
             await self._add_group(device_type, name, group, interval)
         devices = self._server.get_node(ua.NodeId(_DEVICE_SET, self._di))
