@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,11 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
 
 from plow_twin.model.scene import Wear
+from plow_twin.record.entries import EntryRecord, OutputRecord
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import Message
 from plow_twin.record.outputs import publication_messages
+from plow_twin.record.reader import RunReader
 from plow_twin.record.recorder import LossReport, Recorder
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
@@ -46,6 +48,17 @@ def paper_entries(count: int) -> list[Entry]:
     last_ns = BASE_NS + (half - 1) * STEP_NS
     entries += [Hold(last_ns + 500_000_000), Reset(last_ns, "asked for"), Parameter("excitation_timeout", 0.25)]
     return entries + [paper_sample(index, BASE_NS + 10**9 + 7) for index in range(count - half)]
+
+
+def records_of(run: Path | RunReader) -> Iterator[EntryRecord | OutputRecord]:
+    """Yield the entries of a run, each followed by the messages that the twin sent after it."""
+    for batch in (run if isinstance(run, RunReader) else RunReader(run)).batches():
+        reached = np.maximum.accumulate(batch.entries.sequence).tolist()  # entries may be out of order
+        entries = [(number, 0, batch.entries.record(index)) for index, number in enumerate(reached)]
+        sent = [
+            (number, 1, part.record(i)) for part in batch.outputs for i, number in enumerate(part.sequence.tolist())
+        ]
+        yield from (record for _, _, record in sorted([*entries, *sent], key=lambda item: item[:2]))
 
 
 @dataclass

@@ -25,7 +25,7 @@ import browser
 import numpy as np
 import pytest
 from commands import plow_twin_here, started
-from record_support import PAPER_AMPLITUDE, paper_sample, record_run
+from record_support import PAPER_AMPLITUDE, paper_sample, record_run, records_of
 from waiting import until
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
@@ -326,7 +326,7 @@ def _stopped(process: subprocess.Popen[str]) -> dict[str, Any]:
 
 
 def _digests(run: Path) -> list[Digest]:
-    entries = (record.entry for record in RunReader(run) if isinstance(record, EntryRecord))
+    entries = (record.entry for record in records_of(run) if isinstance(record, EntryRecord))
     return [entry for entry in entries if isinstance(entry, Digest)]
 
 
@@ -380,7 +380,7 @@ def test_an_operator_acknowledges_and_marks_and_the_journal_has_both(tmp_path: P
         _stopped(process)
     largest = max(max(row[1:9]) for row in told["seconds"])
     assert largest > 1e5
-    entries = [record.entry for record in RunReader(tmp_path / "run") if isinstance(record, EntryRecord)]
+    entries = [record.entry for record in records_of(tmp_path / "run") if isinstance(record, EntryRecord)]
     marks = [entry.text for entry in entries if isinstance(entry, Mark) and not entry.text.startswith("alarm")]
     assert marks == ["<b>shift</b> " + "x" * 180]
     assert [entry.name for entry in entries if isinstance(entry, Parameter)] == ["alarms_acknowledged"]

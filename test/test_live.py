@@ -27,7 +27,7 @@ from urllib.request import urlopen
 import forge
 import numpy as np
 import pytest
-from record_support import PAPER_AMPLITUDE, rewrite
+from record_support import PAPER_AMPLITUDE, records_of, rewrite
 from waiting import until
 
 from plow_twin.cli.app import run as run_cli
@@ -176,7 +176,7 @@ def test_measured_poses_and_gaps_are_journaled_as_they_come(tmp_path: Path) -> N
     assert (measured.pose_deviation, measured.load_deviation) == ((1e-4, 2e-4, 3e-4), (1e3, 0.0, 2e3))
     assert (values["samples_used"], values["head_pose_used"], values["gaps_used"]) == ("100", "2", "2")
     assert values["head_pose_dropped"] == "0"
-    entries = [record.entry for record in RunReader(tmp_path / "run") if isinstance(record, EntryRecord)]
+    entries = [record.entry for record in records_of(tmp_path / "run") if isinstance(record, EntryRecord)]
     assert [entry for entry in entries if isinstance(entry, Pose | PartOfPose | Gaps)] == [
         Pose(1_030_200_000, (0.001, 0.002, 0.003)),
         Gaps(1_030_200_000, (0,), (0.004,)),
@@ -228,7 +228,7 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
     assert any(values["residual_latched"] == "warn" for values in alarms)
     recorded = [
         dict(record.message().values)
-        for record in RunReader(tmp_path / "run")
+        for record in records_of(tmp_path / "run")
         if isinstance(record, OutputRecord) and record.topic == "/alarms"
     ]
     assert len(recorded) > 3 and all(values in alarms for values in recorded)
@@ -524,7 +524,7 @@ def test_an_alarm_is_reported_once_with_value_pad_threshold_and_time_and_acknowl
         assert values["force_raised"] > values["force_threshold"] == 20e3 and values["force_place"] in PAIR_NAMES
         assert said["stamp_ns"] >= values["force_stamp_ns"] > 1_000_000_000
         assert f"kN at {values['force_place']}, warning threshold 20 kN, at 0." in said["message"]
-        again = sum(record.topic == "/alarms" for record in RunReader(tmp_path / "run") if hasattr(record, "topic"))
+        again = sum(record.topic == "/alarms" for record in records_of(tmp_path / "run") if hasattr(record, "topic"))
         assert again > 4
         mark, acknowledge = ["call", str(control), "mark", "new pads"], ["call", str(control), "acknowledge_alarms"]
         assert [run_cli(mark), run_cli(acknowledge)] == [0, 0]
@@ -545,7 +545,7 @@ def test_an_alarm_is_reported_once_with_value_pad_threshold_and_time_and_acknowl
         assert run_cli(["call", str(control), "restore"]) == 1 and "no snapshot" in capsys.readouterr().err
         assert live.stop() == 0
     assert not control.exists() and run_cli(acknowledge) == 1
-    entries = [record.entry for record in RunReader(tmp_path / "run") if isinstance(record, EntryRecord)]
+    entries = [record.entry for record in records_of(tmp_path / "run") if isinstance(record, EntryRecord)]
     marks = [entry.text for entry in entries if isinstance(entry, Mark)]
     assert marks == ["alarm: force", "new pads"]
     assert [entry.name for entry in entries if isinstance(entry, Parameter)] == ["alarms_acknowledged"]

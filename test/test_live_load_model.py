@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from record_support import records_of
 
 from plow_twin.errors import PlowTwinError
 from plow_twin.live import parameters
@@ -15,7 +16,6 @@ from plow_twin.live.front import BridgeFront
 from plow_twin.live.load_model import LoadModel, read_load_model
 from plow_twin.live.solver_start import Preparation
 from plow_twin.record.entries import EntryRecord
-from plow_twin.record.reader import RunReader
 from plow_twin.record.replay import replay
 from plow_twin.stream.journal import Sample, Spread
 
@@ -60,7 +60,7 @@ def test_absurd_telemetry_goes_through_to_where_it_is_counted_and_is_no_certaint
     assert front.run(lambda: False) == []
     values = front.parts()["input"][2]
     assert (values["samples_used"], values["dropped_implausible"]) == ("9", "1")
-    entries = [record.entry for record in RunReader(tmp_path / "run") if isinstance(record, EntryRecord)]
+    entries = [record.entry for record in records_of(tmp_path / "run") if isinstance(record, EntryRecord)]
     assert max(max(entry.deviation) for entry in entries if isinstance(entry, Spread)) < 1e6
 
 
@@ -102,7 +102,7 @@ def test_telemetry_of_the_drive_runs_the_twin_and_its_interval_is_in_the_journal
     assert front.run(lambda: False) == []
     values = front.parts()["input"][2]
     assert (values["samples_used"], values["dropped_malformed"], values["travel_used"]) == ("100", "1", "101")
-    entries = [record.entry for record in RunReader(tmp_path / "run") if isinstance(record, EntryRecord)]
+    entries = [record.entry for record in records_of(tmp_path / "run") if isinstance(record, EntryRecord)]
     first = next(entry for entry in entries if isinstance(entry, Sample))
     model = read_load_model(tmp_path / "map.yaml")
     assert model is not None

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from record_support import PAPER_AMPLITUDE
+from record_support import PAPER_AMPLITUDE, records_of
 from test_live import ROOT, _live
 from waiting import until
 
@@ -30,7 +30,6 @@ from plow_twin.live.bridge.source import BridgeError
 from plow_twin.live.diagnostics import SOURCE_KEYS
 from plow_twin.record.entries import EntryRecord
 from plow_twin.record.mapping import read_map
-from plow_twin.record.reader import RunReader
 from plow_twin.record.replay import replay
 from plow_twin.record.sources import Arrived
 from plow_twin.run.twin import Twin
@@ -292,7 +291,7 @@ def test_a_minute_without_a_connection_is_filled_and_ends_in_the_digest_of_the_u
         live.until(lambda heard: int(heard["source"]["values"]["breaks_filled"]) == 1, "filled")
         assert float(live.heard["source"]["values"]["unfilled_s"]) == 0.0
         assert live.stop() == 0
-    entries = [record.entry for record in RunReader(run) if isinstance(record, EntryRecord)]
+    entries = [record.entry for record in records_of(run) if isinstance(record, EntryRecord)]
     interrupted, whole = (
         Session(Twin(load_scene("paper"), excitation="sampled"), rollback_span_s=2.0) for _ in range(2)
     )

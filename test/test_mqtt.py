@@ -21,6 +21,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from commands import plow_twin_here
+from record_support import records_of
 from test_live import ROOT, _csv, _free_port, _live, _row
 from waiting import until
 
@@ -31,7 +32,6 @@ from plow_twin.live.bridge.mqtt import Mqtt
 from plow_twin.live.bridge.paho_client import make_client, use_tls
 from plow_twin.live.bridge.source import BridgeError
 from plow_twin.record.entries import EntryRecord
-from plow_twin.record.reader import RunReader
 from plow_twin.stream.journal import Digest
 from plow_twin.telemetry.mqtt import Broker, Message
 from plow_twin.telemetry.sparkplug import Payload
@@ -368,7 +368,7 @@ def test_a_missing_broker_is_reported_and_costs_the_twin_nothing(tmp_path: Path)
 
 
 def _entries(run: Path) -> list[object]:
-    return [record.entry for record in RunReader(run) if isinstance(record, EntryRecord)]
+    return [record.entry for record in records_of(run) if isinstance(record, EntryRecord)]
 
 
 def test_messages_that_wait_for_a_broker_are_bounded_counted_and_come_in_order(tmp_path: Path) -> None:

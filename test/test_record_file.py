@@ -24,7 +24,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from record_support import BASE_NS, Run, chunk_spans, paper_entries, record_run, rewrite
+from record_support import BASE_NS, Run, chunk_spans, paper_entries, record_run, records_of, rewrite
 from rosbags.highlevel import AnyReader
 
 from plow_twin.errors import RecordingError
@@ -103,7 +103,7 @@ def test_equal_messages_have_equal_bytes(values: list[float], stamp_ns: int) -> 
 
 def test_journal_keeps_order_of_use_in_one_counter(run: Run) -> None:
     reader = RunReader(run.folder)
-    records = list(reader)
+    records = list(records_of(reader))
     journal = [record for record in records if isinstance(record, EntryRecord)]
     assert [record.sequence for record in journal] == list(range(len(journal)))
     assert [record.entry for record in journal] == run.entries
@@ -170,7 +170,7 @@ def test_rerun_checks_the_file(run: Run) -> None:
 
 def test_a_file_cut_anywhere_gives_its_content_before_the_cut(run: Run, tmp_path: Path) -> None:
     data = run.file.read_bytes()
-    whole = list(RunReader(run.file))
+    whole = list(records_of(run.file))
     rng = random.Random(1)
     first_chunk = chunk_spans(run.file)[0][0]
     cuts = {*rng.sample(range(first_chunk, len(data)), 60), *range(len(data) - 40, len(data) - 8)}
@@ -178,7 +178,7 @@ def test_a_file_cut_anywhere_gives_its_content_before_the_cut(run: Run, tmp_path
     for cut in sorted(cuts):
         cut_file.write_bytes(data[:cut])
         reader = RunReader(cut_file)
-        records = list(reader)
+        records = list(records_of(reader))
         # journal and outputs are in separate chunks, so a truncated file contains the first records of each
         for kind in (EntryRecord, OutputRecord):
             found = [record for record in records if isinstance(record, kind)]
@@ -189,7 +189,7 @@ def test_a_file_cut_anywhere_gives_its_content_before_the_cut(run: Run, tmp_path
 
 def test_a_damaged_byte_costs_one_chunk_and_is_reported(run: Run, tmp_path: Path) -> None:
     data = bytearray(run.file.read_bytes())
-    whole = list(RunReader(run.file))
+    whole = list(records_of(run.file))
     spans = chunk_spans(run.file)
     rng = random.Random(2)
     for start, length in (spans[0], spans[len(spans) // 2], spans[-1]):
@@ -199,7 +199,7 @@ def test_a_damaged_byte_costs_one_chunk_and_is_reported(run: Run, tmp_path: Path
         file.write_bytes(data)
         data[place] ^= 0x40
         reader = RunReader(file)
-        records = list(reader)
+        records = list(records_of(reader))
         assert (reader.damaged_chunks, reader.status) == (1, FileStatus.DAMAGED)
         rest = iter(whole)
         assert 0 < len(records) < len(whole)

@@ -51,6 +51,6 @@ def test_files_fed_live_are_merged_by_the_stamps_that_the_mapping_reads(tmp_path
     mapping.write_text("excitation: {topic: load}\ntravel: {topic: travel, stamp: zeit, stamp_unit: ms}\n")
     files = Files([tmp_path / "load.csv", tmp_path / "travel.csv"], follow=False)
     roles = read_map(mapping, files.topics())
-    files.start([role.topic for role in roles.values()], stamps_by(roles.values()))
+    files.start([role.topic for role in roles.values()], stamps_by(roles))
     assert [row.topic for row in files.poll(0.0)] == ["load", "travel", *["load"] * 3, "travel", *["load"] * 4]
     files.close()

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
-from record_support import chunk_spans, paper_sample, record_run, rewrite
+from record_support import chunk_spans, paper_sample, record_run, records_of, rewrite
 from rosbags.highlevel import AnyReader
 
 from plow_twin import Wear
@@ -54,7 +54,7 @@ def test_parts_are_whole_alone_and_nothing_is_lost_between_them(tmp_path: Path) 
     assert (report.exit_code, report.samples, report.compared["contact_forces"]) == (0, COUNT, COUNT)
     assert report.snapshots_compared == len(parts) - 1
     for part in parts[1:]:
-        first = next(iter(RunReader(part)))
+        first = next(iter(records_of(part)))
         assert isinstance(first.entry, Snapshot)  # type: ignore[union-attr]
         alone = replay(part)
         assert (alone.exit_code, alone.lost) == (0, {}) and alone.samples > 0
@@ -93,12 +93,12 @@ def test_a_recording_that_was_cut_off_is_repaired(share: float, tmp_path: Path) 
     (run.folder / "metadata.yaml").unlink()
     before = examine(run.folder)
     assert before.problems and before.status == FileStatus.TRUNCATED.value
-    found = list(RunReader(run.folder))
+    found = list(records_of(run.folder))
     assert repair(run.folder) == [run.file]
     after = examine(run.folder)
     assert after.problems == [] and after.status == FileStatus.COMPLETE.value
     # the repaired file contains every record that could be read before, but not always in the same order
-    assert {repr(record) for record in RunReader(run.folder)} == {repr(record) for record in found}
+    assert {repr(record) for record in records_of(run.folder)} == {repr(record) for record in found}
     assert replay(run.folder).exit_code == 0
     with AnyReader([run.folder]) as reader:
         assert reader.message_count == len(found)
@@ -360,7 +360,7 @@ def test_parts_that_are_removed_while_others_are_read_are_passed_over(
     assert len(parts) >= 4
     reader = RunReader(run.folder)
     parts[0].unlink()
-    records = iter(reader)
+    records = iter(records_of(reader))
     first = next(records)
     parts[1].unlink()  # the reader has already opened this part, so it reads the part to its end
     parts[2].unlink()

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 import yaml
 from commands import started
-from record_support import BASE_NS, STEP_NS, paper_sample
+from record_support import BASE_NS, STEP_NS, paper_sample, records_of
 from waiting import until
 
 from plow_twin.errors import RecordingError
@@ -143,7 +143,7 @@ def check_killed(folder: Path, lines: list[str], flush_s: float) -> None:
     whole = [line for line in lines if len(line.split()) == 2 and line.endswith("\n")]
     last_index, last_ns = map(int, whole[-1].split())
     reader = RunReader(folder)
-    records = list(reader)
+    records = list(records_of(reader))
     assert reader.status is FileStatus.TRUNCATED
     assert not (folder / "metadata.yaml").exists()
     stamps = [r.entry.stamp_ns for r in records if isinstance(r, EntryRecord) and isinstance(r.entry, Sample)]
@@ -192,7 +192,7 @@ def test_a_full_queue_is_counted_and_noted_in_the_file(tmp_path: Path) -> None:
     assert len(kept_samples) + loss.lost[JOURNAL] >= 4000
 
     reader = RunReader(tmp_path / "run")
-    records = list(reader)
+    records = list(records_of(reader))
     entries = [record.entry for record in records if isinstance(record, EntryRecord)]
     assert [entry for entry in entries if isinstance(entry, Sample)] == kept_samples
     assert [r.publish_time_ns for r in records if isinstance(r, OutputRecord)] == kept_messages
@@ -227,7 +227,7 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> Non
     assert report["errors"] == [report["error"]] and "File too large" in report["error"]
     assert not report["closed"] and report["refused"] > 0 and report["counted"] == report["lost"]
     reader = RunReader(tmp_path / "run")
-    entries = [record for record in reader if isinstance(record, EntryRecord)]
+    entries = [record for record in records_of(reader) if isinstance(record, EntryRecord)]
     assert reader.status is FileStatus.TRUNCATED and len(entries) > 100
     # every item is in the file or counted as lost; the item that was being written when the disk became full may be
     # both
@@ -244,7 +244,7 @@ def test_little_free_space_ends_a_recording_that_can_be_read(tmp_path: Path) -> 
     assert errors == [loss.error] and f"expected at least {2**62} B" in errors[0]
     assert loss.closed and loss.lost[JOURNAL] >= 1
     reader = RunReader(tmp_path / "run")
-    list(reader)
+    list(records_of(reader))
     assert reader.status is FileStatus.STOPPED_EARLY
     assert reader.stop_reason is not None and reader.stop_reason in errors[0]
     bag = yaml.safe_load((tmp_path / "run" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
@@ -417,7 +417,7 @@ def test_losses_of_callers_do_not_disturb_the_closing_of_the_file(
     loss = recorder.close()
     assert loss.closed and loss.lost == {"/late": 1}
     reader = RunReader(tmp_path / "run")
-    list(reader)
+    list(records_of(reader))
     assert reader.lost == {} and reader.status is FileStatus.STOPPED_EARLY
 
 
@@ -436,7 +436,7 @@ def test_an_open_recorder_is_closed_at_exit(tmp_path: Path) -> None:
     process.communicate(timeout=60)
     assert process.returncode == 0
     reader = RunReader(tmp_path / "run")
-    assert sum(isinstance(record, EntryRecord) for record in reader) == 200
+    assert sum(isinstance(record, EntryRecord) for record in records_of(reader)) == 200
     assert reader.status is FileStatus.COMPLETE
     assert (tmp_path / "run" / "metadata.yaml").exists()
 
@@ -495,7 +495,7 @@ def test_of_recorders_that_want_one_folder_each_gets_its_own(tmp_path: Path, mon
         assert recorder.journal(paper_sample(index)) and recorder.close().complete
     assert [recorder.path.parent.name for recorder in recorders] == ["run", "run_2", "run_3"]
     for index, recorder in enumerate(recorders):
-        (record,) = RunReader(recorder.path)
+        (record,) = records_of(recorder.path)
         assert isinstance(record, EntryRecord) and record.entry == paper_sample(index)
 
 
@@ -545,7 +545,9 @@ def test_with_sync_flushed_data_survive_a_loss_of_power(tmp_path: Path) -> None:
     assert {str(folder), str(tmp_path)} <= {path for path, _ in synced}
     os.truncate(file, max(size for path, size in synced if path == str(file)))
     reader = RunReader(folder)
-    stamps = [r.entry.stamp_ns for r in reader if isinstance(r, EntryRecord) and isinstance(r.entry, Sample)]
+    stamps = [
+        r.entry.stamp_ns for r in records_of(reader) if isinstance(r, EntryRecord) and isinstance(r.entry, Sample)
+    ]
     assert before > 0 and len(stamps) > before
     assert stamps == [BASE_NS + index * STEP_NS for index in range(len(stamps))]
 

@@ -23,6 +23,7 @@ from record_support import (
     paper_entries,
     paper_sample,
     record_run,
+    records_of,
     rewrite,
 )
 
@@ -223,7 +224,7 @@ def test_replay_goes_on_from_the_snapshot_after_a_loss(tmp_path: Path) -> None:
     assert report.lost == dict(run.loss.lost)
     last = max(m.stamp_ns for _, m in run.outputs if isinstance(m, JointState))
     reader = RunReader(run.folder)
-    kept = [record.entry for record in reader if hasattr(record, "entry")]
+    kept = [record.entry for record in records_of(reader) if hasattr(record, "entry")]
     assert report.samples == sum(isinstance(entry, Sample) for entry in kept) < COUNT
     assert report.span_s > 0 and last == BASE_NS + (COUNT - 1) * STEP_NS
     assert report.messages_compared > 0 and report.digests_compared > 0
@@ -263,8 +264,8 @@ def test_a_journal_alone_gives_the_full_recording_again(tmp_path: Path) -> None:
     full = record_run(tmp_path / "full", paper_entries(COUNT))
     report = replay(bare.folder, write=tmp_path / "made")
     assert (report.exit_code, report.divergences) == (0, 0)
-    made = [(r.topic, r.data) for r in RunReader(tmp_path / "made") if isinstance(r, OutputRecord)]
-    assert made == [(r.topic, r.data) for r in RunReader(full.folder) if isinstance(r, OutputRecord)]
+    made = [(r.topic, r.data) for r in records_of(tmp_path / "made") if isinstance(r, OutputRecord)]
+    assert made == [(r.topic, r.data) for r in records_of(full.folder) if isinstance(r, OutputRecord)]
     again = replay(tmp_path / "made")
     assert (again.exit_code, again.compared["contact_forces"]) == (0, COUNT + 1)
 

@@ -15,6 +15,7 @@ from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from record_support import records_of
 from ros_processes import Bench, Process, bench, value
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -110,7 +111,7 @@ def test_only_an_active_node_uses_samples_and_cleanup_closes_its_recording(manag
     assert _change(managed, Transition.TRANSITION_DEACTIVATE)
     assert _change(managed, Transition.TRANSITION_CLEANUP)
     reader = RunReader(tmp_path / "run")
-    assert [type(getattr(record, "entry", None)).__name__ for record in reader].count("Sample") == 1
+    assert [type(getattr(record, "entry", None)).__name__ for record in records_of(reader)].count("Sample") == 1
     assert reader.status is FileStatus.COMPLETE
     probe.until(lambda: probe.node.count_publishers("contact_forces") == 0, "released publishers")
 
@@ -141,7 +142,7 @@ def test_a_shutdown_while_active_ends_in_finalized_and_a_clean_exit(tmp_path: Pa
         assert _change(running, Transition.TRANSITION_ACTIVE_SHUTDOWN)
         assert _state(running) == "finalized"
         reader = RunReader(tmp_path / "run")
-        assert len(list(reader)) > 0 and reader.status is FileStatus.COMPLETE
+        assert len(list(records_of(reader))) > 0 and reader.status is FileStatus.COMPLETE
         assert running.twin.stop() == 0
         assert "Traceback" not in running.twin.output()
 
@@ -308,7 +309,7 @@ def test_the_model_changes_a_motion_comes_back_and_the_journal_gives_it_all_agai
         feed(150)
         assert clearances[-1].position[0] == 0.04
         assert running.twin.stop() == 0
-    entries = [record.entry for record in RunReader(run) if isinstance(record, EntryRecord)]
+    entries = [record.entry for record in records_of(run) if isinstance(record, EntryRecord)]
     assert [entry.text for entry in entries if isinstance(entry, Mark)] == ["wider"]
     report = replay(run)
     assert (report.exit_code, report.samples, report.first_divergence) == (0, sent, None)

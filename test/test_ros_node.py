@@ -28,6 +28,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from record_support import records_of
 from ros_processes import ROOT, WAIT_S, Process, bench, value
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -335,7 +336,7 @@ def test_an_alarm_stays_until_it_is_acknowledged_and_writes_the_time_before_it(t
     # the first ring begins with the run, so its replay raises the alarm again; the second ring does not contain its
     # cause
     assert (before.compared["alarms"], after.compared["alarms"]) == (1, 0) and after.not_compared["alarms"] > 0
-    kinds = [type(record.entry).__name__ for record in RunReader(tmp_path / "run_2") if hasattr(record, "entry")]
+    kinds = [type(record.entry).__name__ for record in records_of(tmp_path / "run_2") if hasattr(record, "entry")]
     # the acknowledgement and the text of the mark are Parameter entries; the mark itself is a Mark entry
     assert (kinds.count("Parameter"), kinds.count("Mark")) == (2, 1)
 
@@ -387,7 +388,7 @@ def test_a_delay_that_rises_for_good_is_worked_in_marked_and_replayed_exactly(tm
     assert report.compared["contact_peaks"] >= len(forces) and not report.not_compared
     # the messages in the file are those that a subscriber has received
     topic = f"{running.namespace}/contact_forces"
-    recorded = [item.message() for item in RunReader(record) if getattr(item, "topic", "") == topic]
+    recorded = [item.message() for item in records_of(record) if getattr(item, "topic", "") == topic]
     assert len(recorded) >= len(forces)
     for ours, theirs in zip(forces, recorded, strict=False):
         assert stamp_ns(ours.header) == theirs.stamp_ns
@@ -535,7 +536,7 @@ def test_a_stop_under_load_is_clean_and_closes_the_recording(tmp_path: Path, num
         assert publisher.stop_again_and_again(number) == 0
         assert "Traceback" not in publisher.output()
     reader = RunReader(tmp_path / "run")
-    used = sum(1 for record in reader if type(getattr(record, "entry", None)).__name__ == "Sample")
+    used = sum(1 for record in records_of(reader) if type(getattr(record, "entry", None)).__name__ == "Sample")
     assert reader.status is FileStatus.COMPLETE
     assert used > 500 and not reader.lost
     report = replay(tmp_path / "run")
@@ -568,7 +569,7 @@ def test_a_twin_ends_cleanly_when_its_launch_has_gone(tmp_path: Path, monkeypatc
     launch.communicate()
     assert gone and not left
     reader = RunReader(tmp_path / "run")
-    assert list(reader) and reader.status is FileStatus.COMPLETE
+    assert list(records_of(reader)) and reader.status is FileStatus.COMPLETE
 
 
 def test_a_stop_while_the_solver_is_compiled_is_clean(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -667,7 +668,7 @@ def test_under_sim_time_silence_moves_nothing(tmp_path: Path) -> None:
         assert running.twin.stop() == 0
     report = replay(run)
     assert (report.exit_code, report.samples) == (0, 200)
-    assert all(record.log_time_ns >= T0 for record in RunReader(run))
+    assert all(record.log_time_ns >= T0 for record in records_of(run))
 
 
 def test_diagnostics_go_on_without_a_clock_and_hold_every_documented_key(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+from record_support import records_of
 from sensor_msgs.msg import JointState
 from waiting import until
 
@@ -213,7 +214,7 @@ def test_a_ring_that_the_disk_does_not_take_is_trouble_and_counted(
         room.set()
         mark(1, 1)
         reader = RunReader(folder)
-        assert list(reader) and reader.status is FileStatus.COMPLETE
+        assert list(records_of(reader)) and reader.status is FileStatus.COMPLETE
         assert not recorder.close().complete
 
 
@@ -259,7 +260,7 @@ def test_the_covariance_of_each_pose_goes_into_the_journal_and_the_estimate(tmp_
         list(front.runtime.step([(stamp * 1_000_000_000, (0.0, 0.0, 0.0)) for stamp in (1, 2, 3)]))
         assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
         assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
-    entries = [record.entry for record in RunReader(run) if isinstance(record, EntryRecord)]
+    entries = [record.entry for record in records_of(run) if isinstance(record, EntryRecord)]
     poses = [entry for entry in entries if isinstance(entry, Pose)]
     assert [pose.deviation for pose in poses] == [(1e-4, 2e-4, 3e-3), (), (3e-4, 2e-4, 3e-3)]
     mean = math.sqrt((1e-8 + 9e-8) / 2)

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pytest
 import rerun as rr
 from figure_checks import kept_figures
-from record_support import BASE_NS, STEP_NS, Run, paper_sample, record_run
+from record_support import BASE_NS, STEP_NS, Run, paper_sample, record_run, records_of
 from rerun.chunk import RrdReader
 
 from plow_twin.cli.app import run as cli
@@ -71,7 +71,7 @@ def curve_names(path: Path) -> dict[str, str]:
 def journal_around_the_hole(folder: Path) -> list[Sample]:
     samples = [
         (record.sequence, record.entry)
-        for record in RunReader(folder)
+        for record in records_of(folder)
         if isinstance(record, EntryRecord) and isinstance(record.entry, Sample)
     ]
     place = int(np.argmax(np.diff([sequence for sequence, _ in samples])))

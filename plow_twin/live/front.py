@@ -97,7 +97,7 @@ class BridgeFront:
         self._said: Part | None = None
         model = read_load_model(mapping)
         self.roles = roles_of(bridge, mapping, settings.excitation_source, model is not None, units)
-        bridge.start([role.topic for role in self.roles.values()], stamps_by(self.roles.values()))
+        bridge.start([role.topic for role in self.roles.values()], stamps_by(self.roles))
         self._first = deque(_first_messages(bridge) if bridge.ends else ())
         try:
             check_units(chain.from_iterable(self._first), self.roles, prepared.scene, "input")
@@ -244,7 +244,8 @@ class BridgeFront:
         periodic += self.timers
         while not stop_asked() and (self._first or not bridge.finished) and time.monotonic() < give_up:
             next_due = min(timer.due for timer in periodic)
-            messages = self._messages(max(0.0, min(_POLL_S, next_due - time.monotonic())))
+            wait_s = max(0.0, min(_POLL_S, next_due - time.monotonic()))
+            messages = self._first.popleft() if self._first else bridge.poll(wait_s)
             inputs.lost = bridge.lost
             if bridge.trouble != trouble:
                 trouble = bridge.trouble
@@ -270,11 +271,6 @@ class BridgeFront:
         for name, part in self.parts().items() if self._watchers else ():
             for watcher in self._watchers:
                 watcher.part(name, part)
-
-    def _messages(self, timeout_s: float) -> Messages:
-        if not self._first:
-            return self._bridge.poll(timeout_s)
-        return self._first.popleft()
 
     def _report(self) -> None:
         self.changed()

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.model.pairs import PAIR_NAMES
-from plow_twin.record.cdr import decode, encode
-from plow_twin.record.entries import OutputRecord
+from plow_twin.record.cdr import encode
+from plow_twin.record.entries import OutputRecord, first_difference
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.record.times import time_text
@@ -168,7 +168,7 @@ class AlarmCheck:
             if record.sequence != sequence:
                 difference = "place in the journal", str(record.sequence), str(sequence)
             elif record.data != encode(computed):
-                difference = _first_difference(record, computed)
+                difference = first_difference(record, computed)
             else:
                 continue
             yield step, record.publish_time_ns, ALARMS, *difference
@@ -187,13 +187,3 @@ class AlarmCheck:
     def _say(self, sequence: int, step: int) -> None:
         hardware_id = str(self._header.parameters.get("hardware_id", ""))
         self._computed.append((sequence, step, alarms_message(self._alarms, self._header.node, hardware_id)))
-
-
-def _first_difference(record: OutputRecord, computed: DiagnosticStatus) -> tuple[str, str, str]:
-    recorded = decode(record.data, record.message_type)
-    if not isinstance(recorded, DiagnosticStatus):
-        return "type", record.message_type, computed.TYPE
-    for (key, ours), (name, theirs) in zip(computed.values, recorded.values, strict=False):
-        if (key, ours) != (name, theirs):
-            return key, theirs if key == name else name, ours
-    return "message", repr(recorded), repr(computed)

@@ -13,10 +13,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import decode
 from plow_twin.record.chunks import Messages
 from plow_twin.record.journal_codec import Dropped
-from plow_twin.record.messages import Message
+from plow_twin.record.messages import DiagnosticStatus, Message
 from plow_twin.record.template import Indexes, compiled
 from plow_twin.stream.journal import Digest, Entry, Sample
 
@@ -49,9 +50,6 @@ class OutputRecord:
     def message(self) -> Message:
         """Return the decoded message."""
         return decode(self.data, self.message_type)
-
-
-Record = EntryRecord | OutputRecord
 
 
 @dataclass(frozen=True)
@@ -248,24 +246,28 @@ def parted_at(outputs: Sequence[Outputs], end: int) -> tuple[list[Outputs], list
     return before, after
 
 
-def in_order(batch: Batch) -> Iterator[Record]:
-    """Yield each entry, followed by the outputs that the twin sent after the entry."""
-    sequences = [part.sequence for part in batch.outputs]
-    owners = np.concatenate([np.full(len(part), number) for number, part in enumerate(sequences)] or [np.zeros(0, int)])
-    places = np.concatenate([np.arange(len(part)) for part in sequences] or [np.zeros(0, int)])
-    # A message is placed before the first entry with a higher sequence number. The search needs ascending numbers, but
-    # entries may be out of order. Each number is therefore replaced by the highest number up to its entry.
-    bounds = np.maximum.accumulate(batch.entries.sequence) if len(batch.entries) else batch.entries.sequence
-    slots = np.searchsorted(bounds, np.concatenate(sequences or [np.zeros(0, np.int64)]), side="right")
-    order = np.argsort(slots, kind="stable")
-    ends = np.searchsorted(slots[order], np.arange(len(batch.entries) + 1), side="right")
-    begin = 0
-    for slot in range(len(batch.entries) + 1):
-        if slot:
-            yield batch.entries.record(slot - 1)
-        for index in order[begin : ends[slot]].tolist():
-            yield batch.outputs[int(owners[index])].record(int(places[index]))
-        begin = int(ends[slot])
+def first_difference(record: OutputRecord, computed: Message) -> tuple[str, str, str]:
+    """Return the first field in which two messages differ, with the recorded and the computed value of the field."""
+    try:
+        recorded = record.message()
+    except RecordingError:
+        return "encoding", "bytes that are not a message", "a message"
+    if type(recorded) is not type(computed):
+        return "type", record.message_type, computed.TYPE
+    if isinstance(recorded, DiagnosticStatus) and isinstance(computed, DiagnosticStatus):
+        for (name, old), (key, new) in zip(recorded.values, computed.values, strict=False):
+            if (name, old) != (key, new):
+                return key, old if key == name else name, new
+    for name in type(computed).__dataclass_fields__:
+        old, new = getattr(recorded, name), getattr(computed, name)
+        if isinstance(new, np.ndarray) and np.shape(old) == np.shape(new):
+            places = np.flatnonzero(np.asarray(old).view(np.int64) != new.view(np.int64))
+            if places.size:
+                place = int(places[0])
+                return f"{name}[{place}]", repr(float(old[place])), repr(float(new[place]))
+        elif repr(old) != repr(new):
+            return name, repr(old), repr(new)
+    return "encoding", "these bytes", "other bytes for the same values"
 
 
 @compiled

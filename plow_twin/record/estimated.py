@@ -73,8 +73,7 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
                     formed.clear()
                 case Estimated(end_ns=end_ns) as entry:
                     yield LiveEstimate(entry, _whole(formed.get(end_ns) or windows.last(), entry))
-                    for end in [end for end in formed if end <= end_ns]:
-                        del formed[end]
+                    formed = {end: window for end, window in formed.items() if end > end_ns}
 
 
 def left_by(reader: RunReader) -> tuple[Scene, Estimated | None]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from plow_twin.record.mapping import read_map, readings, stamps_by, with_units
+from plow_twin.record.mapping import messages_of, read_map, readings, with_units
 from plow_twin.record.sources import open_source
 
 
@@ -75,8 +75,7 @@ def foreign_facts(path: Path, mapping: Path | None, units: Mapping[str, str]) ->
     topics = source.topics()
     roles = with_units(read_map(mapping, topics), units)
     seen = {name: _Seen() for name in roles}
-    wanted = {role.topic for role in roles.values()}
-    for name, _, reading in readings(source.messages(wanted.__contains__, stamps_by(roles.values())), roles):
+    for name, _, reading in readings(messages_of(source, roles), roles):
         seen[name].add(reading)
     lost = {key: count for key, count in source.losses.counts.items() if count}
     facts = {

@@ -259,9 +259,7 @@ def readings(
     tuple
         Name of the role, message, and result of `Role.read`.
     """
-    by_topic: dict[str, list[tuple[str, Role]]] = {}
-    for name, role in roles.items():
-        by_topic.setdefault(role.topic, []).append((name, role))
+    by_topic = roles_by_topic(roles)
     for arrived in messages:
         shared = by_topic.get(arrived.topic, [])
         for name, role in shared:
@@ -269,17 +267,23 @@ def readings(
                 yield name, arrived, role.read(arrived)
 
 
-def stamps_by(roles: Iterable[Role]) -> StampOf[Arrived]:
+def roles_by_topic(roles: Mapping[str, Role]) -> dict[str, list[tuple[str, Role]]]:
+    """Return the roles of each topic, with their names."""
+    found: dict[str, list[tuple[str, Role]]] = {}
+    for name, role in roles.items():
+        found.setdefault(role.topic, []).append((name, role))
+    return found
+
+
+def stamps_by(roles: Mapping[str, Role]) -> StampOf[Arrived]:
     """Return a function that returns the stamp of a message [ns].
 
     If a topic has several roles, the first role that finds a stamp determines it.
     """
-    by_topic: dict[str, list[Role]] = {}
-    for role in roles:
-        by_topic.setdefault(role.topic, []).append(role)
+    by_topic = roles_by_topic(roles)
 
     def stamp_ns(arrived: Arrived) -> int | None:
-        found = (role.stamp_ns(arrived) for role in by_topic.get(arrived.topic, ()))
+        found = (role.stamp_ns(arrived) for _, role in by_topic.get(arrived.topic, ()))
         return next((stamp for stamp in found if stamp is not None), None)
 
     return stamp_ns
@@ -288,7 +292,7 @@ def stamps_by(roles: Iterable[Role]) -> StampOf[Arrived]:
 def messages_of(source: Source, roles: Mapping[str, Role]) -> Iterator[Arrived]:
     """Yield the messages of all topics that have a role; messages from several files are merged by their stamps."""
     topics = {role.topic for role in roles.values()}
-    return source.messages(topics.__contains__, stamps_by(roles.values()))
+    return source.messages(topics.__contains__, stamps_by(roles))
 
 
 def roles_by_source(

@@ -154,7 +154,8 @@ class McapFile:
         self._chunk_index = bytearray()
         self._chunk_count = 0
         self._metadata: list[Any] = []
-        self._counts: Counter[int] = Counter()
+        #: number of messages of each channel
+        self.counts: Counter[int] = Counter()
         self._times: list[int] = []
         self.out.write(MAGIC)
         self._write(Header("ros2", library))
@@ -163,11 +164,6 @@ class McapFile:
     def size(self) -> int:
         """Size of the file so far [B]."""
         return self.out.tell()
-
-    @property
-    def counts(self) -> Counter[int]:
-        """Number of messages of each channel."""
-        return self._counts
 
     @property
     def times(self) -> tuple[int, int]:
@@ -240,7 +236,7 @@ class McapFile:
         self.out.write(b"".join(parts))
         self._undeclared = []
         for channel, entries in index.items():
-            self._counts[channel] += len(entries)
+            self.counts[channel] += len(entries)
         self._times += [first, last]
         if len(self._times) > 64:
             self._times = [min(self._times), max(self._times)]
@@ -270,9 +266,9 @@ class McapFile:
         statistics = Statistics(
             attachment_count=0,
             channel_count=len(self._channels),
-            channel_message_counts=dict(self._counts),
+            channel_message_counts=dict(self.counts),
             chunk_count=self._chunk_count,
-            message_count=self._counts.total(),
+            message_count=self.counts.total(),
             metadata_count=len(self._metadata),
             message_start_time=self.times[0],
             message_end_time=self.times[1],

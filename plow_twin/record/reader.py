@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from plow_twin.errors import ForeignRecordingError, RecordingError
 from plow_twin.record.cdr import decode
 from plow_twin.record.chunks import ChunkReader, Messages, is_mcap, metadata_records
-from plow_twin.record.entries import NO_ENTRIES, Batch, Entries, Outputs, Record, in_order, parted_at, unwrap
+from plow_twin.record.entries import NO_ENTRIES, Batch, Entries, Outputs, parted_at, unwrap
 from plow_twin.record.follow import Tail
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
 from plow_twin.record.journal_codec import Dropped, from_message, read_digests
@@ -56,7 +56,7 @@ class FileStatus(Enum):
 
 @dataclass
 class RunReader:
-    """Iterate over the records of a run.
+    """Reader of the records of a run, in batches.
 
     Parameters
     ----------
@@ -191,10 +191,6 @@ class RunReader:
         named = part_number(file)[0]
         number = self.number(file)
         return number, named != number, file.name
-
-    def __iter__(self) -> Iterator[Record]:
-        for batch in self.batches():
-            yield from in_order(batch)
 
     def batches(self, *, outputs: bool = True) -> Iterator[Batch]:
         """Yield the records in order, many at a time. Without `outputs`, only the journal is read."""

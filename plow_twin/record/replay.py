@@ -32,10 +32,10 @@ from plow_twin.build import build_fingerprint
 from plow_twin.errors import RecordingError
 from plow_twin.model.scene import Scene
 from plow_twin.record.alarms import ALARMS, AlarmCheck
-from plow_twin.record.cdr import decode, encode
+from plow_twin.record.cdr import encode
 from plow_twin.record.chunks import Messages, scan
 from plow_twin.record.comparing import Sent
-from plow_twin.record.entries import Batch, Entries, EntryRecord, OutputRecord
+from plow_twin.record.entries import Batch, Entries, EntryRecord, OutputRecord, first_difference
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
@@ -384,7 +384,7 @@ class _Replay:
         computed = publication_messages(published, self.header.frame_id, self.header.child_frame_id).get(name)
         if computed is None:
             return "message", "a message", "none"
-        return None if encode(computed) == record.data else _first_difference(record, computed)
+        return None if encode(computed) == record.data else first_difference(record, computed)
 
     def entry(self, record: EntryRecord) -> None:
         if not self.report.entries and self.header.part:
@@ -494,7 +494,7 @@ class _Replay:
         if computed is None:
             self._diverged(name, record.publish_time_ns, "message", "a message", "none")
         elif encode(computed) != record.data:
-            self._diverged(name, record.publish_time_ns, *_first_difference(record, computed))
+            self._diverged(name, record.publish_time_ns, *first_difference(record, computed))
 
     def _compare(self, topic: str, stamp_ns: int, name: str, recorded: str, computed: str) -> None:
         if recorded != computed:
@@ -545,23 +545,3 @@ def _warm_up(scene: Scene, tol: float, templates: Templates, *, rows: bool) -> N
 
 def _hash(data: bytes) -> str:
     return hashlib.blake2b(data, digest_size=8).hexdigest()
-
-
-def _first_difference(record: OutputRecord, computed: Message) -> tuple[str, str, str]:
-    """Return the first field in which two messages differ, with the recorded and the computed value of the field."""
-    try:
-        recorded = decode(record.data, record.message_type)
-    except RecordingError:
-        return "encoding", "bytes that are not a message", "a message"
-    if type(recorded) is not type(computed):
-        return "type", record.message_type, computed.TYPE
-    for name in type(computed).__dataclass_fields__:
-        old, new = getattr(recorded, name), getattr(computed, name)
-        if isinstance(new, np.ndarray) and np.shape(old) == np.shape(new):
-            places = np.flatnonzero(np.asarray(old).view(np.int64) != new.view(np.int64))
-            if places.size:
-                place = int(places[0])
-                return f"{name}[{place}]", repr(float(old[place])), repr(float(new[place]))
-        elif repr(old) != repr(new):
-            return name, repr(old), repr(new)
-    return "encoding", "these bytes", "other bytes for the same values"

@@ -10,7 +10,7 @@ import csv
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -179,11 +179,9 @@ class Decoder:
         from plow_twin.record.foreign_types import parsed_types
 
         if message_type not in self._store.types and schema:
-            try:
+            with suppress(Exception):  # the schema may be damaged, too large, or in another schema language
                 types = parsed_types(schema, message_type)
                 self._store.register({name: type_ for name, type_ in types.items() if name not in self._store.types})
-            except Exception:  # the schema may be damaged, too large, or in another schema language
-                self._losses.unknown_types[topic] = message_type
         if message_type in self._store.types:
             return True
         self._losses.unknown_types[topic] = message_type

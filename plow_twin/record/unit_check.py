@@ -17,7 +17,7 @@ from plow_twin.model.scene import Scene
 from plow_twin.record.map_file import QUANTITIES, UNITS
 from plow_twin.record.mapping import Role, readings
 from plow_twin.record.sources import Arrived
-from plow_twin.record.times import START_NS
+from plow_twin.record.times import EPOCH_S, START_NS
 from plow_twin.stream.limits import excitation_limits, largest_displacement
 
 Array = NDArray[np.float64]
@@ -58,8 +58,6 @@ _NAME_TIME: Final = "name the column of the time in a mapping (stamp: NAME)"
 _WRITE_SECONDS: Final = "write seconds, or dates such as 2026-01-02T03:04:05.678Z"
 #: Smallest plausible distance of stamps [s], because load cells measure at 10 kHz at most.
 _SHORTEST_SPACING_S: Final = 1e-4
-#: Smallest stamp that is a date [s]; 1e9 s after 1970 is in the year 2001.
-_DATES_S: Final = 1e9
 
 
 @dataclass(frozen=True)
@@ -307,7 +305,7 @@ def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
                 UnitDoubt("excitation", ("t",), found, expected, "rows from the newest to the oldest", False, _SORT)
             ]
         return [UnitDoubt("excitation", ("t",), found, expected, "another column", False, _NAME_TIME)]
-    if stamps_s.max() > _DATES_S:
+    if stamps_s.max() > EPOCH_S:
         return []
     spacing = float(np.median(np.abs(steps)))
     # the function `time_ns` has added a second to times that count from an unknown start

@@ -205,14 +205,10 @@ class JournalWalk:
         begin = 0
         for place, count in self._holes.find(entries).items():
             self._whole(entries[begin:place])
-            self._hole(count)
+            self.missing += count
+            self._entry(Loss(count))
             begin = place
         self._whole(entries[begin:])
-
-    def _hole(self, count: int) -> None:
-        """Restart the motion after `count` missing entries, so that no load is interpolated across the gap."""
-        self.missing += count
-        self._entry(Loss(count))
 
     def _whole(self, entries: Entries) -> None:
         stamps, wrench, begin = entries.stamp_ns, entries.wrench, 0

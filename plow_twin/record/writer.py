@@ -259,9 +259,7 @@ class RunWriter:
 
     def reason_to_stop(self) -> str | None:
         """Return the reason why recording must stop, or None."""
-        if not self._part.file.out.is_linked():
-            return "the file was removed or replaced"
-        return None
+        return None if self._part.file.out.is_linked() else "the file was removed or replaced"
 
     def shortage(self) -> str | None:
         """Return a text if the disk has too little space to complete the file, otherwise None."""

@@ -21,7 +21,7 @@ from plow_twin.live.publishing import Outgoing
 from plow_twin.live.runtime import Runtime
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.map_file import ROLES
-from plow_twin.record.mapping import Role
+from plow_twin.record.mapping import Role, roles_by_topic
 from plow_twin.record.messages import Message
 from plow_twin.record.sources import Arrived
 from plow_twin.stream.driver import Arrival
@@ -64,9 +64,7 @@ class Feeder:
         self._model, self._send = model, send
         self._deviation = (0.0, 0.0, 0.0)
         self._runtime = runtime
-        self._by_topic: dict[str, list[tuple[str, Role]]] = {}
-        for name, role in roles.items():
-            self._by_topic.setdefault(role.topic, []).append((name, role))
+        self._by_topic = roles_by_topic(roles)
         #: newest stamp [ns]; a single stamp far ahead is not used
         self.newest_ns = 0
         self._far_ahead_ns: int | None = None
