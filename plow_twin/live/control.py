@@ -1,6 +1,6 @@
 """A local socket through which a twin without ROS offers the services of the node.
 
-A request is a single datagram, and the answer is a single datagram. A slow client can therefore not block the twin.
+Request and answer are single datagrams, so that a slow client cannot block the twin.
 """
 
 from __future__ import annotations
@@ -33,11 +33,6 @@ class Control:
     """Context manager that opens the socket of a twin. Only the user who runs the twin can connect to it.
 
     The attribute `services` must be set before clients can request a service.
-
-    Raises
-    ------
-    ControlError
-        The socket cannot be opened at the path.
     """
 
     def __init__(self, path: Path) -> None:
@@ -98,11 +93,6 @@ def call(path: Path, service: str, text: str | None = None) -> tuple[bool, str]:
         Whether the service succeeded.
     message : str
         Answer of the twin.
-
-    Raises
-    ------
-    ControlError
-        The socket does not exist, or no twin answers.
     """
     if not path.is_socket():
         kind = "a folder" if path.is_dir() else "a file" if path.exists() else "nothing there"

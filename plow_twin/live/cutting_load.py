@@ -1,9 +1,7 @@
 """Random cutting load along the face, with a Gamma distribution and a spatial correlation.
 
-A new random process is drawn for each pass. The process is a function of the position along the face, so that it does
-not depend on the sampling rate or the speed. The process is a translation process. It is computed from a Gaussian
-process with exponential correlation, which is transformed to the Gamma distribution by the quantiles of the two
-distributions.
+Each pass has its own random process, which depends on the position along the face, and not on the sampling rate or the
+speed. A Gaussian process with exponential correlation is transformed to the Gamma distribution (a translation process).
 
 References
 ----------
@@ -53,10 +51,9 @@ _SCHEMA: Final[Schema] = {
 
 @dataclass(frozen=True)
 class Face:
-    """The face, and the motion of the plough along it.
+    """The face, and the motion of the plough, which travels from end to end with the speed `speed_m_s` [m/s].
 
-    The plough travels from one end of the face to the other with the speed `speed_m_s` [m/s], and returns. A reversal
-    takes `turn_s` [s].
+    A reversal takes `turn_s` [s].
     """
 
     length_m: float = 250.0
@@ -141,9 +138,9 @@ class CuttingLoad:
         return np.column_stack([force, x * force[:, 1] - y * force[:, 0]])
 
     def _fields(self, number: int, position: Array) -> tuple[Array, Array]:
-        """Return the normalized forces at positions [m] in the pass `number`.
+        """Return both forces at positions [m] in the pass `number`.
 
-        The cutting force is divided by its mean, and the lateral force is divided by its standard deviation.
+        The cutting force is divided by its mean, and the lateral force by its standard deviation.
         """
         step = self.correlation_m / _POINTS
         grid = np.arange(math.ceil(self.face.length_m / step) + 2) * step

@@ -251,7 +251,7 @@ def failures(runtime: Runtime) -> list[str]:
 
 
 class Health:
-    """Creator of the parts of `/diagnostics`, which compares the counters with the counters of the previous report."""
+    """Parts of `/diagnostics`, with a warning for each counter that has grown since the previous report."""
 
     def __init__(self) -> None:
         self._before: dict[str, int] = {}

@@ -57,7 +57,7 @@ class Estimation:
         #: agreement of the model and of the sensor with the measurements, according to the last estimate
         self.trust = {"model": "", "sensor": ""}
         self.reasons: tuple[str, ...] = ()
-        #: number of estimates, and number of windows of measurements that were skipped for a newer window
+        #: numbers of estimates, and of windows that were skipped for a newer window
         self.count = self.skipped = 0
         self.wall_s = 0.0
         self.end_ns: int | None = None

@@ -54,22 +54,9 @@ class Watcher(Protocol):
 class BridgeFront:
     """Live twin that receives its messages from a bridge.
 
-    Parameters
-    ----------
-    bridge
-        Source of the messages.
-    mapping
-        Mapping file. Without a file, columns are recognised by their names.
-    settings
-        Parameters of the twin.
-    prepared
-        Scene and compiled twin.
-    say
-        Function that receives the status and the alarms when they change, and the diagnostics once a second.
-    on_error
-        Function that receives errors. It may be called from any thread.
-    units
-        Units that replace the units in the mapping, by name of the quantity. The name of the time is `t`.
+    Without the file `mapping`, columns are recognised by their names. `units` replaces units in the mapping, by name of
+    the quantity (`t` for the time). `say` receives the status and the alarms when they change, and the diagnostics once
+    a second. `on_error` receives errors, from any thread.
 
     Raises
     ------
@@ -296,18 +283,8 @@ def roles_of(
 ) -> dict[str, Role]:
     """Return the roles of the topics of a bridge.
 
-    Parameters
-    ----------
-    bridge
-        Source of the messages.
-    mapping
-        Mapping file, or None.
-    source
-        Value of the parameter `excitation_source`.
-    modelled
-        Whether the mapping contains a load model.
-    units
-        Units of quantities, which replace the units in the mapping.
+    `source` is the parameter `excitation_source`, `modelled` states whether the mapping contains a load model, and
+    `units` replaces units in the mapping.
 
     Raises
     ------

@@ -30,20 +30,9 @@ _SILENT_NS: Final = 10_000_000_000
 class Inputs:
     """Inputs of a live twin.
 
-    Parameters
-    ----------
-    front
-        Interface to the transport.
-    source
-        Name of the input that provides the load.
-    depth
-        Length of the queue of the input `source` [messages].
-    late_span_s
-        Largest delay at which a measured pose or gap is used [s].
-    journaled
-        Whether unused messages are collected for the journal.
-    **intake
-        Arguments of the `Intake` of the load.
+    The input `source` provides the load, from a queue of `depth` messages. `late_span_s` is the largest delay at which
+    a measured pose or gap is used [s]. With `journaled`, unused messages are collected for the journal. The other
+    arguments are those of the `Intake` of the load.
     """
 
     def __init__(
@@ -112,18 +101,7 @@ class Inputs:
     def wanted(self, sender: bytes, number: int, stamp_ns: int, values: Sequence[float], fits: bool = True) -> bool:
         """Register a message of a sender, and return whether it is used. An unused message is counted.
 
-        Parameters
-        ----------
-        sender
-            Identifier of the sender.
-        number
-            Number of the message, counted from 1 for each sender.
-        stamp_ns
-            Stamp of the message [ns].
-        values
-            Numbers of the message.
-        fits
-            Whether the message can be read as a sample.
+        `number` counts the messages of each sender from 1. `fits` states whether the message can be read as a sample.
         """
         lost = self.senders.lost
         followed = self.senders.hear(sender, number)
@@ -157,10 +135,7 @@ class Inputs:
         self.unused.note(topic, sender, "not_followed", stamp_ns, values)
 
     def _follows(self, topic: str, stamp_ns: int, values: Sequence[float]) -> bool:
-        """Return whether the current message on an optional input comes from the followed sender.
-
-        A message from another sender is counted.
-        """
+        """Return whether the current message on an optional input comes from the followed sender; if not, count it."""
         sender = self.arriving[1]
         followed = self.optional[topic].hear(sender, time.monotonic_ns())
         if not followed:

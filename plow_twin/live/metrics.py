@@ -30,11 +30,6 @@ class Metrics:
     """Context manager that serves the page `http://127.0.0.1:PORT/metrics`, which Prometheus reads.
 
     Each number in the last report is a gauge with the name `plow_twin_<part>_<key>`. Texts in the report are omitted.
-
-    Raises
-    ------
-    MetricsError
-        The port cannot be used.
     """
 
     def __init__(self, port: int) -> None:
@@ -70,10 +65,7 @@ class Metrics:
 
 
 def _bound(server: Any) -> None:
-    """Limit the number of simultaneous readers to `_READERS`, and disconnect silent readers.
-
-    Each reader occupies a thread and a file descriptor.
-    """
+    """Limit the number of simultaneous readers, each of which takes a thread, and disconnect silent readers."""
     free = threading.BoundedSemaphore(_READERS)
     start, serve = server.process_request, server.process_request_thread
     handler = server.RequestHandlerClass

@@ -70,8 +70,8 @@ class Front(Protocol):
 class Publishing:
     """Output of a live twin.
 
-    The function `on_alarm` receives a text when an alarm is latched. The function `catch_up` computes the intervals of
-    a publication after the forces have been sent. `catch_up` is None if the intervals are computed with the forces.
+    `on_alarm` receives a text when an alarm is latched. `catch_up` computes the intervals after the forces have been
+    sent; it is None if they are computed with the forces.
     """
 
     def __init__(
@@ -114,9 +114,9 @@ class Publishing:
     def messages(self, published: Published) -> Iterator[Outgoing]:
         """Yield the messages of a publication, which has at most one row.
 
-        If a number is not finite, no message is yielded. The forces are yielded first. The intervals are the last
-        messages of the motion that are yielded, because many twins must be advanced to compute the intervals. After the
-        last message, the publication is counted and recorded, and the alarms are updated.
+        If a number is not finite, no message is yielded. The forces are yielded first, and the intervals last, because
+        many twins are advanced for the intervals. After the last message, the publication is counted and recorded, and
+        the alarms are updated.
         """
         rows, _ = published
         if not len(rows):

@@ -29,20 +29,9 @@ _QUEUE_SIZE: Final = 20_000
 class Recording:
     """Recording of a configured twin.
 
-    Parameters
-    ----------
-    settings
-        Parameters of the twin.
-    scene
-        Scene of the twin.
-    node_name
-        Name of the node.
-    topics
-        Resolved name of each output topic, by base name.
-    clock
-        Function that returns the time on `/clock` [ns], or None if the system time is used.
-    on_error
-        Function that receives the reason when recording stops early. The thread of the recorder calls this function.
+    `topics` contains the resolved name of each output topic, by base name. `clock` returns the time on `/clock` [ns];
+    with None, the system time is used. `on_error` receives the reason when recording stops early, in the thread of the
+    recorder.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """The live twin without its transport.
 
-A *front* delivers samples and sends messages. It is the ROS node or the command `plow-twin live`. The intake checks
-each sample. A valid sample advances the twin and causes a publication, which is recorded.
+A *front*, which is the ROS node or the command `plow-twin live`, delivers samples and sends messages. Each valid sample
+advances the twin and causes a publication, which is recorded.
 """
 
 from __future__ import annotations
@@ -45,24 +45,16 @@ _CATCH_UP_S: Final = 0.002
 _LOOK_FOR_CLOCK_HZ: Final = 20.0
 #: Rate at which unused messages are written to the journal [Hz].
 _UNUSED_HZ: Final = 5.0
-#: Limits for twins that follow measurements. They are too slow if samples wait for longer than `_LONGEST_WAIT_S` [s] in
-#: each of `_WAITING_SECONDS` consecutive seconds.
+#: Twins that follow measurements are too slow if samples wait for longer than `_LONGEST_WAIT_S` [s] in each of
+#: `_WAITING_SECONDS` consecutive seconds.
 _LONGEST_WAIT_S, _WAITING_SECONDS = 0.5, 5
 
 
 class Runtime:
-    """A configured twin. It is created when the node is configured and closed when the node is cleaned up.
+    """A configured twin, from configure to cleanup.
 
-    Parameters
-    ----------
-    front
-        Interface to the transport.
-    settings
-        Parameters of the twin.
-    prepared
-        Scene and compiled twin, which no other runtime may use.
-    kept_wear
-        Wear of earlier runtimes of this process. The key is the result of `scene_identity` for the scene.
+    No other runtime may use `prepared`. `kept_wear` is the wear of earlier runtimes of this process, by
+    `scene_identity`.
 
     Raises
     ------
@@ -186,10 +178,7 @@ class Runtime:
 
     @property
     def reads_at_once(self) -> bool:
-        """Whether `step_series` may be used.
-
-        It may be used if only samples advance the time, and if messages of the motion are not sent.
-        """
+        """Whether `step_series` may be used: only samples advance the time, and the motion is not sent."""
         return self._front.follows_samples and not self._front.sends_motion
 
     @property
@@ -349,14 +338,9 @@ class Runtime:
         self._advanced(len(arrived))
 
     def step_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64]) -> Iterator[Outgoing]:
-        """Use many samples in one call, like `step`; `reads_at_once` must be true.
+        """Use stamps [ns], shape (n,), and loads [N, N, N m], shape (n, 3), in one call with the results of `step`.
 
-        Parameters
-        ----------
-        stamps : ndarray of int64, shape (n,)
-            Stamps [ns].
-        wrench : ndarray, shape (n, 3)
-            Loads [N, N, N m].
+        `reads_at_once` must be true.
         """
         if self.waits_for_clock or self.publishing.watch is not None or self.settings.record_ring:
             # a watcher must receive each publication, and the ring of the recorder needs the state directly after the
@@ -503,8 +487,7 @@ class Runtime:
         if self.recording and self.recording.recorder.snapshot_wanted:
             self._renew_recording()
         if self._front.follows_samples:
-            # A twin without a deadline waits until the recorder and the estimate have caught up. It waits for at most
-            # `_CATCH_UP_S` per sample.
+            # a twin without a deadline lets the recorder and the estimate catch up, for at most `_CATCH_UP_S` a sample
             while count and self._behind:
                 time.sleep(_CATCH_UP_S)
                 count -= 1

@@ -37,7 +37,7 @@ class Prepared:
 
 
 class Preparation:
-    """Preparation of a twin in a thread. The function `warm_up` compiles additional kernels in the same thread."""
+    """Preparation of a twin in a thread, in which `warm_up` compiles additional kernels."""
 
     def __init__(self, settings: Settings, warm_up: Callable[[], None] = lambda: None) -> None:
         self.key = key(settings)
@@ -69,10 +69,7 @@ class Preparation:
 
 
 def key(settings: Settings) -> tuple[object, ...]:
-    """Return the settings on which a prepared twin depends, with the time and size of the scene file.
-
-    The time and the size are included because a changed scene file must give another key.
-    """
+    """Return the settings on which a prepared twin depends, with the time and size of the scene file."""
     follow = settings.follows, settings.follow_members
     own = settings.scene, settings.tolerance, settings.excitation_source, settings.max_evaluations, *follow
     try:
@@ -100,10 +97,7 @@ def _prepare(settings: Settings, warm_up: Callable[[], None]) -> Prepared:
 
 
 def leave(code: int, *, at_once: bool = False) -> int:
-    """Return the exit code `code`, or end the process immediately.
-
-    The process is ended immediately if `at_once` is True, or if a running compilation would delay the end.
-    """
+    """Return `code`, or end the process at once if `at_once` is True or a running compilation would delay the end."""
     if at_once:  # standard output has no reader, so it is not flushed
         os._exit(code)
     if all(future.done() for future in _started):

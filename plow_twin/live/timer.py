@@ -9,8 +9,8 @@ from collections.abc import Callable
 class Timer:
     """Timer that calls the function `do` every `period_s` seconds of the monotonic clock.
 
-    Missed calls are omitted. After a missed call, calls are made at multiples of the period from the start. `do` may
-    return a time [s] for which it need not be called.
+    Missed calls are omitted, so that calls stay at multiples of the period. `do` may return a time [s] for which it
+    need not be called.
     """
 
     def __init__(self, period_s: float, do: Callable[[], float | None]) -> None:

@@ -14,10 +14,10 @@ Wrench = tuple[float, float, float]
 
 
 class ToolForces:
-    """Sum of measured forces. Each force acts in the direction of a load in the scene.
+    """Sum of measured forces, each in the direction of a load in the scene.
 
-    The measured effort of a load is a force [N] or, for a pure moment, a moment [N m]. Tables and constants of zero
-    have no direction. Efforts for loads without a direction are ignored.
+    The measured effort of a load is a force [N] or, for a pure moment, a moment [N m]. Efforts for tables and constants
+    of zero are ignored, because these loads have no direction.
     """
 
     def __init__(self, scene: Scene) -> None:

@@ -38,8 +38,7 @@ class KeptWear:
 class WearKeeper:
     """Storage for the wear of one head in one scene, in a folder.
 
-    Only a file that this object has read or written is replaced. A file that the object has not read may come from the
-    user, and may contain wear that no twin has used.
+    Only a file that this object has read or written is replaced, because any other file may come from the user.
 
     Raises
     ------
@@ -61,8 +60,8 @@ class WearKeeper:
     def load(self, kept: KeptWear | None = None) -> tuple[float, ...] | None:
         """Return the wear depths [m] with which the twin starts, or None without saved wear.
 
-        The depths are read from the file. If the depths `kept` could not be saved and the file has not changed since
-        the failure, the depths `kept` are returned.
+        If the depths `kept` could not be saved, and the file has not changed since then, they replace those in the
+        file.
         """
         found = read_wear(self.folder)
         if found is not None:

@@ -87,8 +87,7 @@ def alarm_texts(values: Mapping[str, str], *, own_start: bool = False, newest: b
 class AlarmCheck:
     """Compute the alarms of a run from its journal, and compare each computed message with the recorded message.
 
-    An alarm depends on every publication since the start of the run. Alarms can therefore not be compared after a
-    publication is missing.
+    Alarms cannot be compared after a missing publication, because an alarm depends on all earlier publications.
     """
 
     def __init__(self, header: RunHeader, possible: bool) -> None:
@@ -159,8 +158,7 @@ class AlarmCheck:
     def differences(self) -> Iterator[Difference]:
         """Yield the differences between recorded and computed messages.
 
-        A recorded message stays in a queue until its computed message exists. A computed message stays in a queue until
-        its recorded message exists.
+        Each message waits in a queue until its counterpart exists.
         """
         while self._recorded and self._computed:
             record, (sequence, step, computed) = self._recorded.popleft(), self._computed.popleft()

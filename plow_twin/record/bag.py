@@ -20,17 +20,7 @@ _MIN_FREE_BYTES: Final = 64 * 1024 * 1024
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic with its message type.
-
-    Attributes
-    ----------
-    schema : str
-        Text of the type in the format `ros2msg`.
-    type_hash : str
-        REP-2016 hash of the type.
-    qos : str
-        Offered QoS in YAML.
-    """
+    """A topic with its message type, the `ros2msg` text and REP-2016 hash of the type, and the offered QoS in YAML."""
 
     name: str
     message_type: str
@@ -127,8 +117,7 @@ def beside_folders(run: Path) -> Sequence[Path]:
 def readable_beside(run: Path, lost: Counter[str]) -> list[Path]:
     """Return the folders of `beside_folders` that contain a readable MCAP file.
 
-    The counter `lost` receives the losses that the recorder counted. For each folder that cannot be read, it receives
-    the number of files.
+    The counter `lost` receives the losses that the recorder counted, and the number of files in each unreadable folder.
     """
     found = []
     for folder in beside_folders(run):

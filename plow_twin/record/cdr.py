@@ -191,7 +191,6 @@ def _decode_short_text(data: bytes) -> Text:
 
 
 def _encode_short_text(message: Text) -> bytes:
-    """Encode a string message without rosbags, which is too slow for the strings of a live journal."""
     text = message.data.encode()
     return b"\x00\x01\x00\x00" + struct.pack("<I", len(text) + 1) + text + b"\x00"
 

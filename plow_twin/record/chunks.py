@@ -41,8 +41,7 @@ _HEAD: Final = struct.Struct("<BQ")
 _HEAD_SIZE: Final = _HEAD.size
 #: Size [B] of the start of an index record: a head and a channel number of two bytes.
 _INDEX_HEAD: Final = _HEAD.size + 2
-#: Limit on the decompressed size of all chunks of a file, as a multiple of the size of the file. `RECORD_LIMIT` is
-#: added to the limit, so that small files are accepted.
+#: Largest decompressed size of all chunks, as a multiple of the size of the file; `RECORD_LIMIT` is added.
 UNPACKED_RATIO: Final = 200
 #: Largest number of schemas and channels that a file may declare.
 _MOST_DECLARED: Final = 10_000

@@ -108,18 +108,8 @@ _ZONE: Final = re.compile(r"([Zz]|:\d\d([.,]\d+)?[+-]\d\d(:?\d\d)?)$")
 def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: Mapping[str, str]) -> Guess:
     """Guess the meanings of the columns of a CSV file.
 
-    The magnitudes of the numbers are compared with the loads and sizes of the scene.
-
-    Parameters
-    ----------
-    path
-        The file. At most 20,000 rows and two million cells are examined.
-    scene
-        Scene of the machine.
-    columns
-        Columns that the user states, by name of the quantity. The name of the time is `t`.
-    units
-        Units that the user states, by name of the quantity.
+    The magnitudes of the numbers, in at most 20,000 rows and two million cells, are compared with the loads and sizes
+    of the scene. The user states `columns` and `units` by name of the quantity (`t` for the time).
 
     Raises
     ------

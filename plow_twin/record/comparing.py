@@ -25,18 +25,9 @@ _IS_SLOW = np.array([topic.cadence is Cadence.SLOW for topic in REPLAYED])
 class Sent:
     """Find the advance of the twin after which each message was sent, for a series of journal entries.
 
-    Parameters
-    ----------
-    sequence : ndarray of int64, shape (n,)
-        Sequence number of the journal entry before each message, in ascending order.
-    kind : ndarray of int64, shape (n,)
-        Kind of each message.
-    done : ndarray of int64, shape (k,)
-        Number of advances up to and including each entry of the series.
-    first
-        Sequence number of the first entry of the series.
-    advances
-        Number of advances in the series.
+    `sequence`, shape (n,), is the number of the journal entry before each message, in ascending order. `kind`, shape
+    (n,), is the kind of each message. `done`, shape (k,), is the number of advances up to and including each entry of
+    the series, which begins with the entry `first`.
     """
 
     def __init__(self, sequence: Indexes, kind: Indexes, done: Indexes, first: int, advances: int) -> None:

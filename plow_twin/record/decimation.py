@@ -31,11 +31,7 @@ class Decimation:
         return self._outputs == "all"
 
     def select(self, published: Published) -> Published | None:
-        """Return the publication to record, or None if `published` is omitted.
-
-        `published` has one row. The impulses and peaks of the result include the omitted publications since the last
-        recorded publication.
-        """
+        """Return the publication to record, or None if `published`, which has one row, is omitted."""
         if self._outputs == "all":
             return published
         if self._outputs == "none":

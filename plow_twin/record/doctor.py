@@ -1,7 +1,7 @@
 """Examine a recording, and repair truncated and damaged files.
 
-A repair copies every readable message into a new file with an index and renames the old file. Messages that cannot be
-read are lost; the report contains their number.
+A repair copies every readable message into a new file with an index, and renames the old file. Other messages are
+counted as lost.
 """
 
 from __future__ import annotations
@@ -304,8 +304,7 @@ def _list_parts(folder: Path, parts: Sequence[Path], repaired: Sequence[str]) ->
 def _rewrite(part: Path, *, last: bool) -> None:
     """Replace a file by a new file with the readable messages and a note of damage at each gap.
 
-    A truncated part gets a note of damage at its end, because messages may be missing before the next part. The last
-    part of a recording gets no note at its end.
+    A truncated part has a gap at its end, unless it is the last part.
     """
     target = part.with_name(f"{part.name}.partial")
     target.unlink(missing_ok=True)

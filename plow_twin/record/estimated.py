@@ -30,8 +30,7 @@ from plow_twin.stream.session import wear_in
 class LiveEstimate:
     """An estimate from the journal of a node, with its window of measurements.
 
-    The journal does not contain the window, so the window is computed from the entries. If measurements are missing in
-    the journal, the window is None.
+    The window is computed from the entries of the journal, and is None if measurements are missing.
     """
 
     entry: Estimated

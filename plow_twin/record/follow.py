@@ -40,7 +40,7 @@ def is_claimed(descriptor: int) -> bool:
 
 
 class Tail:
-    """Object with which a reader waits at the end of a growing file. The wait ends if `stop` returns True."""
+    """Wait at the end of a growing file, until the file grows or `stop` returns True."""
 
     def __init__(self, stop: Callable[[], bool] = lambda: False) -> None:
         self._stop = stop

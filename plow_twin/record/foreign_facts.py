@@ -14,11 +14,7 @@ from plow_twin.record.sources import open_source
 
 @dataclass
 class _Seen:
-    """Statistics of the messages of one role.
-
-    `used` is the number of messages that fit the role, and `unfit` is the number of messages that do not fit it. The
-    ranges of the stamps [ns] and of the values [SI units] refer to the messages that fit.
-    """
+    """Statistics of the messages of one role. The ranges are those of the `used` messages, which fit the role."""
 
     used: int = 0
     unfit: int = 0

@@ -25,8 +25,6 @@ from plow_twin.stream.steps import Steps
 class Feed:
     """Pass the messages of a recording to walkers in the order of their arrival, after a check of each load sample.
 
-    A walker advances a session of a twin.
-
     The function `measured` receives the role, the stamp [ns] and the values of each message that contains neither a
     load nor a speed.
     """

@@ -412,10 +412,7 @@ def _limits(path: Path, key: str, given: float | list[float]) -> tuple[float, fl
 
 
 def _check_columns(path: Path, name: str, role: Role) -> None:
-    """Raise a `MapError` for a field that names no column.
-
-    The field may be a column, or a path that begins with the name of a column, such as `load.f[0]`.
-    """
+    """Raise a `MapError` for a field that is neither a column nor a path within a column, such as `load.f[0]`."""
     columns = role.message_type
     if not isinstance(columns, Columns):
         return

@@ -1,8 +1,7 @@
 """Write MCAP files.
 
-Compiled functions write many messages at a time into a chunk. The compiled functions and the compressors release the
-lock of the Python interpreter. Each record is written to the file by a single call, so that the file of a killed
-process can be read up to the last chunk.
+Compiled functions and compressors, which release the interpreter lock, write many messages at a time. Each record is
+written by a single call, so that the file of a killed process can be read up to its last chunk.
 """
 
 from __future__ import annotations

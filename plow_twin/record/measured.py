@@ -274,8 +274,7 @@ def _journal(reader: RunReader, lost: Counter[str]) -> tuple[Array, list[int], A
 def _longest(rows: Array, begins: list[int]) -> Array:
     """Return the longest part of a load without missing samples.
 
-    Samples are missing before each row in `begins`. The load is split at such a row if the time without samples is
-    long.
+    Samples are missing before each row in `begins`, where the load is split if the time without samples is long.
     """
     if len(rows) < 2:
         return rows

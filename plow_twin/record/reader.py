@@ -1,8 +1,7 @@
 """Read a run from front to back, even if it is truncated or has damaged chunks.
 
-A recording consists of one or more files, which are called *parts*. Only a few chunks are in memory at a time. Journal
-entries and outputs are stored in separate chunks. The reader merges the entries and the outputs by their sequence
-numbers.
+A recording consists of one or more files, which are called *parts*. Journal entries and outputs are in separate chunks,
+and the reader merges them by their sequence numbers.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from plow_twin.stream.journal import Entry, Loss, Sample
 _PENDING: Final = 65_536
 #: Smallest number of entries in a batch. A batch may be smaller if the outputs of `_LEAST // 16` chunks are in memory.
 _LEAST: Final = 8192
-#: Smallest number of entries in a batch without outputs. It is larger, because entries alone need less memory.
+#: Smallest number of entries in a batch without outputs, which needs less memory.
 _LEAST_ALONE: Final = 32_768
 #: Typical growth of a recording at 1 kHz [B/s]. It is used to estimate the duration of a file without an index.
 _BYTES_PER_S: Final = 400_000

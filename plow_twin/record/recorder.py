@@ -49,22 +49,10 @@ _BURST: Final = 128
 
 @dataclass(frozen=True)
 class RecorderCounters:
-    """State of a recorder.
+    """State of a recorder: numbers of items, and of rings (the last seconds of a run).
 
-    Attributes
-    ----------
-    written : int
-        Number of items that were written.
-    queued : int
-        Number of items in the queue.
-    lost : dict
-        Number of lost messages by topic. The key of lost journal entries is `journal`.
-    error : str or None
-        Reason why recording stopped, or why the last ring was not written.
-    marks : int
-        Number of rings that were written. A ring contains the last seconds of a run.
-    marks_lost : int
-        Number of rings that could not be written.
+    The key of lost journal entries in `lost` is `journal`. `error` is the reason why recording stopped, or why the last
+    ring was not written.
     """
 
     written: int
@@ -445,10 +433,7 @@ class Recorder:
                 time.sleep(1e-6)
 
     def _write(self, items: list[_Item]) -> None:
-        """Write items. Consecutive items of one kind are written in one call.
-
-        The order of the journal entries and the order of the outputs are preserved.
-        """
+        """Write items in the order of the entries and of the outputs, consecutive items of one kind in one call."""
         samples: list[_EntryItem] = []
         publications: list[_PublicationItem] = []
         for item in items:
@@ -572,7 +557,7 @@ class Recorder:
 
 
 class _SeriesItem(NamedTuple):
-    """Samples and digests to write. `sequence` is the sequence number of the first entry."""
+    """Samples and digests to write, with the sequence number of the first entry."""
 
     sequence: int
     log_time_ns: int
@@ -590,9 +575,9 @@ class _SeriesItem(NamedTuple):
 
 
 class _PublicationsItem(NamedTuple):
-    """Publications to write. `sequence` is the number of the journal entry before each publication.
+    """Publications to write, each with the number of the journal entry before it.
 
-    Every kind of item has the attribute `keys`. It contains the topics of the messages that are lost with the item.
+    The attribute `keys`, which every kind of item has, contains the topics of the messages that are lost with the item.
     """
 
     sequence: NDArray[np.int64]

@@ -34,10 +34,7 @@ _NAMES: Final = {"makes": "touches"}
 
 
 def _columns_of(topic: Topic) -> tuple[str, ...]:
-    """Return the column names of the table of a topic.
-
-    If the topic has several quantities, a column name is `<name>/<quantity>`.
-    """
+    """Return the column names of the table of a topic: `<name>/<quantity>` if it has several quantities."""
     if topic.type != JOINT_STATE:
         return *_POSE, "velocity_x", "velocity_y", "omega"
     if len(topic.columns) == 1:

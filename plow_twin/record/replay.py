@@ -136,8 +136,6 @@ def following_twin(header: RunHeader, scene: Scene) -> Driven:
 
 
 class _Replay:
-    """State of a replay."""
-
     def __init__(self, header: RunHeader, report: ReplayReport, digests_only: bool) -> None:
         self.digests_only = digests_only
         self.all_outputs = not digests_only and header.record_outputs == "all"
@@ -184,7 +182,7 @@ class _Replay:
         self.alarms = AlarmCheck(header, self.all_outputs)
 
     def batch(self, batch: Batch) -> None:
-        """Apply and compare a batch. Each run, and each entry outside a run, is applied in one call."""
+        """Apply and compare a batch. Each run is applied in one call."""
         self.outputs_whole = not batch.damaged
         self.outputs_synced = self.outputs_synced and self.outputs_whole
         if batch.damaged:
@@ -212,9 +210,9 @@ class _Replay:
             self._compare_alarms(batch)
 
     def _run_ends(self, entries: Entries) -> Indexes:
-        """Return the indexes at which runs end, in ascending order. The last index is the number of entries.
+        """Return the indexes at which runs end, in ascending order, up to the number of entries.
 
-        A run ends at a missing entry. A run ends before and after each entry that must be applied in a call of its own:
+        A run ends at a missing entry, and before and after each entry that must be applied in a call of its own:
 
         - a late sample
         - an entry that changes the motion
@@ -256,8 +254,7 @@ class _Replay:
             self._note(Divergence(*difference))
 
     def _messages(self, sent: SentMessages, begin: int, end: int) -> None:
-        # If there is a sink, the messages that a replay cannot compute are copied to the sink. If there is no sink, the
-        # messages that a replay can compute are compared.
+        # a sink gets copies of the messages that a replay cannot compute; without a sink, the others are compared
         chosen = (sent.kind[begin:end] >= 0) == (self.sink is None)
         for index in (begin + np.flatnonzero(chosen)).tolist():
             self.output(sent.record(index))
@@ -447,8 +444,7 @@ class _Replay:
     def _snapshot(self, snapshot: Snapshot) -> None:
         if self.synced and self.outputs_synced:
             self.report.snapshots_compared += 1
-            # The live session discarded its earlier states when it took the snapshot. `renew` takes a snapshot and
-            # discards the earlier states of the replay, so that late samples have the same effect in both sessions.
+            # `renew` discards the earlier states, as the live session did, so that late samples have the same effect
             computed = self.session.renew().data
             self._compare("snapshot", snapshot.stamp_ns, "state", _hash(snapshot.data), _hash(computed))
             return

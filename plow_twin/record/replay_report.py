@@ -31,22 +31,9 @@ class Divergence:
 class ReplayReport:
     """Result of a replay.
 
-    Attributes
-    ----------
-    refused : int
-        Number of entries that the session refused.
-    repeated : int
-        Number of entries that repeat an earlier entry.
-    compared : Counter
-        Number of messages that were compared, by base name of the topic.
-    not_compared : Counter
-        Number of messages that could not be compared, by base name of the topic.
-    repeated_parts : dict
-        Files that repeat a part. The value is the file that was read in place of the key.
-    foreign_parts : dict
-        Files of another run. The value is the keys of the header that differ.
-    inputs : dict
-        Number of received messages, by input and by outcome.
+    Messages are counted by base name of the topic. The session refused the `refused` entries, and the `repeated`
+    entries repeat an earlier entry. `repeated_parts` maps a file to the file that was read instead, and `foreign_parts`
+    maps a file of another run to the keys of the header that differ.
     """
 
     path: Path

@@ -19,8 +19,8 @@ NO_TIME: Final = -1
 NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|inf|nan)", re.IGNORECASE)
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _NANOSECONDS: Final = re.compile(r"[.,]\d{6}(\d{1,3})")
-#: Smallest time that is read as a date [s]. A smaller time counts from an unknown start. `START_NS` is added to a time
-#: from an unknown start, because a stamp of 0 means that the stamp is missing.
+#: Smallest time that is read as a date [s]. `START_NS` is added to a smaller time, because a stamp of 0 means that the
+#: stamp is missing.
 EPOCH_S: Final = 1e9
 #: Stamp of the time 0 [ns].
 START_NS: Final = 1_000_000_000

@@ -30,7 +30,7 @@ CHECKED: Final = 20_000
 _IDLE_SHARE: Final = 1e-2
 #: Smallest ratio at which forces are taken for numbers in kN. Smaller forces may be the noise of an idle sensor.
 _BROKEN_SHARE: Final = 1e-4
-#: Units in which too small forces may be. The value is the factor for `_IDLE_SHARE` and `_BROKEN_SHARE` in this unit.
+#: Likely units of too small forces, with the factor for `_IDLE_SHARE` and `_BROKEN_SHARE`.
 _SMALLER: Final = {"kN": 1.0, "MN": 1e-3}
 #: Largest angle of the model [rad], 45 degrees.
 _LARGEST_ANGLE_RAD: Final = 0.25 * np.pi
@@ -45,8 +45,7 @@ _SLOW_S: Final = 0.5
 _SMOOTH: Final = 0.05
 #: Largest plausible speed of a plough [m/s]. The fastest ploughs travel at 3.6 m/s (Caterpillar GH1600).
 _FASTEST_M_S: Final = 5.0
-#: Shares of descending stamps. If the first share is exceeded, the column is not a time. If the second share is
-#: exceeded, the rows are in reverse order.
+#: Shares of descending stamps above which the column is not a time, and above which the rows are in reverse order.
 _FALLING, _REVERSED = 0.2, 0.9
 _TIMES: Final = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: Range of the dates of this century in a spreadsheet, which counts days from 1900.
@@ -133,16 +132,8 @@ def large_loads(values: Mapping[tuple[str, str], Array], units: Mapping[str, str
     """Return a warning for each component of the load that a live twin would refuse, by name of the component.
 
     A live twin refuses numbers above the limits that `excitation_limits` returns for the scene. The warning is given if
-    more than one number in a hundred exceeds the limit.
-
-    Parameters
-    ----------
-    values
-        Measured numbers by role and name [SI units].
-    units
-        Original unit of each component, by name.
-    scene
-        Scene of the twin.
+    more than one number in a hundred exceeds the limit. `values` contains measured numbers by role and name [SI units],
+    and `units` the original unit of each component.
     """
     found = {}
     for name, most in zip(("fx", "fy", "m"), excitation_limits(scene).largest, strict=True):
@@ -191,16 +182,8 @@ def check_units(messages: Iterable[Arrived], roles: Mapping[str, Role], scene: S
 def check_poses(t: Array, q: Array, scene: Scene, source: object) -> None:
     """Check the units of measured poses.
 
-    Parameters
-    ----------
-    t : ndarray, shape (n,)
-        Times [s].
-    q : ndarray, shape (n, 3)
-        Poses: x, y [m], theta [rad].
-    scene
-        Scene whose sizes determine plausible magnitudes.
-    source
-        Name of the recording for an error message.
+    The poses `q`, shape (n, 3), are x, y [m] and theta [rad] at the times `t` [s], shape (n,). An error names the
+    recording by `source`.
 
     Raises
     ------
@@ -228,8 +211,7 @@ def _usual_magnitude(values: Array, percent: float = 99.0) -> float:
 def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[UnitDoubt]:
     """Return doubts about the forces and the moment.
 
-    Only the larger of the two forces is checked, because the smaller force may be small in any unit. The expected
-    moment is proportional to the forces.
+    Only the larger of the two forces is checked, because the smaller force may be small in any unit.
     """
     found = [magnitudes[key] for key in (("excitation", "fx"), ("excitation", "fy")) if key in magnitudes]
     usual = _largest_force(scene)
@@ -242,7 +224,7 @@ def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
             largest *= UNITS["force"][unit]
     if largest < _IDLE_SHARE * usual:
         return doubts
-    # the expected moment is reduced in proportion if the forces are smaller than in the scene
+    # if the forces are smaller than in the scene, a smaller moment is expected
     beside = float(compile_loads(scene.loads).largest()[2]) * min(1.0, largest / usual) if usual else 0.0
     moment = magnitudes.get(("excitation", "m"), 0.0)
     if _BROKEN_SHARE * beside < moment < _IDLE_SHARE * beside:

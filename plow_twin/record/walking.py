@@ -160,30 +160,15 @@ class Walker:
 class JournalWalk:
     """Pass the journal of a run to walkers.
 
-    After missing entries, the motion of all walkers is reset. A late sample is inserted at its stamp. A late sample is
-    not used if the walkers have already reached its stamp.
+    After missing entries, the motion of all walkers is reset. A late sample is inserted at its stamp, unless the
+    walkers have already reached the stamp.
 
-    Parameters
-    ----------
-    own
-        Walkers that restore the first snapshot after a loss, and that apply settings of the wear.
-    others
-        Walkers that never restore a state from the journal, because their scenes differ from the scene of the run.
-    whole
-        Whether the journal begins with the first entry of the run. If it does not, the walkers `own` restore the first
-        snapshot.
-    same_scene
-        Whether the walkers `own` have the scene of the run. Walkers with the scene of the run apply changes of the
-        model and restored motions. If the twin of a walker follows measurements, the walker applies the measurements.
+    The walkers `own` restore the first snapshot after a loss, and apply settings of the wear. With `same_scene`, they
+    have the scene of the run, and apply changes of the model, restored motions and, if their twins follow measurements,
+    the measurements. The walkers `others` have other scenes, and never restore a state. If the journal is not `whole`,
+    that is, begins after the first entry of the run, the walkers `own` restore the first snapshot.
 
-    Attributes
-    ----------
-    used : int
-        Number of used samples.
-    late : int
-        Number of late samples that were not used.
-    missing : int
-        Number of missing entries.
+    `used` and `late` count the samples that were used, and that were too late. `missing` counts missing entries.
     """
 
     def __init__(

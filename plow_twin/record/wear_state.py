@@ -46,13 +46,7 @@ def check_depth(depth_m: Sequence[float], scene: Scene) -> None:
 
 
 def read_wear(folder: Path) -> bytes | None:
-    """Return the content of the wear file in a folder, or None if the folder has no wear file.
-
-    Raises
-    ------
-    WearStateError
-        The file cannot be read.
-    """
+    """Return the content of the wear file in a folder, or None if the folder has no wear file."""
     path = folder / FILE_NAME
     try:
         return path.read_bytes()

@@ -35,8 +35,7 @@ _TYPES: Final = frozenset(kind.value for kind in Parameter.Type)
 class WithoutEvents(Node):
     """Node that uses no events of the middleware, not even for the topics that rclpy creates.
 
-    The node refuses negative times on `/clock`, and parameters that rclpy cannot read. Without this check, a negative
-    time or an unreadable parameter would end the program.
+    The node refuses negative times on `/clock` and parameters that rclpy cannot read, which would end the program.
     """
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **options: Any) -> Service:

@@ -1,7 +1,7 @@
 """A thread that reads the input queues when messages arrive, and calls timers of a monotonic clock.
 
-The thread replaces the executors of rclpy, which create a task for each message. The events executor of rclpy is not
-used, because it runs timers only when no message is waiting. Its timers may never run if samples arrive at 10 kHz.
+The thread replaces the executors of rclpy, which create a task for each message. The events executor of rclpy runs
+timers only when no message is waiting, so its timers may never run if samples arrive at 10 kHz.
 """
 
 from __future__ import annotations

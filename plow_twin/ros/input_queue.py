@@ -49,8 +49,8 @@ class _Info(ctypes.Structure):
     ]
 
 
-#: Layouts of two structures. The layout of `_Info` contains the times of sending and reception, the sequence number and
-#: the publisher. The layout of `SerializedMessage` contains the address and the length of the bytes.
+#: Layouts of `_Info` (times of sending and reception, sequence number, publisher) and of `SerializedMessage` (address
+#: and length of the bytes).
 _INFO, _PLACE = struct.Struct("=qqQ16x16s"), struct.Struct("=QQ")
 #: Return code of rcl for an empty queue.
 _NOTHING_TAKEN: Final = 401
@@ -58,10 +58,7 @@ _NOTHING_TAKEN: Final = 401
 
 @cache
 def _count_up() -> ctypes.c_void_p:
-    """Return the address of the C function `eventfd_write`, which rcl calls for new messages.
-
-    rcl passes two arguments to the function: the user data, which is the file descriptor, and the number of messages.
-    """
+    """Return the address of the C function `eventfd_write`, which rcl calls with the descriptor and a count."""
     return ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
 
 

@@ -13,14 +13,13 @@ from std_msgs.msg import Header
 from plow_twin.record import messages as plain
 from plow_twin.stream.intake import NS_PER_S
 
-#: Content of a message: the stamp [ns], the numbers, and two flags. The first flag is True if the numbers are a load.
-#: The second flag is True if the load has a component out of the plane.
+#: Content of a message: the stamp [ns], the numbers, whether the numbers are a load, and whether the load has a
+#: component out of the plane.
 Read = tuple[int, tuple[float, ...], bool, bool]
 #: Content of a message that cannot be decoded.
 UNREADABLE: Final[Read] = (0, (), False, False)
 
-#: Two layouts of a wrench message for big-endian order, and two layouts for little-endian order. The first layout
-#: contains the stamp and the length of the frame name. The second layout contains the force and the torque.
+#: Layouts of a wrench message (stamp and length of the frame name; force and torque), big-endian and little-endian.
 _WRENCH_LAYOUTS: Final = tuple((struct.Struct(f"{order}iII"), struct.Struct(f"{order}6d")) for order in "><")
 
 

@@ -40,14 +40,8 @@ _SAY_AGAIN: Final = 5
 class TwinNode(WithoutEvents, LifecycleNode):
     """The ROS 2 node of the twin. Several nodes can use the same process and executor.
 
-    Parameters
-    ----------
-    node_name
-        Name of the node.
-    stop_asked
-        Function that returns True if a stop was requested. The node calls it repeatedly while the solver is compiled.
-    **options
-        Options of `rclpy.node.Node`.
+    While the solver is compiled, the node calls `stop_asked`, which returns True if a stop was requested. `options` are
+    those of `rclpy.node.Node`.
 
     Raises
     ------
@@ -209,7 +203,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
                 self.runtime.parameter(name, value, self._table.settings)
 
     def _refuse_invalid_transitions(self) -> None:
-        """Answer requests of invalid transitions. The callback of rclpy would raise an error that ends the process."""
+        """Answer requests of invalid transitions, at which the callback of rclpy would end the process."""
         service = self._service_change_state
         change = service.callback
 

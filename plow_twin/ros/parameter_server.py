@@ -51,16 +51,9 @@ class ParameterServer:
     be read before rclpy checks their types. An integer is accepted for a double. All invalid values are listed in one
     error.
 
-    Parameters
-    ----------
-    node
-        The node.
-    unconfigured
-        Function that returns whether parameters that take effect on configure may change.
-    changed
-        Function that receives the name and the value of a changed parameter that takes effect immediately.
-    refusals
-        Function that returns the reasons why the twin cannot use new settings.
+    `unconfigured` returns whether parameters that take effect on configure may change. `changed` receives the name and
+    the value of a changed parameter that takes effect immediately. `refusals` returns the reasons why the twin cannot
+    use new settings.
 
     Raises
     ------

@@ -59,7 +59,7 @@ def without_ros(arguments: Sequence[str]) -> list[str]:
 
 @contextmanager
 def _said_plainly() -> Iterator[None]:
-    """Convert an exception of rclpy to an error with a message that contains no line numbers of rcl."""
+    """Convert an exception of rclpy to an error whose message has no line numbers of rcl."""
     try:
         yield
     except RuntimeError as error:

@@ -168,11 +168,10 @@ class Subscriptions:
             self._not_selected(topic, batch)
 
     def _count_before_first(self, batch: list[Taken]) -> None:
-        """Count lost messages that a publisher sent after the subscription but before its first received message.
+        """Count the lost messages of a publisher before its first received message.
 
-        A publisher that is new to the node may have started before the subscription, because discovery takes time. The
-        start of the publisher is estimated from its rate. If the start is before the subscription, no message is
-        counted.
+        A publisher that is new to the node may have started before the subscription. Its start is estimated from its
+        rate, and no message is counted if the start is before the subscription.
         """
         newest = {message.sender: message for message in batch}
         for sender, (first, counted) in list(self._appeared.items()):

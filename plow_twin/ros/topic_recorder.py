@@ -173,24 +173,10 @@ def record_topics(
 ) -> Mapping[str, Any]:
     """Record topics to a new folder until `stopped` returns True.
 
-    Parameters
-    ----------
-    folder
-        Folder to create. If it exists and is not empty, `<folder>_2`, `<folder>_3`, ... is created.
-    topics
-        Names of topics to record.
-    every
-        Whether to record all topics, except hidden topics.
-    exclude
-        Regular expression for names of topics that `every` does not include.
-    but
-        Names of topics that `every` does not include.
-    stopped
-        Function that returns True when the recording must end.
-    on_started
-        Function that receives the created folder.
-    on_trouble
-        Function that receives a text when the disk becomes full, and a text when it has space after that.
+    If the folder exists and is not empty, `<folder>_2`, `<folder>_3`, ... is created. With `every`, all topics are
+    recorded except hidden topics, topics that match the regular expression `exclude`, and the topics `but`.
+    `on_started` receives the created folder. `on_trouble` receives a text when the disk becomes full, and a text when
+    it has space after that.
 
     Returns
     -------

@@ -44,9 +44,7 @@ class Level(IntEnum):
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Smallest values with which an alarm has the level WARN or the level ERROR. A threshold of 0 disables the
-    level.
-    """
+    """Smallest values of an alarm with the level WARN and with the level ERROR; 0 disables a level."""
 
     warn: float = 0.0
     error: float = 0.0
@@ -161,8 +159,7 @@ class _Model:
     def residual(self, stamp_ns: int, x: float, y: float) -> tuple[int, float] | None:
         """Return the stamp [ns] of a measured pose and its distance [m] from the model.
 
-        The result is None if the pose is older than all stored poses of the model, or if it is newer than the model and
-        therefore waits.
+        The result is None for a pose that is too old, and for a pose that waits because it is newer than the model.
         """
         if not self._stamps_ns or stamp_ns > self._stamps_ns[-1]:
             if len(self._waiting) < _MOST_WAITING:
@@ -250,10 +247,7 @@ class Alarms:
         return self._model is not None
 
     def _feed_quiet(self, published: Published) -> bool:
-        """Update the alarms with many rows together and return True if no row can change a level.
-
-        If a row might change a level, return False and change nothing.
-        """
+        """Update the alarms with many rows together; return False, without an effect, if a row might change a level."""
         rows, slow = published
         growth = self.alarms.get("clearance_rate")
         if self._model is not None or rows["held"].any() or (growth is not None and growth.lowest < math.inf):

@@ -208,10 +208,9 @@ class Driver:
     def _use_samples(
         self, run: list[Sample], stamp_ns: int, wrench: tuple[float, float, float], now_ns: int
     ) -> Iterator[Published]:
-        """Judge a sample and append it to `run`, a list of samples that will be applied together.
+        """Judge a sample and append it to `run`, whose samples are applied together.
 
-        If the new sample cannot be judged or applied together with the samples in `run`, the samples in `run` are
-        applied first.
+        If the sample cannot be judged or applied together with the others, the others are applied first.
         """
         late = bool(run) and self._is_late(run[0])
         # if the stamp does not rise, `run` must be applied before the sample can be judged as late or as a jump back

@@ -68,7 +68,6 @@ class History:
         return self._stamps_ns[-1] if self._stamps_ns else None
 
     def __contains__(self, stamp_ns: int) -> bool:
-        """Return whether a stored sample has this stamp."""
         self._make_samples()
         index = bisect_left(self._stamps_ns, stamp_ns)
         return self._stamps_ns[index : index + 1] == [stamp_ns]
@@ -202,7 +201,6 @@ class RecentStamps:
         return self._stamps_ns[-1] - self._span_ns if self._stamps_ns else None
 
     def __contains__(self, stamp_ns: int) -> bool:
-        """Return whether the stamp has occurred."""
         index = bisect_left(self._stamps_ns, stamp_ns)
         return self._stamps_ns[index : index + 1] == [stamp_ns]
 

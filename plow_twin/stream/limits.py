@@ -84,10 +84,9 @@ def excitation_limits(
 ) -> Limits:
     """Return the limits of a load (Fx, Fy [N], M [N m]) and of its rates; a limit of 0 is derived from the scene.
 
-    The derived limit of a force is ten times the sum of all loads of the scene and the head's weight. The derived limit
-    of a moment is the sum of two terms. The first term is the limit of a force times half the frame's diagonal. The
-    second term is ten times the largest moment of the loads. The derived limits of the rates allow a change by the
-    limit of the value within a millisecond.
+    The derived limit of a force is ten times the sum of all loads and the head's weight. The derived limit of a moment
+    is this force times half the frame's diagonal, plus ten times the largest moment of the loads. The derived limits of
+    the rates allow a change by the limit of the value within a millisecond.
     """
     amplitude = compile_loads(scene.loads).largest()
     total = float(amplitude[:2].sum()) + scene.head.mass_kg * abs(scene.gravity.acceleration_m_s2)

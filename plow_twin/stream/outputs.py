@@ -59,8 +59,7 @@ FOLLOWED_FIELDS: Final = (
 _MOTION: Final = ("t", "stamp_ns", "held", "q", "v", "penetration", "rate", "force", "wear_depth", *FOLLOWED_FIELDS)
 #: Fields that are checked for numbers that are not finite.
 _SUMMED: Final = ("q", "v", "penetration", "rate", "force", "impulse", "peak")
-#: Indices in `clearance` of the six numbers in `known_clearance`. The shifts by an estimate are added to the same six
-#: numbers.
+#: Indices in `clearance` of the numbers in `known_clearance`, and of the numbers that an estimate shifts.
 _KNOWN: Final = np.array([0, len(_CLEARANCES), len(_CLEARANCES) + 1, 1, len(_CLEARANCES) + 2, len(_CLEARANCES) + 3])
 #: Number of rows allocated together. The allocation takes about as long as the allocation of a single row.
 _STOCK: Final = 256
@@ -189,9 +188,8 @@ class Outputs:
     def set_shift(self, shift: Sequence[float]) -> None:
         """Add the shifts of an estimate to the published clearances and their quantiles.
 
-        `shift` contains six numbers [m]. The first three are for the horizontal clearance, its 5 % quantile and its 95
-        % quantile. The last three are for the vertical clearance. The shift is not part of `state`, so the insertion of
-        late samples does not change it.
+        `shift` contains six numbers [m]: for the horizontal clearance and its 5 % and 95 % quantiles, then for the
+        vertical clearance. The shift is not part of `state`, so the insertion of late samples does not change it.
         """
         values = np.zeros(len(CLEARANCE_NAMES))
         values[_KNOWN] = shift
@@ -342,11 +340,7 @@ class Outputs:
         return found
 
     def modelled(self, wear_depth: Array) -> Array:
-        """Return the clearances of the model without a shift, shape (6,) [m].
-
-        The first three numbers are the horizontal clearance, its 5 % quantile and its 95 % quantile. The last three
-        numbers are for the vertical clearance.
-        """
+        """Return the clearances of the model without a shift, shape (6,) [m], in the order of `set_shift`."""
         middle = clearances(self._scene, wear_depth)
         low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
         return np.stack((middle, low, high), axis=1)[:2].ravel()

@@ -63,8 +63,8 @@ DIGEST_INTERVAL: Final = 100
 #: - number of travel speeds that wait for their stamps
 _HEADER: Final = struct.Struct("<?qqq?dq")
 _TRAVEL: Final = struct.Struct("<qd")
-#: Largest time [ns] by which a pose may be ahead of the model. If a bag is played fast, poses arrive long before the
-#: samples with the same stamps. A pose beyond the limit must come from a different clock.
+#: Largest time [ns] by which a pose may be ahead of the model, as when a bag is played fast. A pose beyond the limit
+#: must come from a different clock.
 _AHEAD_NS: Final = 3_600_000_000_000
 _WEAR_SIZE: Final = 8 * PAIR_COUNT
 _NO_LOAD: Final = np.zeros((1, 3))
@@ -597,8 +597,8 @@ class Session:
         self._restore(data)
         self._advances, self.outputs.slow_before = advances, slow
         if self.following is not None:
-            # A pose or an estimate has no effect before the time at which it became known. Without this rule, the
-            # motion would depend on how far the session goes back.
+            # if a pose or an estimate had an effect before it became known, the motion would depend on how far the
+            # session goes back
             measured, self._measured = self._measured, deque()
             for one in measured:
                 if one.number > self.following.added:
@@ -665,8 +665,8 @@ class Session:
         elif travel.stamp_ns > self.stamp_ns:
             insort(self._travels, travel, key=lambda item: item.stamp_ns)
         elif oldest_ns is not None and travel.stamp_ns <= oldest_ns:
-            # The stamp of the speed is older than all stored states. The speed takes effect at the newest sample or,
-            # without samples, at the oldest stored state.
+            # a speed older than all stored states takes effect at the newest sample or, without samples, at the oldest
+            # stored state
             self._set_speed(Travel(oldest_ns if newest_ns is None else newest_ns, travel.speed_m_s))
         elif newest_ns is None or oldest_ns is None or travel.stamp_ns >= newest_ns:
             self._set_speed(travel)

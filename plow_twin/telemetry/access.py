@@ -40,18 +40,9 @@ _NO_TOPIC: Final = re.compile(r"[+#\x00-\x1f]|^\$")
 class WayOut:
     """Description of an output.
 
-    Attributes
-    ----------
-    name : str
-        Name of the part of the diagnostics for the output.
-    address : str
-        Address of the receiver without credentials.
-    modules
-        Modules that the process of the output imports.
-    first
-        First message to the process of the output, which contains the options.
-    may_acknowledge : bool
-        Whether an operator at the receiver may acknowledge alarms.
+    `name` is its part of the diagnostics, and `address` contains no credentials. The process of the output imports
+    `modules` and receives the message `first`, which contains the options. With `may_acknowledge`, an operator at the
+    receiver may acknowledge alarms.
     """
 
     name: str
@@ -186,10 +177,7 @@ def _broker_options(host: str, port: int, credentials: Credentials, *, tls: bool
 def _address(
     option: str, url: str, schemes: tuple[str, ...], expected: str, *, plain: bool
 ) -> tuple[str, int, str, bool]:
-    """Return host, port and path of an address, and whether the address is encrypted.
-
-    The address is encrypted if its scheme is the last of `schemes`.
-    """
+    """Return host, port and path of an address, and whether its scheme is the last of `schemes`, which is encrypted."""
     try:
         parts = urlsplit(url)
         port = parts.port or _PORTS.get(parts.scheme, 0)

@@ -16,13 +16,11 @@ from plow_twin.dashboard.link import Link
 from plow_twin.telemetry.values import Group, Newest
 from plow_twin.telemetry.way import State
 
-#: Largest number of points in the queue. At 1 Hz, the queue covers ten minutes of all numeric groups. If the queue is
-#: full, the oldest points are dropped.
+#: Largest number of points in the queue: ten minutes of all numeric groups at 1 Hz. The oldest points are dropped.
 _WAITING: Final = 2000
 _AT_ONCE: Final = 500
 _ANSWER_MS: Final = 5000
-#: Waiting time after a failed attempt to write [s]. The first constant is the time after the first failure. The time
-#: doubles with each failure up to the second constant.
+#: Waiting time after the first failed attempt to write [s]. The time doubles with each failure up to `_LONGEST_WAIT_S`.
 _FIRST_WAIT_S: Final = 1.0
 _LONGEST_WAIT_S: Final = 30.0
 
@@ -75,11 +73,7 @@ class Influx:
         self._client.close()
 
     def _fail(self, error: Any, count: int) -> None:
-        """Record a failure.
-
-        If the database has rejected the content of lines, the lines are dropped. After any other failure, they stay in
-        the queue.
-        """
+        """Record a failure; drop the lines if the database has rejected their content."""
         self.state.connected = False
         status = getattr(error, "status", None)
         reason = f"{status} {error.reason}" if status else str(error)

@@ -16,8 +16,7 @@ from plow_twin.live.bridge.paho_client import end_of, make_client, refusal, use_
 from plow_twin.telemetry.values import UNITS, Group, Newest
 from plow_twin.telemetry.way import State, TelemetryError
 
-#: Largest number of messages in the queue. At 1 Hz, the queue covers ten minutes of all numeric groups. If the queue is
-#: full, the oldest messages are dropped.
+#: Largest number of messages in the queue: ten minutes of all numeric groups at 1 Hz. The oldest messages are dropped.
 _WAITING: Final = 2000
 _UNACKNOWLEDGED: Final = 20
 #: Keep-alive interval [s]. After 1.5 intervals without a message, the connection to the broker is treated as broken.
@@ -36,19 +35,10 @@ class Message(NamedTuple):
 class Broker:
     """A connection to a broker that is restored after a break, with a queue of messages.
 
-    Parameters
-    ----------
-    tls
-        Paths of the files `ca`, `certificate` and `key`. If `tls` is None, the connection is not encrypted.
-    will
-        Function that returns the message that the broker publishes if the next connection breaks.
-    on_connected
-        Function that returns the messages that are sent before the queue after each connection.
-    waiting
-        Largest length of the queue. If the queue is full, the oldest messages are dropped and counted as lost.
-    keeps
-        Whether the queued messages are kept when the connection breaks. If False, the messages are dropped and counted
-        as lost.
+    If the queue has more than `waiting` messages, the oldest messages are dropped and counted as lost. If `keeps` is
+    False, a break drops all queued messages. `will` returns the message that the broker publishes if the next
+    connection breaks. `on_connected` returns the messages that are sent before the queue after each connection. Without
+    the paths `tls` (`ca`, `certificate`, `key`), the connection is not encrypted.
     """
 
     def __init__(
@@ -70,8 +60,7 @@ class Broker:
         self._most, self._keeps = waiting, keeps
         self._waiting: deque[Message] = deque()
         self._unacknowledged: set[int] = set()
-        #: Lock that is held while messages are numbered and queued, so that messages are queued in the order of their
-        #: numbers.
+        #: held while messages are numbered and queued, so that they are queued in the order of their numbers
         self.lock = threading.RLock()
         self.client = make_client(client_id, clean=True)
         self._set_will()

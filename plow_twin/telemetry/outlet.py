@@ -1,4 +1,4 @@
-"""An output of a twin. It consists of a process, of a feed to the process, and of a part of the diagnostics."""
+"""An output of a twin: a process, a feed to the process, and a part of the diagnostics."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class Outlet(Beside):
 
 
 def _is_there(name: str) -> bool:
-    """Return whether a module can be imported. The module is not imported."""
+    """Return whether a module can be imported, without importing it."""
     try:
         return find_spec(name) is not None
     except ModuleNotFoundError:

@@ -18,14 +18,8 @@ class TelemetryError(PlowTwinError):
 class State:
     """State of an output.
 
-    Attributes
-    ----------
-    sent : int
-        Number of messages, points or updates that the receiver has accepted.
-    lost : int
-        Number of messages, points or updates that were dropped.
-    trouble : str
-        Reason why the receiver accepts no messages. The text is empty if it accepts messages.
+    `sent` and `lost` count messages, points or updates that the receiver has accepted, and that were dropped. `trouble`
+    is the reason why the receiver accepts no messages, or empty.
     """
 
     connected: bool = False

@@ -23,30 +23,11 @@ _CREDENTIALS: Final = mapping(
 
 @dataclass(frozen=True)
 class Access:
-    """Address of a broker or server, and the credentials for it.
+    """Address `SCHEME://HOST:PORT` of a broker or server, and the credentials for it.
 
-    Attributes
-    ----------
-    url : str
-        Address `SCHEME://HOST:PORT`. If the host is missing, the address refers to this machine.
-    user : str
-        Name of the user.
-    password : str
-        Password of the user.
-    ca : Path
-        Certificate of a trusted authority, or certificate of the broker or server.
-    certificate : Path
-        Certificate of the twin.
-    key : Path
-        Private key of the twin.
-    user_certificate : Path
-        Certificate of the user, which replaces the name and the password.
-    user_key : Path
-        Private key of the user.
-    plain : bool
-        Whether an unencrypted connection to another machine is allowed.
-    client_id : str
-        Name of the session at an MQTT broker.
+    An address without a host refers to this machine. `ca` is the certificate of a trusted authority, of the broker or
+    of the server. `user_certificate` replaces the name and the password. With `plain`, an unencrypted connection to
+    another machine is allowed. `client_id` is the name of the session at an MQTT broker.
     """
 
     url: str
@@ -85,8 +66,8 @@ def host_and_port(access: Access, ports: Mapping[str, int], *, has_path: bool = 
 def password(path: Path | None, source: str) -> str:
     """Return the password for a source.
 
-    The password is the first line of a file or, if `path` is None, the value of an environment variable. For the source
-    `OPCUA`, the variable is `PLOW_TWIN_OPCUA_PASSWORD`.
+    The password is the first line of a file or, if `path` is None, the environment variable
+    `PLOW_TWIN_<source>_PASSWORD`.
     """
     return os.environ.get(f"PLOW_TWIN_{source}_PASSWORD", "") if path is None else read_secret(path)
 

@@ -1,7 +1,6 @@
 """Pass the messages of a bridge to the inputs of a live twin.
 
-Some senders number their messages, and the feeder counts lost messages by these numbers. If a message has no number,
-the feeder assigns the next number to it.
+Lost messages are counted by the numbers of the sender. A message without a number gets the next number.
 """
 
 from __future__ import annotations
@@ -42,16 +41,8 @@ _NOTABLE = 0.02
 class Feeder:
     """Feeder that passes messages to the runtime of a live twin.
 
-    Parameters
-    ----------
-    roles
-        Roles of the topics. Roles that a live twin does not use are ignored.
-    runtime
-        Runtime of the twin.
-    send
-        Function that receives each message of the twin.
-    model
-        Load model, if the load is computed from the signals of the drive.
+    Roles that a live twin does not use are ignored. The function `send` receives each message of the twin. With
+    `model`, the load is computed from the signals of the drive.
     """
 
     def __init__(
@@ -73,7 +64,7 @@ class Feeder:
         self._number = 0
         #: count of messages without a number since the last message with a number
         self._assumed = 0
-        #: count of assigned numbers that the sender has used for later messages
+        #: number of messages that the sender has not counted
         self._unnumbered = 0
         #: number of the last message if it does not continue the earlier numbers, otherwise None
         self._odd: int | None = None
@@ -127,10 +118,7 @@ class Feeder:
             self._send(topic, message)
 
     def _feed_table(self, table: Table) -> bool:
-        """Process the lines of a file as arrays.
-
-        Returns False, without an effect, if the lines must be processed singly.
-        """
+        """Process the lines of a file as arrays; return False, without an effect, if they must be processed singly."""
         roles, inputs = self._by_topic.get(table.topic, []), self._runtime.inputs
         role = next((role for name, role in roles if name == "excitation"), None)
         if role is None or role.sequence or not (self._at_once and inputs.active):
@@ -236,10 +224,7 @@ class Feeder:
         return self._name, number + self._unnumbered, again
 
     def _goes_on(self, number: int) -> bool:
-        """Return whether a number continues a sequence of numbers.
-
-        The sequence is either the sequence of all earlier numbers, or a new sequence that begins with `_odd`.
-        """
+        """Return whether a number continues the earlier numbers, or new numbers that begin with `_odd`."""
         odd, before = self._odd, self._number
         if odd is not None and abs(number - odd) < abs(number - before):
             if not before < odd <= before + _MOST_LOST:

@@ -34,7 +34,7 @@ STDIN_TOPIC: Final = "stdin"
 
 @dataclass
 class _Tail:
-    """A file that is read while it grows. If the file is truncated or replaced, it is read from its beginning."""
+    """A file that is read while it grows, and from its beginning after it was truncated or replaced."""
 
     path: Path
     #: topic of the rows; by default the file name without extension
@@ -53,7 +53,7 @@ class _Tail:
     def columns(self, *, grows: bool) -> list[str] | None:
         """Return the columns in the first line, or None without a first line.
 
-        If `grows` is True, a last line without a newline character is incomplete and is not used.
+        If `grows` is True, a last line without a newline character is not used.
         """
         rows = Rows()
         try:
@@ -102,7 +102,7 @@ class _Tail:
         return data
 
     def _is_anew(self) -> bool:
-        """Return whether the file was rewritten. The rewritten file may be longer than the old file."""
+        """Return whether the bytes before the read position have changed."""
         begin = self._file.tell() - len(self._newest)
         return os.pread(self._file.fileno(), len(self._newest), begin) != self._newest
 
@@ -139,10 +139,10 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 class _Dated:
-    """Files with names that match a pattern. All files are one topic.
+    """Files whose names match a pattern, as one topic.
 
-    When files are followed, reading begins with the newest file and continues with each new file. The second newest
-    file is still read while the newest file is read, because it may still grow.
+    When followed, reading begins with the newest file. The newest two files are read, because the older one may still
+    grow.
     """
 
     def __init__(self, pattern: Path) -> None:
@@ -201,13 +201,8 @@ def _numbered(path: Path) -> list[tuple[int, str]]:
 class Files(Bridge):
     """Files as topics. The name of a topic is the file name, or the pattern such as `load_*.csv`, without extension.
 
-    With `follow`, files are read while they grow, and files that do not exist are awaited. Without `follow`, the
-    messages of several files are merged by the stamps of the messages.
-
-    Raises
-    ------
-    BridgeError
-        A file cannot be read.
+    With `follow`, files are read while they grow, and missing files are awaited. Without `follow`, the messages of
+    several files are merged by their stamps.
     """
 
     def __init__(self, paths: list[Path], *, follow: bool) -> None:
@@ -314,7 +309,7 @@ def _is_pattern(path: Path) -> bool:
 
 
 def _sent_ns(row: Arrived, stamp_ns: StampOf[Arrived] | None) -> int | None:
-    """Return the stamp in a row, or None if the row contains no stamp; the receive time is not used."""
+    """Return the stamp in a row, or None without a stamp."""
     return None if stamp_ns is None else stamp_ns(Arrived(row.topic, NO_TIME, row.content))
 
 

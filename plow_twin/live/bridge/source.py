@@ -25,7 +25,7 @@ class BridgeError(PlowTwinError):
 
 
 class Messages(Protocol):
-    """Messages in the order of arrival. Some sources parse a message only when the iteration reaches it."""
+    """Messages in the order of arrival, which may be parsed only when the iteration reaches them."""
 
     def __len__(self) -> int: ...
     def __iter__(self) -> Iterator[Arrived]: ...
@@ -114,7 +114,7 @@ class Lines:
 
 
 class Rows:
-    """Parser of lines. The first line determines whether the lines are JSON objects or rows of a CSV table."""
+    """Parser of lines, which are JSON objects or rows of a CSV table, as the first line shows."""
 
     def __init__(self) -> None:
         #: names of the columns, or keys of the first JSON object; None before the first line
@@ -134,7 +134,7 @@ class Rows:
         return columns_of(source, self.columns or ())
 
     def of_another_file(self) -> Rows:
-        """Return a parser for the next file. If the next file has no header, the columns of this file are used."""
+        """Return a parser for the next file, which has the columns of this file if it has no header."""
         rows = Rows()
         rows._before = self.columns
         return rows

@@ -1,4 +1,4 @@
-"""The OPC UA information model. It has a type for the twin of a plough head, and one instance of the type.
+"""The OPC UA information model: a type for the twin of a plough head, and one instance of the type.
 
 The type is derived from the type of mining equipment in the companion specification.
 """

@@ -54,18 +54,9 @@ class OneUser(UserManager):
 class OpcUaServer:
     """Output as an OPC UA server, to which clients connect.
 
-    Parameters
-    ----------
-    certificate
-        Certificate of the server. With a certificate and a key, all connections are signed and encrypted.
-    key
-        Private key of the server.
-    trusted
-        Folder with the certificates of the admitted clients or authorities. With None, all clients are admitted.
-    user
-        Name of the only user. If the name is empty, clients need no login.
-    password
-        Password of the user.
+    With a certificate and a key, all connections are signed and encrypted. `trusted` is a folder with the certificates
+    of the admitted clients or authorities; with None, all clients are admitted. `user` is the only user; if it is
+    empty, clients need no login.
     """
 
     def __init__(

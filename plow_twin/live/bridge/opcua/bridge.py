@@ -1,6 +1,6 @@
 """Receive samples from an OPC UA server by a subscription, and read missed samples from the history of the server.
 
-The server sends single values, each with a node and a stamp. The class `Samples` combines values into samples.
+The server sends single values, which the class `Samples` combines into samples.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from plow_twin.record.sources import Arrived, TopicType
 #: history wait.
 _QUEUE: Final = 100_000
 _PORTS: Final = {"opc.tcp": 4840}
-#: Longest wait for all values with the same stamp [s]. The wait is five publishing intervals. It has a margin, because
-#: the values arrive in one or two messages.
+#: Longest wait for all values with the same stamp [s]: five publishing intervals. The values arrive in one or two
+#: messages.
 _WAIT_S: Final = 5e-3 * PUBLISHING_MS
 #: Time span of the history that is read at a time [ns].
 _PIECE_NS: Final = 10_000_000_000
@@ -53,24 +53,12 @@ _LONGEST_WAIT_S: Final = 30.0
 
 
 class OpcUa(Bridge):
-    """Subscription to the nodes of a mapping. After a broken connection, the subscription is renewed.
+    """Subscription to the nodes of a mapping, which is renewed after a broken connection.
 
-    Each role of the mapping is a topic, and the fields of the role are nodes.
-
-    Parameters
-    ----------
-    access
-        Address of the server, and credentials.
-    roles
-        Roles of the mapping.
-    rate_hz
-        Expected rate of the samples [Hz]. With 0, the fastest sampling of the server is requested.
-    connect_s
-        Longest wait for the connection [s].
-    waits
-        Whether `start` returns immediately, without waiting for the connection.
-    on_arrival
-        Function that is called, in another thread, when samples have arrived.
+    Each role of the mapping is a topic, and its fields are nodes. `rate_hz` is the expected rate of the samples [Hz];
+    with 0, the fastest sampling of the server is requested. With `waits`, `start` does not wait for the connection,
+    otherwise it waits for up to `connect_s` [s]. The function `on_arrival` is called, in another thread, when samples
+    have arrived.
 
     Raises
     ------
@@ -219,7 +207,7 @@ class OpcUa(Bridge):
             self.trouble = f"the connection broke: {link.trouble}; reconnecting"
 
     async def _first_values(self) -> list[tuple[int, Any]]:
-        """Return the first values of the new subscription. The history is read up to the stamps of these values."""
+        """Return the first values of the new subscription, up to which the history is read."""
         give_up = time.monotonic() + _FIRST_VALUES_S
         while not self._held_back and time.monotonic() < give_up:
             await asyncio.sleep(0.01)
@@ -233,7 +221,7 @@ class OpcUa(Bridge):
         self._held_back = None
 
     async def _take(self, values: list[tuple[int, Any]], lost: bool) -> None:
-        """Use values from the server. If values before these values were lost, read the history first."""
+        """Use values from the server, after the history if values before them were lost."""
         if self._held_back is not None:
             self._held_back.append((values, lost))
             return
@@ -305,7 +293,7 @@ class OpcUa(Bridge):
         return False
 
     async def _read_history(self, ends_ns: Mapping[int, int]) -> None:
-        """Read the history until the newest value of each node reaches the stamp of the node in `ends_ns`."""
+        """Read the history until each node has reached its stamp in `ends_ns`."""
         end_ns = max(ends_ns.values(), default=time.time_ns())
         reached_ns, found = 0, 0
         give_up = time.monotonic() + _HISTORY_LAG_S
@@ -327,7 +315,7 @@ class OpcUa(Bridge):
             self._no_history = "the history of the server is empty"
 
     async def _take_piece(self, begin_ns: int, end_ns: int) -> int:
-        """Use the new values of the history between two stamps [ns], and return the number of these values."""
+        """Use the new values of the history between two stamps [ns], and return their number."""
         assert self._link is not None
         values = await self._link.history(begin_ns, end_ns)
         new = [item for item in values if self._stamp_ns(*item) > self._newest_ns(item[0])]

@@ -62,24 +62,11 @@ class Revised:
 
 
 class Link:
-    """Connection to a server with a subscription.
+    """Connection to a server with a subscription to nodes.
 
-    Parameters
-    ----------
-    access
-        Address of the server, and credentials.
-    host
-        Host name of the server.
-    nodes
-        Identifiers of the nodes. The namespace number in an identifier is an index of `uris`.
-    uris
-        Namespaces at the first connection. If `uris` is empty, the current namespaces of the server are used.
-    sampling_ms
-        Requested sampling interval [ms]. With 0, the fastest sampling of the server is requested.
-    take
-        Function that receives the values.
-    counts
-        Counters of the losses.
+    The namespace number in the identifier of a node is an index of `uris`, the namespaces at the first connection. If
+    `uris` is empty, the current namespaces of the server are used. `sampling_ms` is the requested sampling interval
+    [ms]; 0 requests the fastest. The function `take` receives the values.
     """
 
     def __init__(
@@ -135,10 +122,7 @@ class Link:
             self._client.disconnect_socket()
 
     def _placed(self, node: ua.NodeId, uris: Sequence[str]) -> ua.NodeId:
-        """Return the identifier of a node with the current number of its namespace.
-
-        The number may have changed when the server restarted.
-        """
+        """Return a node with the current number of its namespace, which may have changed when the server restarted."""
         uri = getattr(node, "NamespaceUri", None)
         if uri is None:
             uri = uris[node.NamespaceIndex] if node.NamespaceIndex < len(uris) else None
@@ -288,10 +272,7 @@ class Link:
 
 
 def _bound(client: Client) -> None:
-    """Limit the size of the messages that a client accepts, because asyncua has no limit.
-
-    If a message is larger, the client disconnects.
-    """
+    """Limit the size of the messages that a client accepts, because asyncua has no limit."""
     connection = client.uaclient
     make = connection._make_protocol
 

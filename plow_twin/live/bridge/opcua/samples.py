@@ -52,7 +52,7 @@ class Samples:
         self._strays.setdefault(stamp_ns, (now_s, {}))[1].setdefault(node, value)
 
     def begin(self, node: str, stamp_ns: int, value: Value) -> None:
-        """Store the value of a node before the first sample. The value replaces missing values in later samples."""
+        """Store the value of a node before the first sample, for samples without a value of the node."""
         self.newest_ns[node] = stamp_ns
         self._begun.add(node)
         self._held[node] = value

@@ -56,13 +56,7 @@ async def secure(client: Client, access: Access, host: str) -> None:
 
 
 async def identify(client: Client, access: Access) -> None:
-    """Configure a client to log in with the certificate of a user.
-
-    Raises
-    ------
-    BridgeError
-        A file cannot be read.
-    """
+    """Configure a client to log in with the certificate of a user."""
     assert access.user_key, "checked with the address"
     try:
         await client.load_client_certificate(str(access.user_certificate))
@@ -72,10 +66,7 @@ async def identify(client: Client, access: Access) -> None:
 
 
 def _first(chain: bytes) -> bytes:
-    """Return the first certificate of a chain in DER encoding, which is the certificate of the server.
-
-    The length in the certificate must have the long form of DER.
-    """
+    """Return the first certificate of a chain in DER encoding, which is the certificate of the server."""
     return chain[: int.from_bytes(chain[2:4], "big") + 4]
 
 
@@ -88,10 +79,7 @@ def _read(path: Path) -> x509.Certificate:
 
 
 def _check_trust(server: x509.Certificate, trusted: x509.Certificate, host: str, access: Access) -> None:
-    """Raise a `BridgeError` if the certificate of the server is not trusted.
-
-    A certificate is trusted if it is `trusted` itself, or if `trusted` issued it for the host.
-    """
+    """Raise a `BridgeError` unless the certificate is `trusted` itself, or `trusted` issued it for the host."""
     now = datetime.now(UTC)
     if not server.not_valid_before_utc <= now <= server.not_valid_after_utc:
         raise BridgeError(
