@@ -35,28 +35,30 @@ class ParameterError(InputError):
         super().__init__(problems, source)
 
 
-def _number(default: float | tuple[float, ...], unit: str, low: float, high: float, effect: Effect, doc: str) -> Any:
+def _number(
+    default: float | tuple[float, ...], unit: str, low: float, high: float, doc: str, effect: Effect = Effect.CONFIGURE
+) -> Any:
     return field(default=default, metadata={"unit": unit, "low": low, "high": high, "effect": effect, "doc": doc})
 
 
 def _limit(unit: str, doc: str, default: float = 0.0, high: float = 1e300) -> Any:
-    return _number(default, unit, 0.0, high, Effect.NOW, f"largest plausible {doc}")
+    return _number(default, unit, 0.0, high, f"largest plausible {doc}", Effect.NOW)
 
 
 def _of_scene(unit: str, high: float, doc: str) -> Any:
-    return _number(-1.0, unit, -1.0, high, Effect.NOW, f"{doc}; with -1, the value in the scene")
+    return _number(-1.0, unit, -1.0, high, f"{doc}; with -1, the value in the scene", Effect.NOW)
 
 
 def _alarm(unit: str, high: float, doc: str) -> Any:
     doc = f"{doc} that raise a warning and an error; with 0, no alarm is raised"
-    return _number((0.0, 0.0), unit, 0.0, high, Effect.CONFIGURE, doc)
+    return _number((0.0, 0.0), unit, 0.0, high, doc)
 
 
-def _choice(default: str, choices: tuple[str, ...], effect: Effect, doc: str) -> Any:
+def _choice(default: str, choices: tuple[str, ...], doc: str, effect: Effect = Effect.CONFIGURE) -> Any:
     return field(default=default, metadata={"choices": choices, "effect": effect, "doc": doc})
 
 
-def _plain(default: bool | str, effect: Effect, doc: str) -> Any:
+def _plain(default: bool | str, doc: str, effect: Effect = Effect.CONFIGURE) -> Any:
     return field(default=default, metadata={"effect": effect, "doc": doc})
 
 
@@ -64,241 +66,110 @@ def _plain(default: bool | str, effect: Effect, doc: str) -> Any:
 class Settings:
     """All parameters with their defaults. Numbers are in SI units."""
 
-    autostart: bool = _plain(
-        True, Effect.START, "configure and activate the node at start; if false, the node waits for lifecycle requests"
-    )
-    hardware_id: str = _plain("plough_head", Effect.START, "serial number of the head, shown in status and diagnostics")
-    file_root: str = _plain(
-        "",
-        Effect.START,
+    # fmt: off
+    autostart: bool = _plain(True,
+        "configure and activate the node at start; if false, the node waits for lifecycle requests", Effect.START)
+    hardware_id: str = _plain("plough_head", "serial number of the head, shown in status and diagnostics", Effect.START)
+    file_root: str = _plain("",
         "folder that must contain the paths scene, record_path and wear_state_path; if empty, these parameters cannot "
-        "be changed after the start, but scene can be set to the name of a preset",
-    )
-    services_off: str = _plain(
-        "", Effect.START, "services that are refused, separated by commas, e.g. set_wear,acknowledge_alarms"
-    )
-    opcua_server: str = _plain(
-        "",
-        Effect.START,
+        "be changed after the start, but scene can be set to the name of a preset", Effect.START)
+    services_off: str = _plain("",
+        "services that are refused, separated by commas, e.g. set_wear,acknowledge_alarms", Effect.START)
+    opcua_server: str = _plain("",
         "OPC UA server, opc.tcp://HOST:PORT, whose nodes replace the topics of some inputs; if empty, all inputs are "
-        "topics",
-    )
-    opcua_map: str = _plain("", Effect.START, "YAML file that assigns nodes of opcua_server to inputs")
-    opcua_access: str = _plain(
-        "",
-        Effect.START,
-        "YAML file with the credentials for opcua_server; a server on this machine may need no credentials",
-    )
-    priority: int = _number(
-        0,
-        "SCHED_FIFO",
-        0,
-        99,
-        Effect.START,
-        "real-time priority of the computing thread; with 0, the normal priority; a refusal by the system is a warning",
-    )
-    cpu_affinity: str = _plain(
-        "",
-        Effect.START,
-        "processors on which the node runs, e.g. 2,3; if empty, all processors; a refusal by the system is a warning",
-    )
-    lock_memory: bool = _plain(
-        False, Effect.START, "lock all memory, so that it is not paged out; a refusal by the system is a warning"
-    )
-    scene: str = _plain("paper", Effect.CONFIGURE, "scene file, or the name of a preset: paper, bench_kv, bench_hc")
-    tolerance: float = _number(1e-9, "1", 1e-13, 1e-3, Effect.CONFIGURE, "relative tolerance of the solver")
-    excitation_source: str = _choice(
-        "excitation",
-        ("excitation", "tool_forces", "scene"),
-        Effect.CONFIGURE,
+        "topics", Effect.START)
+    opcua_map: str = _plain("", "YAML file that assigns nodes of opcua_server to inputs", Effect.START)
+    opcua_access: str = _plain("",
+        "YAML file with the credentials for opcua_server; a server on this machine may need no "
+        "credentials", Effect.START)
+    priority: int = _number(0, "SCHED_FIFO", 0, 99,
+        "real-time priority of the computing thread; with 0, the normal priority; a refusal by the system is a "
+        "warning", Effect.START)
+    cpu_affinity: str = _plain("",
+        "processors on which the node runs, e.g. 2,3; if empty, all processors; a refusal by the system is a "
+        "warning", Effect.START)
+    lock_memory: bool = _plain(False,
+        "lock all memory, so that it is not paged out; a refusal by the system is a warning", Effect.START)
+    scene: str = _plain("paper", "scene file, or the name of a preset: paper, bench_kv, bench_hc")
+    tolerance: float = _number(1e-9, "1", 1e-13, 1e-3, "relative tolerance of the solver")
+    excitation_source: str = _choice("excitation", ("excitation", "tool_forces", "scene"),
         "source of the load: a topic, or the loads in the scene at the time of the node's clock; samples on the other "
-        "topic are counted and ignored",
-    )
-    input_depth: int = _number(1000, "messages", 200, 100000, Effect.CONFIGURE, "queue depth of the excitation topics")
-    expected_rate: float = _number(
-        0.0,
-        "Hz",
-        0.0,
-        1e5,
-        Effect.CONFIGURE,
-        "expected rate of the samples, from which missing samples are counted; with 0, they are not counted",
-    )
-    publish_mode: str = _choice(
-        "on_sample",
-        ("on_sample", "fixed_rate"),
-        Effect.CONFIGURE,
-        "publish after each used sample, or at publish_rate; each message has the stamp of the newest used sample",
-    )
-    publish_rate: float = _number(100.0, "Hz", 0.1, 1000.0, Effect.CONFIGURE, "rate with publish_mode fixed_rate")
-    missed_periods: int = _number(
-        1,
-        "periods",
-        0,
-        1000000,
-        Effect.NOW,
-        "number of missed periods between two reports that causes a warning; with 0, no warning",
-    )
-    step_rate: float = _number(
-        100.0, "Hz", 1.0, 1000.0, Effect.CONFIGURE, "rate of advances under the loads in the scene and the hold policy"
-    )
-    rollback_span: float = _number(
-        2.0,
-        "s",
-        0.0,
-        600.0,
-        Effect.CONFIGURE,
-        "largest age, relative to the newest sample, at which a late sample is used; with 0, late samples are dropped",
-    )
-    estimate: bool = _plain(
-        False,
-        Effect.CONFIGURE,
-        "estimate clearances and contact parameters from the load and head_pose or gaps, in a separate process",
-    )
-    estimate_window: float = _number(
-        32.0, "s", 1.0, 600.0, Effect.CONFIGURE, "duration of the window of an estimate; ten load periods are enough"
-    )
-    estimate_interval: float = _number(10.0, "s", 0.5, 3600.0, Effect.CONFIGURE, "time between the ends of two windows")
-    estimate_forces: int = _number(
-        0,
-        "twins",
-        0,
-        4096,
-        Effect.CONFIGURE,
+        "topic are counted and ignored")
+    input_depth: int = _number(1000, "messages", 200, 100000, "queue depth of the excitation topics")
+    expected_rate: float = _number(0.0, "Hz", 0.0, 1e5,
+        "expected rate of the samples, from which missing samples are counted; with 0, they are not counted")
+    publish_mode: str = _choice("on_sample", ("on_sample", "fixed_rate"),
+        "publish after each used sample, or at publish_rate; each message has the stamp of the newest used sample")
+    publish_rate: float = _number(100.0, "Hz", 0.1, 1000.0, "rate with publish_mode fixed_rate")
+    missed_periods: int = _number(1, "periods", 0, 1000000,
+        "number of missed periods between two reports that causes a warning; with 0, no warning", Effect.NOW)
+    step_rate: float = _number(100.0, "Hz", 1.0, 1000.0,
+        "rate of advances under the loads in the scene and the hold policy")
+    rollback_span: float = _number(2.0, "s", 0.0, 600.0,
+        "largest age, relative to the newest sample, at which a late sample is used; with 0, late samples are dropped")
+    estimate: bool = _plain(False,
+        "estimate clearances and contact parameters from the load and head_pose or gaps, in a separate process")
+    estimate_window: float = _number(32.0, "s", 1.0, 600.0,
+        "duration of the window of an estimate; ten load periods are enough")
+    estimate_interval: float = _number(10.0, "s", 0.5, 3600.0, "time between the ends of two windows")
+    estimate_forces: int = _number(0, "twins", 0, 4096,
         "number of twins, at least 20, that are drawn from each estimate for the intervals on window_forces; 256 are "
-        "sufficient; with 0, window_forces is not published",
-    )
-    follow: str = _choice(
-        "full",
-        ("off", "parameters", "full"),
-        Effect.CONFIGURE,
+        "sufficient; with 0, window_forces is not published")
+    follow: str = _choice("full", ("off", "parameters", "full"),
         "how the twin follows the machine if `estimate` is true. With off, it does not follow. With parameters, each "
         "estimate sets the parameters of the model. With full, each measured pose also corrects the motion, and the "
-        "forces have intervals",
-    )
-    follow_members: int = _number(
-        128,
-        "twins",
-        20,
-        4096,
-        Effect.CONFIGURE,
-        "number of twins with follow: full; the computing time is proportional to this number",
-    )
-    forecast_limits: tuple[float, ...] = _number(
-        (0.0, 0.0),
-        "m",
-        0.0,
-        1.0,
-        Effect.CONFIGURE,
-        "limits of the horizontal and the vertical clearance for the forecast after each estimate; with 0, no forecast",
-    )
-    forecast_horizon: float = _number(
-        1.44e7, "s", 1.0, 1e10, Effect.CONFIGURE, "time of operation after which a limit counts as not reached"
-    )
-    forecast_stop: float = _number(
-        0.0,
-        "s",
-        0.0,
-        1e10,
-        Effect.CONFIGURE,
+        "forces have intervals")
+    follow_members: int = _number(128, "twins", 20, 4096,
+        "number of twins with follow: full; the computing time is proportional to this number")
+    forecast_limits: tuple[float, ...] = _number((0.0, 0.0), "m", 0.0, 1.0,
+        "limits of the horizontal and the vertical clearance for the forecast after each estimate; with 0, no forecast")
+    forecast_horizon: float = _number(1.44e7, "s", 1.0, 1e10,
+        "time of operation after which a limit counts as not reached")
+    forecast_stop: float = _number(0.0, "s", 0.0, 1e10,
         "time of operation until a planned stop; the forecast contains the probability that a limit is reached before "
-        "the stop; with 0, no stop is planned",
-    )
-    forecast_scenarios: str = _plain(
-        "",
-        Effect.CONFIGURE,
+        "the stop; with 0, no stop is planned")
+    forecast_scenarios: str = _plain("",
         "scenarios with factors of the load and the wear coefficient: NAME:load=X,coefficient=Y; NAME:...; the answer "
-        "of ~/forecast contains a forecast for each scenario",
-    )
-    wear_state_path: str = _plain(
-        "",
-        Effect.CONFIGURE,
+        "of ~/forecast contains a forecast for each scenario")
+    wear_state_path: str = _plain("",
         "folder in which the wear of the pads is saved; the wear of another head or scene is refused; if empty, the "
-        "wear is not saved",
-    )
-    wear_save_period: float = _number(10.0, "s", 0.1, 3600.0, Effect.CONFIGURE, "interval at which the wear is saved")
-    frame_id: str = _plain(
-        "slide_frame",
-        Effect.CONFIGURE,
-        "frame of all outputs; the origin is the centre of the slide, x points to the right and y points up",
-    )
-    child_frame_id: str = _plain("head_frame", Effect.CONFIGURE, "frame of the head in messages on head_state")
-    marker_rate: float = _number(
-        0.0,
-        "Hz",
-        0.0,
-        100.0,
-        Effect.CONFIGURE,
+        "wear is not saved")
+    wear_save_period: float = _number(10.0, "s", 0.1, 3600.0, "interval at which the wear is saved")
+    frame_id: str = _plain("slide_frame",
+        "frame of all outputs; the origin is the centre of the slide, x points to the right and y points up")
+    child_frame_id: str = _plain("head_frame", "frame of the head in messages on head_state")
+    marker_rate: float = _number(0.0, "Hz", 0.0, 100.0,
         "rate of the topic markers, on which the ROS node sends walls, pads and forces for RViz; needs "
-        "visualization_msgs; with 0, no markers are sent",
-    )
-    tf: bool = _plain(
-        False,
-        Effect.CONFIGURE,
+        "visualization_msgs; with 0, no markers are sent")
+    tf: bool = _plain(False,
         "send the pose of the head on /tf with the markers, from frame_id to child_frame_id; needs the ROS node and "
-        "tf2_msgs",
-    )
-    record_path: str = _plain(
-        "",
-        Effect.CONFIGURE,
+        "tf2_msgs")
+    record_path: str = _plain("",
         "folder for the recording of each configured run; if it exists, _2, _3, ... is added to its name; if empty, no "
-        "run is recorded",
-    )
-    record_outputs: str = _choice(
-        "all",
-        ("all", "decimated", "none"),
-        Effect.CONFIGURE,
+        "run is recorded")
+    record_outputs: str = _choice("all", ("all", "decimated", "none"),
         "recorded outputs; with none, only the journal is recorded, from which `plow-twin replay --write` computes the "
-        "outputs",
-    )
-    record_rate: float = _number(
-        50.0,
-        "Hz",
-        0.1,
-        10000.0,
-        Effect.CONFIGURE,
-        "rate of the outputs in a decimated recording; each output contains the peaks since the previous output",
-    )
-    record_part_mb: float = _number(
-        0.0, "MB", 0.0, 1e6, Effect.CONFIGURE, "size after which a new file of the recording begins; with 0, no limit"
-    )
-    record_part_s: float = _number(
-        0.0, "s", 0.0, 1e9, Effect.CONFIGURE, "time after which a new file of the recording begins; with 0, no limit"
-    )
-    record_keep_mb: float = _number(
-        0.0,
-        "MB",
-        0.0,
-        1e9,
-        Effect.CONFIGURE,
-        "total size of completed files above which the oldest files are removed; with 0, no file is removed",
-    )
-    record_ring: float = _number(
-        0.0,
-        "s",
-        0.0,
-        3600.0,
-        Effect.CONFIGURE,
+        "outputs")
+    record_rate: float = _number(50.0, "Hz", 0.1, 10000.0,
+        "rate of the outputs in a decimated recording; each output contains the peaks since the previous output")
+    record_part_mb: float = _number(0.0, "MB", 0.0, 1e6,
+        "size after which a new file of the recording begins; with 0, no limit")
+    record_part_s: float = _number(0.0, "s", 0.0, 1e9,
+        "time after which a new file of the recording begins; with 0, no limit")
+    record_keep_mb: float = _number(0.0, "MB", 0.0, 1e9,
+        "total size of completed files above which the oldest files are removed; with 0, no file is removed")
+    record_ring: float = _number(0.0, "s", 0.0, 3600.0,
         "duration of a recording in memory, which is written to a folder at each alarm or mark; with 0, the whole run "
-        "is recorded on the disk",
-    )
-    record_sync: bool = _plain(
-        False, Effect.CONFIGURE, "wait for the disk every half second, so that the recording survives a loss of power"
-    )
-    excitation_timeout: float = _number(
-        0.5,
-        "s",
-        0.01,
-        3600.0,
-        Effect.NOW,
+        "is recorded on the disk")
+    record_sync: bool = _plain(False,
+        "wait for the disk every half second, so that the recording survives a loss of power")
+    excitation_timeout: float = _number(0.5, "s", 0.01, 3600.0,
         "time without samples after which the excitation counts as stale; in files and under use_sim_time, such a "
-        "silence is only counted",
-    )
-    hold_policy: str = _choice(
-        "hold", ("hold", "zero"), Effect.NOW, "load while the excitation is stale: the last load, or zero"
-    )
-    hold_limit: float = _number(
-        60.0, "s", 0.0, 86400.0, Effect.NOW, "time for which the model continues while the excitation is stale"
-    )
+        "silence is only counted", Effect.NOW)
+    hold_policy: str = _choice("hold", ("hold", "zero"),
+        "load while the excitation is stale: the last load, or zero", Effect.NOW)
+    hold_limit: float = _number(60.0, "s", 0.0, 86400.0,
+        "time for which the model continues while the excitation is stale", Effect.NOW)
     limit_force: float = _limit("N", "force component; with 0, ten times the loads and the weight in the scene")
     limit_moment: float = _limit("N m", "moment; with 0, derived from the loads and the weight in the scene")
     limit_force_rate: float = _limit("N/s", "rate of change of a force; with 0, a change by limit_force within 1 ms")
@@ -317,82 +188,40 @@ class Settings:
     )
     limit_gap: float = _limit("m", "measured gap; with 0, the limit of a displacement", high=1000.0)
     limit_gap_rate: float = _limit("m/s", "rate of change of a gap; with 0, a change by limit_gap within 1 ms")
-    set_wear: tuple[float, ...] = _number(
-        (0.0,) * 8,
-        "m",
-        0.0,
-        1.0,
-        Effect.NOW,
-        "wear depths of the eight pads, which the service ~/set_wear applies; new pads have the depth 0",
-    )
-    mark: str = _plain("", Effect.NOW, "text that the service ~/mark writes to the journal")
+    set_wear: tuple[float, ...] = _number((0.0,) * 8, "m", 0.0, 1.0,
+        "wear depths of the eight pads, which the service ~/set_wear applies; new pads have the depth 0", Effect.NOW)
+    mark: str = _plain("", "text that the service ~/mark writes to the journal", Effect.NOW)
     clearance_horizontal: float = _of_scene("m", 10.0, "horizontal clearance of unworn pads")
     clearance_vertical: float = _of_scene("m", 10.0, "vertical clearance of unworn pads")
     stiffness: float = _of_scene("N/m^exponent", 1e300, "stiffness of the contact law")
     damping: float = _of_scene("as in the scene", 1e300, "damping of the contact law, if it has one")
     restitution: float = _of_scene("1", 1.0, "restitution of the contact law, if it has one")
     wear_coefficient: float = _of_scene("m^2/N", 1.0, "wear coefficient")
-    max_evaluations: int = _number(
-        0,
-        "evaluations",
-        0,
-        1000000000,
-        Effect.CONFIGURE,
+    max_evaluations: int = _number(0, "evaluations", 0, 1000000000,
         "largest number of evaluations of the equations of motion in an advance, at least 16; the rest of the advance "
-        "is computed coarsely, with an estimate of the error; with 0, the number is unlimited",
-    )
-    head_pose_type: str = _choice(
-        "pose",
-        ("pose", "pose_with_covariance"),
-        Effect.CONFIGURE,
-        "type of the messages on head_pose: PoseStamped, or PoseWithCovarianceStamped with variances of x, y and theta",
-    )
-    head_pose_deviation: tuple[float, ...] = _number(
-        (0.0, 0.0, 0.0),
-        "m, m, rad",
-        0.0,
-        1.0,
-        Effect.CONFIGURE,
-        "standard deviations of x, y and theta on head_pose; 0 means unknown",
-    )
-    gaps_deviation: float = _number(
-        0.0, "m", 0.0, 1.0, Effect.CONFIGURE, "standard deviation of the measured gaps; 0 means unknown"
-    )
-    excitation_deviation: tuple[float, ...] = _number(
-        (0.0, 0.0, 0.0),
-        "N, N, N m",
-        0.0,
-        1e12,
-        Effect.CONFIGURE,
-        "standard deviations of Fx, Fy and M on excitation; 0 means unknown",
-    )
+        "is computed coarsely, with an estimate of the error; with 0, the number is unlimited")
+    head_pose_type: str = _choice("pose", ("pose", "pose_with_covariance"),
+        "type of the messages on head_pose: PoseStamped, or PoseWithCovarianceStamped with variances of x, y and theta")
+    head_pose_deviation: tuple[float, ...] = _number((0.0, 0.0, 0.0), "m, m, rad", 0.0, 1.0,
+        "standard deviations of x, y and theta on head_pose; 0 means unknown")
+    gaps_deviation: float = _number(0.0, "m", 0.0, 1.0, "standard deviation of the measured gaps; 0 means unknown")
+    excitation_deviation: tuple[float, ...] = _number((0.0, 0.0, 0.0), "N, N, N m", 0.0, 1e12,
+        "standard deviations of Fx, Fy and M on excitation; 0 means unknown")
     alarm_force: tuple[float, ...] = _alarm("N", 1e12, "contact forces")
     alarm_clearance: tuple[float, ...] = _alarm("m", 10.0, "values of the larger clearance")
     alarm_wear_rate: tuple[float, ...] = _alarm("m/s", 1.0, "wear rates of a pad")
     alarm_clearance_rate: tuple[float, ...] = _alarm("m/s", 1.0, "growth rates of the larger clearance, over 10 s,")
     alarm_residual: tuple[float, ...] = _alarm("m", 10.0, "distances of head_pose from the model at the same stamp")
-    alarm_duration: float = _number(
-        0.0, "s", 0.0, 3600.0, Effect.CONFIGURE, "time for which a value must exceed a threshold to raise an alarm"
-    )
-    jump_back: float = _number(
-        1.0, "s", 0.0, 3600.0, Effect.NOW, "largest age relative to the newest stamp; an older stamp resets the model"
-    )
-    jump_forward: float = _number(
-        10.0,
-        "s",
-        0.1,
-        3600.0,
-        Effect.NOW,
-        "largest lead of a stamp ahead of the model time; a stamp further ahead resets the model",
-    )
-    failure_limit: int = _number(
-        10,
-        "advances",
-        0,
-        1000000,
-        Effect.NOW,
-        "number of consecutive failed advances after which the model is reset; with 0, the model is not reset",
-    )
+    alarm_duration: float = _number(0.0, "s", 0.0, 3600.0,
+        "time for which a value must exceed a threshold to raise an alarm")
+    jump_back: float = _number(1.0, "s", 0.0, 3600.0,
+        "largest age relative to the newest stamp; an older stamp resets the model", Effect.NOW)
+    jump_forward: float = _number(10.0, "s", 0.1, 3600.0,
+        "largest lead of a stamp ahead of the model time; a stamp further ahead resets the model", Effect.NOW)
+    failure_limit: int = _number(10, "advances", 0, 1000000,
+        "number of consecutive failed advances after which the model is reset; with 0, the model is not "
+        "reset", Effect.NOW)
+    # fmt: on
 
     @property
     def follows(self) -> str:
