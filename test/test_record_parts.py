@@ -6,6 +6,7 @@ import json
 import re
 import resource
 import shutil
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +107,7 @@ def test_a_recording_that_was_cut_off_is_repaired(share: float, tmp_path: Path) 
 
 def test_a_recording_that_is_being_written_is_not_repaired(tmp_path: Path) -> None:
     scene = dump_scene(load_scene(scene_path("paper")))
-    with Recorder(tmp_path / "run", RunHeader(scene)) as recorder:
+    with closing(Recorder(tmp_path / "run", RunHeader(scene))) as recorder:
         recorder.journal(paper_sample(0))
         with pytest.raises(RecordingError, match="still being written"):
             repair(tmp_path / "run")

@@ -16,6 +16,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -424,7 +425,7 @@ def test_losses_of_callers_do_not_disturb_the_closing_of_the_file(
 @pytest.mark.parametrize("whole", [False, True], ids=["file", "folder"])
 def test_a_removed_file_is_noticed(whole: bool, tmp_path: Path) -> None:
     errors: list[str] = []
-    with Recorder(tmp_path / "run", HEADER, flush_period_s=0.05, on_error=errors.append) as recorder:
+    with closing(Recorder(tmp_path / "run", HEADER, flush_period_s=0.05, on_error=errors.append)) as recorder:
         shutil.rmtree(recorder.path.parent) if whole else recorder.path.unlink()
         until(lambda: errors, "the end of the recording")
         assert not recorder.journal(Sample(BASE_NS, (0.0, 0.0, 0.0)))

@@ -1,7 +1,7 @@
 """Write MCAP files.
 
-Compiled functions and compressors, which release the interpreter lock, write many messages at a time. Each record is
-written by a single call, so that the file of a killed process can be read up to its last chunk.
+Compiled functions write many messages at a time. These functions and the compressors release the interpreter lock. Each
+record is written by a single call, so that the file of a killed process can be read up to its last chunk.
 """
 
 from __future__ import annotations

@@ -340,7 +340,8 @@ def _read(path: Path, lost: Counter[str], columns: tuple[str, ...], some: tuple[
     for row in rows:
         numbers = [_number(row[place]) if place < len(row) else math.nan for place in places]
         if numbers[0] is None:
-            numbers[0] = _date(row[places[0]])
+            stamp_ns = time_ns(row[places[0]])
+            numbers[0] = None if stamp_ns is None else 1e-9 * stamp_ns
         whole = [number for number in numbers if number is not None]
         if len(whole) < len(numbers):
             lost["unreadable_rows"] += 1
@@ -355,11 +356,6 @@ def _counted(rows: _Rows, lost: Counter[str]) -> Array:
     if rows.dropped:
         lost[OLDER_ROWS] += rows.dropped
     return table
-
-
-def _date(cell: str) -> float | None:
-    stamp_ns = time_ns(cell)
-    return None if stamp_ns is None else 1e-9 * stamp_ns
 
 
 def _number(cell: str) -> float | None:

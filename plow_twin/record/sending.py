@@ -57,8 +57,8 @@ class Messages:
 
     def intervals(self, published: Published) -> tuple[tuple[str, memoryview], ...]:
         """Return the messages with the intervals of a publication, in the form of `write`."""
-        wanted = self._followed is not None and published.with_intervals and self._followed.fill(published.rows)
-        return self._followed.parts if self._followed is not None and wanted else ()
+        followed = self._followed
+        return followed.parts if followed and published.with_intervals and followed.fill(published.rows) else ()
 
 
 class _Group(NamedTuple):

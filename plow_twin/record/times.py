@@ -17,7 +17,7 @@ STAMP_UNITS: Final = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 #: Time of a message whose time is unknown [ns].
 NO_TIME: Final = -1
 NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|inf|nan)", re.IGNORECASE)
-_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _NANOSECONDS: Final = re.compile(r"[.,]\d{6}(\d{1,3})")
 #: Smallest time that is read as a date [s]. `START_NS` is added to a smaller time, because a stamp of 0 means that the
 #: stamp is missing.
@@ -25,8 +25,8 @@ EPOCH_S: Final = 1e9
 #: Stamp of the time 0 [ns].
 START_NS: Final = 1_000_000_000
 OF_NUMBERS: Final = b"0123456789+-.eE "
-#: Latest time that is accepted [ns]. Many databases write a later date, 9999-12-31, for a missing date.
-_FARTHEST_NS: Final = 4_000_000_000_000_000_000
+#: Latest time that is accepted [ns]. Databases and servers write a later date, such as 9999-12-31, for a missing date.
+FARTHEST_NS: Final = 4_000_000_000_000_000_000
 
 
 def time_ns(value: Any, unit: str = "s") -> int | None:
@@ -64,7 +64,7 @@ def times_ns(texts: Sequence[bytes], unit: str) -> NDArray[np.int64] | None:
         numbers = np.array(list(map(float, texts))) * STAMP_UNITS[unit]
     except ValueError:
         numbers = None
-    if numbers is None or not (np.abs(numbers) < _FARTHEST_NS).all() or b"".join(texts).translate(None, OF_NUMBERS):
+    if numbers is None or not (np.abs(numbers) < FARTHEST_NS).all() or b"".join(texts).translate(None, OF_NUMBERS):
         found = [time_ns(text.decode(errors="replace"), unit) for text in texts]
         return None if None in found else np.array(found, np.int64)
     stamps: NDArray[np.int64] = np.rint(numbers).astype(np.int64)
@@ -90,7 +90,7 @@ def time_text(stamp_ns: int, *, own_start: bool = False) -> str:
 
 
 def _within(stamp_ns: int | None) -> int | None:
-    return None if stamp_ns is None or abs(stamp_ns) > _FARTHEST_NS else stamp_ns
+    return None if stamp_ns is None or abs(stamp_ns) > FARTHEST_NS else stamp_ns
 
 
 def _date_ns(text: str) -> int | None:
@@ -98,6 +98,11 @@ def _date_ns(text: str) -> int | None:
         time = datetime.fromisoformat(text)
     except ValueError:
         return None
-    time = time if time.tzinfo else time.replace(tzinfo=UTC)
     digits = _NANOSECONDS.search(text)  # the digits after the microseconds, which a datetime drops
-    return (time - _EPOCH) // timedelta(microseconds=1) * 1000 + (int(digits[1].ljust(3, "0")) if digits else 0)
+    return datetime_ns(time) + (int(digits[1].ljust(3, "0")) if digits else 0)
+
+
+def datetime_ns(time: datetime) -> int:
+    """Return a date as a stamp [ns]. A date without a time zone is in UTC."""
+    time = time if time.tzinfo else time.replace(tzinfo=UTC)
+    return (time - EPOCH) // timedelta(microseconds=1) * 1000

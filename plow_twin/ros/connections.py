@@ -1,8 +1,6 @@
 """Look up the publishers and subscribers on the topics of a node in the ROS graph.
 
 The lookup replaces the events of the middleware, which can cause a deadlock in rmw_fastrtps (ros2/rmw_fastrtps#890).
-When an event is requested or taken, rmw_fastrtps acquires two locks in one order. When an event occurs, rmw_fastrtps
-acquires the two locks in the opposite order.
 """
 
 from __future__ import annotations

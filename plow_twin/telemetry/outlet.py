@@ -53,9 +53,6 @@ class Outlet(Beside):
     def turn(self) -> None:
         """Send an update. If the receiver has stopped or resumed accepting messages, report the change."""
         self.feed.turn()
-        self._report()
-
-    def _report(self) -> None:
         trouble = self.feed.report["trouble"]
         if trouble != self._trouble:
             self._on_error(f"{self.address}: {trouble or 'takes messages now'}")

@@ -71,6 +71,9 @@ class _Tail:
             return None
         return rows.columns
 
+    def files(self) -> list[Path]:
+        return [self.path] if self.path.is_file() else []
+
     def read(self) -> list[Arrived]:
         data = self._block()
         lines = [None] * self.left + (self.lines.add(data) if data else [])
@@ -209,7 +212,7 @@ class Files(Bridge):
         super().__init__(ends=not follow, connected=True)
         self._tails = [_Dated(path) if _is_pattern(path) else _Tail(path) for path in paths]
         for tail in self._tails:
-            if self.ends and not (tail.files() if isinstance(tail, _Dated) else tail.path.is_file()):
+            if self.ends and not tail.files():
                 raise BridgeError(f"{tail.path}: no such file")
             if follow and is_parquet(tail.path):
                 raise BridgeError(f"{tail.path}: got Parquet, which does not grow by lines; expected CSV for --follow")
@@ -239,10 +242,7 @@ class Files(Bridge):
         """Begin to read the files of the topics."""
         self._tails = [tail for tail in self._tails if tail.topic in topics]
         if self.ends:
-            files = [
-                file for tail in self._tails for file in (tail.files() if isinstance(tail, _Dated) else [tail.path])
-            ]
-            self._size = sum(file.stat().st_size for file in files)
+            self._size = sum(file.stat().st_size for tail in self._tails for file in tail.files())
             streams = [self._all(tail) for tail in self._tails]
             if len(streams) == 1:
                 self._tables = streams[0]
@@ -253,7 +253,7 @@ class Files(Bridge):
     def poll(self, timeout_s: float) -> Messages:
         """Return the next messages."""
         if self.ends:
-            messages = self._next()
+            messages = next(self._tables, []) if self._tables is not None else list(islice(self._merged or (), BATCH))
             self.finished = not len(messages)
             return messages
         give_up = time.monotonic() + timeout_s
@@ -268,11 +268,6 @@ class Files(Bridge):
     def share(self) -> float:
         """Share of the files that has been read, from 0 to 1. With `follow`, the share is 0."""
         return self._done / self._size if self._size else 0.0
-
-    def _next(self) -> Messages:
-        if self._tables is not None:
-            return next(self._tables, [])
-        return list(islice(self._merged or (), BATCH))
 
     def _all(self, tail: _Tail | _Dated) -> Iterator[Messages]:
         if isinstance(tail, _Dated):

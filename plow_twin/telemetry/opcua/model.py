@@ -19,7 +19,7 @@ from plow_twin.telemetry.values import UNITS, Group
 
 NAMESPACE: Final = "https://plow-twin.readthedocs.io/opcua"
 _NODESETS: Final = Path(__file__).with_name("nodesets")
-#: Nodeset files. Files that are needed by a file precede the file.
+#: Nodeset files. Each file follows the files that it needs.
 _FILES: Final = ("Opc.Ua.Di", "Opc.Ua.Machinery", "Opc.Ua.Mining.General")
 _DI, _MINING = "http://opcfoundation.org/UA/DI/", "http://opcfoundation.org/UA/Mining/General/"
 _FUNCTIONAL_GROUP, _DEVICE_SET, _EQUIPMENT, _IDENTIFICATION = 1005, 5001, 1002, 1003

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 from typing import Any, Final
 
 from plow_twin.live.bridge.opcua.samples import NOT_MEASURED, Value
+from plow_twin.record.times import EPOCH, FARTHEST_NS, datetime_ns
 
-_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
-#: Latest time that is accepted as a stamp [ns]. Servers without a time send a date in 1601 or 9999.
-_FARTHEST_NS: Final = 4_000_000_000_000_000_000
-_MICROSECOND: Final = timedelta(microseconds=1)
 _SEVERITY: Final = 0xC0000000
 _UNCERTAIN: Final = 0x40000000
 #: Bits of the status of a value. They mean that the queue of the server dropped values before the value.
@@ -78,11 +75,10 @@ def _stamp_ns(time: datetime | None, picoseconds: int | None) -> int | None:
     """
     if time is None:
         return None
-    time = time if time.tzinfo else time.replace(tzinfo=UTC)
-    stamp_ns = (time - _EPOCH) // _MICROSECOND * 1000 + (picoseconds or 0) // 100
-    return stamp_ns if 0 < stamp_ns < _FARTHEST_NS else None
+    stamp_ns = datetime_ns(time) + (picoseconds or 0) // 100
+    return stamp_ns if 0 < stamp_ns < FARTHEST_NS else None  # without a time, servers send a date in 1601 or 9999
 
 
 def date_of(stamp_ns: int) -> datetime:
     """Return a stamp as a date, truncated to microseconds."""
-    return _EPOCH + stamp_ns // 1000 * _MICROSECOND
+    return EPOCH + timedelta(microseconds=stamp_ns // 1000)
