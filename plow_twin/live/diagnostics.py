@@ -440,32 +440,12 @@ class Health:
 
 #: Counters of the part `input` that cause a warning when they have grown since the last report.
 _TROUBLE: Final = (
-    "dropped_unstamped",
-    "dropped_non_finite",
-    "dropped_duplicate",
-    "dropped_out_of_order",
-    "dropped_late",
-    "dropped_implausible",
-    "dropped_unsteady",
-    "dropped_stray",
-    "rolled_back",
-    "dropped_malformed",
-    "dropped_not_selected",
-    "jumps_back",
-    "jumps_forward",
-    "out_of_plane",
-    "samples_missing",
-    "samples_lost",
-    "samples_not_followed",
-    "messages_lost",
-    "travel_dropped",
-    "travel_misplaced",
-    "head_pose_dropped",
-    "gaps_dropped",
-    "travel_not_followed",
-    "head_pose_not_followed",
-    "gaps_not_followed",
-)
+    "dropped_unstamped", "dropped_non_finite", "dropped_duplicate", "dropped_out_of_order", "dropped_late",
+    "dropped_implausible", "dropped_unsteady", "dropped_stray", "rolled_back", "dropped_malformed",
+    "dropped_not_selected", "jumps_back", "jumps_forward", "out_of_plane", "samples_missing", "samples_lost",
+    "samples_not_followed", "messages_lost", "travel_dropped", "travel_misplaced", "head_pose_dropped", "gaps_dropped",
+    "travel_not_followed", "head_pose_not_followed", "gaps_not_followed",
+)  # fmt: skip
 
 
 def _refused(intake: Intake) -> int:

@@ -17,19 +17,7 @@ from plow_twin.estimate.worker import Found, Worker
 from plow_twin.live.parameters import ESTIMATES, Settings
 from plow_twin.model.scene import Scene
 from plow_twin.record import messages as plain
-from plow_twin.stream.journal import (
-    Entry,
-    Estimated,
-    Gaps,
-    PartOfPose,
-    Pose,
-    Reset,
-    Sample,
-    SetModel,
-    SetWear,
-    Spread,
-    whole_pose,
-)
+from plow_twin.stream import journal
 from plow_twin.stream.session import Series, Session
 
 ESTIMATE, WINDOW_FORCES, FORECAST = ESTIMATES
@@ -65,7 +53,7 @@ class Estimation:
         self.forecast: dict[str, Any] | None = None
         self.forecast_error = "nothing has been estimated yet"
         #: journal entry of the last estimate, which is repeated at the start of a new part of the recording
-        self.entry: Estimated | None = None
+        self.entry: journal.Estimated | None = None
 
     @property
     def done(self) -> bool:
@@ -77,30 +65,30 @@ class Estimation:
         """Reason why no estimate was computed before the source ended. The text is empty if there is an estimate."""
         return "" if self.count else self.worker.ended or ""
 
-    def add(self, entry: Entry) -> None:
+    def add(self, entry: journal.Entry) -> None:
         """Pass a journal entry to the estimating process."""
         match entry:
-            case Sample(stamp_ns, wrench):
+            case journal.Sample(stamp_ns, wrench):
                 self.worker.add_load(stamp_ns, wrench)
-            case Pose(stamp_ns, pose, deviation):
+            case journal.Pose(stamp_ns, pose, deviation):
                 self.worker.add_pose(stamp_ns, pose, deviation)
-            case PartOfPose(stamp_ns) as part:
-                self.worker.add_pose(stamp_ns, whole_pose(part))
-            case Gaps(stamp_ns, pairs, gaps):
+            case journal.PartOfPose(stamp_ns) as part:
+                self.worker.add_pose(stamp_ns, journal.whole_pose(part))
+            case journal.Gaps(stamp_ns, pairs, gaps):
                 self.worker.add_gaps(stamp_ns, pairs, gaps)
-            case Spread(_, deviation):
+            case journal.Spread(_, deviation):
                 self.worker.set_load_deviation(deviation)
-            case SetWear(stamp_ns):
+            case journal.SetWear(stamp_ns):
                 self.worker.restart()
                 self._forget()
                 self._set_ns, self.end_ns = stamp_ns, None
                 self.trust, self.reasons = dict.fromkeys(self.trust, ""), ()
                 self.forecast, self.forecast_error = None, "nothing has been estimated since the pads were set"
-            case SetModel():
+            case journal.SetModel():
                 # the new clearances of the model replace the clearances of an older estimate
                 self.worker.restart()
                 self._forget()
-            case Reset():
+            case journal.Reset():
                 self.worker.restart()
                 if self._follows:
                     self._forget()
@@ -143,7 +131,7 @@ class Estimation:
         self.states = dict.fromkeys(self.states, State.PRIOR)
 
 
-def entry_of(found: Found, session: Session, before: Estimated | None) -> Estimated:
+def entry_of(found: Found, session: Session, before: journal.Estimated | None) -> journal.Estimated:
     """Return the journal entry of an estimate.
 
     If a clearance is not observable, its shift is that of the previous estimate `before`. If a clearance is withdrawn,
@@ -161,7 +149,7 @@ def entry_of(found: Found, session: Session, before: Estimated | None) -> Estima
         elif state is not State.NOT_OBSERVABLE:
             shift[own] = 0.0
     bounds = (found.start_ns, found.end_ns, found.samples, found.poses)
-    return Estimated(*bounds, found.guess, tuple(shift.tolist()), found.text)
+    return journal.Estimated(*bounds, found.guess, tuple(shift.tolist()), found.text)
 
 
 def message_of(found: Found, frame_id: str) -> plain.JointState:

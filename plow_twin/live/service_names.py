@@ -5,16 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 SERVICES: Final = (
-    "reset",
-    "switch_publisher",
-    "set_wear",
-    "acknowledge_alarms",
-    "snapshot",
-    "restore",
-    "mark",
-    "forecast",
-)
-
+    "reset", "switch_publisher", "set_wear", "acknowledge_alarms", "snapshot", "restore", "mark", "forecast",
+)  # fmt: skip
 #: Largest length of the text of a mark [characters].
 MOST_MARK: Final = 200
 

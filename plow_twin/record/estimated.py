@@ -10,18 +10,7 @@ from plow_twin.estimate.measurements import UNSTATED, Deviation
 from plow_twin.estimate.window import Window, Windows
 from plow_twin.model.scene import Scene
 from plow_twin.record.reader import RunReader
-from plow_twin.stream.journal import (
-    Estimated,
-    Gaps,
-    PartOfPose,
-    Pose,
-    Reset,
-    SetModel,
-    SetWear,
-    Snapshot,
-    Spread,
-    whole_pose,
-)
+from plow_twin.stream import journal
 from plow_twin.stream.model_changes import changed_scene, read_changes
 from plow_twin.stream.session import wear_in
 
@@ -33,7 +22,7 @@ class LiveEstimate:
     The window is computed from the entries of the journal, and is None if measurements are missing.
     """
 
-    entry: Estimated
+    entry: journal.Estimated
     window: Window | None
 
 
@@ -59,23 +48,23 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
                 note(windows.add_load(stamps[index], tuple(wrenches[index])))
                 continue
             match entries.others[index]:
-                case Pose(stamp_ns, pose, deviation):
+                case journal.Pose(stamp_ns, pose, deviation):
                     note(windows.add_pose(stamp_ns, pose, deviation))
-                case PartOfPose(stamp_ns) as part:
-                    note(windows.add_pose(stamp_ns, whole_pose(part)))
-                case Gaps(stamp_ns, pairs, gaps):
+                case journal.PartOfPose(stamp_ns) as part:
+                    note(windows.add_pose(stamp_ns, journal.whole_pose(part)))
+                case journal.Gaps(stamp_ns, pairs, gaps):
                     windows.add_gaps(stamp_ns, pairs, gaps)
-                case Spread(_, deviation):
+                case journal.Spread(_, deviation):
                     windows.set_load_deviation(deviation)
-                case Reset() | SetWear() | SetModel():
+                case journal.Reset() | journal.SetWear() | journal.SetModel():
                     windows.restart()
                     formed.clear()
-                case Estimated(end_ns=end_ns) as entry:
+                case journal.Estimated(end_ns=end_ns) as entry:
                     yield LiveEstimate(entry, _whole(formed.get(end_ns) or windows.last(), entry))
                     formed = {end: window for end, window in formed.items() if end > end_ns}
 
 
-def left_by(reader: RunReader) -> tuple[Scene, Estimated | None]:
+def left_by(reader: RunReader) -> tuple[Scene, journal.Estimated | None]:
     """Return the scene at the end of a run, including wear and changes of the model, and the last estimate.
 
     An estimate before the last setting of the wear is not returned.
@@ -85,13 +74,13 @@ def left_by(reader: RunReader) -> tuple[Scene, Estimated | None]:
     for batch in reader.batches(outputs=False):
         for _, entry in sorted(batch.entries.others.items()):
             match entry:
-                case Estimated():
+                case journal.Estimated():
                     newest = entry
-                case SetWear(_, set_depth):
+                case journal.SetWear(_, set_depth):
                     newest, depth = None, set_depth
-                case SetModel(_, text):
+                case journal.SetModel(_, text):
                     changes = read_changes(text)
-                case Snapshot(_, data):
+                case journal.Snapshot(_, data):
                     depth = wear_in(data)
     scene = changed_scene(scene, changes)
     if depth is not None and scene.wear is not None:
@@ -105,7 +94,7 @@ def stated(parameters: Mapping[str, Any]) -> tuple[Deviation, Deviation]:
     return tuple(map(float, poses)), tuple(map(float, load))
 
 
-def _whole(window: Window | str, entry: Estimated) -> Window | None:
+def _whole(window: Window | str, entry: journal.Estimated) -> Window | None:
     """Return the window if its bounds and numbers of measurements agree with the entry, otherwise None."""
     if isinstance(window, str):
         return None

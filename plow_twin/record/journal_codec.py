@@ -21,29 +21,7 @@ from numpy.typing import NDArray
 from plow_twin.errors import RecordingError
 from plow_twin.record.messages import Integers, Message, Text, WrenchStamped
 from plow_twin.record.template import Bytes, Indexes
-from plow_twin.stream.journal import (
-    Digest,
-    Entry,
-    Estimated,
-    Failed,
-    Gaps,
-    Hold,
-    Loss,
-    Mark,
-    Parameter,
-    PartOfPose,
-    Pose,
-    Reset,
-    Restore,
-    Sample,
-    SetModel,
-    SetWear,
-    Snapshot,
-    Spread,
-    Travel,
-    Unload,
-    Unused,
-)
+from plow_twin.stream import journal
 
 
 @dataclass(frozen=True)
@@ -55,24 +33,24 @@ class Dropped:
 
 
 _KINDS: Final[dict[str, type[Any]]] = {
-    "hold": Hold,
-    "unload": Unload,
-    "travel": Travel,
-    "reset": Reset,
-    "wear": SetWear,
-    "model": SetModel,
-    "restore": Restore,
-    "mark": Mark,
-    "failed": Failed,
-    "spread": Spread,
-    "parameter": Parameter,
-    "pose": Pose,
-    "part_of_pose": PartOfPose,
-    "gaps": Gaps,
-    "unused": Unused,
-    "estimated": Estimated,
-    "snapshot": Snapshot,
-    "loss": Loss,
+    "hold": journal.Hold,
+    "unload": journal.Unload,
+    "travel": journal.Travel,
+    "reset": journal.Reset,
+    "wear": journal.SetWear,
+    "model": journal.SetModel,
+    "restore": journal.Restore,
+    "mark": journal.Mark,
+    "failed": journal.Failed,
+    "spread": journal.Spread,
+    "parameter": journal.Parameter,
+    "pose": journal.Pose,
+    "part_of_pose": journal.PartOfPose,
+    "gaps": journal.Gaps,
+    "unused": journal.Unused,
+    "estimated": journal.Estimated,
+    "snapshot": journal.Snapshot,
+    "loss": journal.Loss,
     "dropped": Dropped,
 }
 #: First bytes of a message with a digest. They are the encoding, the number of dimensions (0), the offset (0), the
@@ -85,19 +63,19 @@ _OPTIONAL: Final = frozenset({"deviation"})
 _NAMES: Final = {kind: name for name, kind in _KINDS.items()}
 
 
-def to_message(entry: Entry | Dropped, frame_id: str) -> Message:
+def to_message(entry: journal.Entry | Dropped, frame_id: str) -> Message:
     """Return the message that represents a journal entry."""
-    if isinstance(entry, Sample):
+    if isinstance(entry, journal.Sample):
         fx, fy, m = entry.wrench
         return WrenchStamped(entry.stamp_ns, frame_id, (fx, fy, 0.0), (0.0, 0.0, m))
-    if isinstance(entry, Digest):
+    if isinstance(entry, journal.Digest):
         return Integers((entry.stamp_ns & _MASK, int(entry.digest, 16)))
     values = {spec.name: getattr(entry, spec.name) for spec in fields(entry)}
-    if isinstance(entry, Pose) and not entry.deviation:
+    if isinstance(entry, journal.Pose) and not entry.deviation:
         del values["deviation"]
-    if isinstance(entry, Snapshot | Restore):
+    if isinstance(entry, journal.Snapshot | journal.Restore):
         values["data"] = base64.b64encode(entry.data).decode()
-    elif isinstance(entry, Unused):
+    elif isinstance(entry, journal.Unused):
         # infinity and NaN are written as strings, because JSON cannot represent them as numbers
         values["values"] = [
             [number if math.isfinite(number) else repr(number) for number in row] for row in entry.values
@@ -105,7 +83,7 @@ def to_message(entry: Entry | Dropped, frame_id: str) -> Message:
     return Text(json.dumps({"kind": _NAMES[type(entry)], **values}, allow_nan=False))
 
 
-def from_message(message: Message, source: str = "journal") -> Entry | Dropped:
+def from_message(message: Message, source: str = "journal") -> journal.Entry | Dropped:
     """Return the journal entry that a message represents.
 
     Raises
@@ -117,12 +95,12 @@ def from_message(message: Message, source: str = "journal") -> Entry | Dropped:
         wrench = (message.force[0], message.force[1], message.torque[2])
         if not all(map(math.isfinite, wrench)):
             raise RecordingError(f"{source}: sample at {message.stamp_ns}: got {wrench}, expected finite numbers")
-        return Sample(message.stamp_ns, wrench)
+        return journal.Sample(message.stamp_ns, wrench)
     if isinstance(message, Integers):
         if len(message.data) != 2:
             raise RecordingError(f"{source}: got {len(message.data)} integers, expected the two of a digest")
         stamp_ns, digest = message.data
-        return Digest((stamp_ns ^ _SIGN) - _SIGN, f"{digest:016x}")
+        return journal.Digest((stamp_ns ^ _SIGN) - _SIGN, f"{digest:016x}")
     if not isinstance(message, Text):
         raise RecordingError(f"{source}: got a {message.TYPE}, expected a sample, a digest or a line of JSON")
     return _from_json(message.data, source)
@@ -159,12 +137,12 @@ def read_digests(
     return found, numbers[:, 0].astype(np.int64), numbers[:, 1]
 
 
-def _from_json(text: str, source: str) -> Entry | Dropped:
+def _from_json(text: str, source: str) -> journal.Entry | Dropped:
     try:
         values = json.loads(text, parse_constant=_no_number)
         kind = values["kind"]
         given = [read(values[name]) for name, read in _FIELDS[kind] if name in values or name not in _OPTIONAL]
-        entry: Entry | Dropped = _KINDS[kind](*given)
+        entry: journal.Entry | Dropped = _KINDS[kind](*given)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise RecordingError(f"{source}: got {text[:120]!r}, expected an entry of the journal ({error!r})") from error
     return entry

@@ -52,20 +52,8 @@ from plow_twin.record.template import Indexes, Templates, read_numbers
 from plow_twin.record.unused import InputCounts
 from plow_twin.run.twin import Twin
 from plow_twin.solve.state import ROW
+from plow_twin.stream import journal
 from plow_twin.stream.driven import Driven
-from plow_twin.stream.journal import (
-    Digest,
-    Gaps,
-    Hold,
-    Loss,
-    Parameter,
-    PartOfPose,
-    Pose,
-    Sample,
-    Snapshot,
-    Unload,
-    Unused,
-)
 from plow_twin.stream.outputs import NONE, NOTHING, Published
 from plow_twin.stream.session import Applied, Session
 from plow_twin.stream.topics import TOPICS
@@ -78,11 +66,13 @@ _CUMULATIVE: Final = frozenset(topic.name for topic in TOPICS if topic.cumulativ
 _IS_CUMULATIVE: Final = np.array([name in _CUMULATIVE for name in PUBLICATION_TOPICS])
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
 
-ProgressCallback = Callable[[float], object]
-
 
 def replay(
-    path: Path, on_progress: ProgressCallback | None = None, *, digests_only: bool = False, write: Path | None = None
+    path: Path,
+    on_progress: Callable[[float], object] = lambda share: None,
+    *,
+    digests_only: bool = False,
+    write: Path | None = None,
 ) -> ReplayReport:
     """Replay a recording, and compare each digest and each message that can be computed from the journal.
 
@@ -112,10 +102,8 @@ def replay(
     begin = time.perf_counter()
     for batch in reader.batches(outputs=not digests_only):
         run.batch(batch)
-        if on_progress is not None:
-            on_progress(reader.position)
-    if on_progress is not None:
-        on_progress(1.0)
+        on_progress(reader.position)
+    on_progress(1.0)
     if run.sink is not None:
         run.sink.close(reader.lost, reader.stop_reason)
     return run.finish(reader, time.perf_counter() - begin)
@@ -224,7 +212,11 @@ class _Replay:
         digests = entries.digest_at
         behind = digests > 0
         behind[behind] = ~entries.sample[digests[behind] - 1]
-        kinds = Gaps | Unused if self.follows else Pose | PartOfPose | Gaps | Unused
+        kinds = (
+            journal.Gaps | journal.Unused
+            if self.follows
+            else journal.Pose | journal.PartOfPose | journal.Gaps | journal.Unused
+        )
         for index in sorted({*entries.rest, *digests[behind | breaks[digests]].tolist()}):
             goes_on = not breaks[index] and (index == 0 or entries.sample[index - 1] or not breaks[index - 1])
             still = index not in entries.rest or isinstance(entries.rest[index], kinds)
@@ -336,11 +328,15 @@ class _Replay:
         """Write an entry that has been applied, and the publication that follows it, to the sink."""
         assert self.sink is not None
         entry = record.entry
-        if isinstance(entry, Snapshot) and self.synced:
+        if isinstance(entry, journal.Snapshot) and self.synced:
             # the recorded snapshot does not fit the publications in the sink, which are more than the recorded ones
             entry = self.session.snapshot()
         self.sink.write_entry(record.sequence, record.log_time_ns, entry)
-        published = self.session.outputs.pop() if self.synced and isinstance(entry, Sample | Hold | Unload) else NOTHING
+        published = (
+            self.session.outputs.pop()
+            if self.synced and isinstance(entry, journal.Sample | journal.Hold | journal.Unload)
+            else NOTHING
+        )
         if len(published.rows) and published.finite:
             self.sink.write_publications(np.array([record.sequence]), np.array([record.log_time_ns]), published)
 
@@ -357,7 +353,7 @@ class _Replay:
         poses = [
             (int(entries.sequence[index]) & _SEQUENCE_MASK, first_step + int(done[index]) - 1, entry)
             for index, entry in sorted(entries.rest.items())
-            if isinstance(entry, Pose)
+            if isinstance(entry, journal.Pose)
         ]
         self.alarms.published(found.first_sequence & _SEQUENCE_MASK, first_step + found.taken, published, poses)
         compared = self.outputs_synced | ~_IS_CUMULATIVE
@@ -397,7 +393,7 @@ class _Replay:
             self.gaps += missing
             self.alarms.give_up()
             self.synced = self.outputs_synced = False
-        elif record.sequence == 0 and not isinstance(record.entry, Snapshot):
+        elif record.sequence == 0 and not isinstance(record.entry, journal.Snapshot):
             # the recording is complete from its first entry, so the state is the initial state of the scene
             self.synced, self.outputs_synced = True, self.all_outputs and self.outputs_whole
         self.next_sequence = (record.sequence + 1) & _SEQUENCE_MASK
@@ -406,16 +402,16 @@ class _Replay:
             self.messages = self.published = None
         self.report.entries += 1
         match record.entry:
-            case Loss(count):
+            case journal.Loss(count):
                 self.lost_entries += count
                 self.alarms.give_up()
                 self.synced = self.outputs_synced = False
             case Dropped():
                 self.alarms.give_up()
                 self.outputs_synced = False
-            case Snapshot() as snapshot:
+            case journal.Snapshot() as snapshot:
                 self._snapshot(snapshot)
-            case Digest(stamp_ns, digest):
+            case journal.Digest(stamp_ns, digest):
                 if self.synced:
                     self.report.digests_compared += 1
                     self._compare("digest", stamp_ns, "digest", digest, self.session.twin.digest())
@@ -426,12 +422,12 @@ class _Replay:
             self._write_entry(record)
 
     def _apply(self, entry: Any, sequence: int) -> None:
-        if isinstance(entry, Pose):
+        if isinstance(entry, journal.Pose):
             self.alarms.pose(sequence, self.report.steps - 1, entry)
-        elif isinstance(entry, Parameter):
+        elif isinstance(entry, journal.Parameter):
             self.alarms.parameter(sequence, self.report.steps - 1, entry)
-        self.report.samples += isinstance(entry, Sample)
-        if isinstance(entry, Sample | Hold | Unload):
+        self.report.samples += isinstance(entry, journal.Sample)
+        if isinstance(entry, journal.Sample | journal.Hold | journal.Unload):
             self.report.steps += 1
             self.resumed = False
             self.first_ns = entry.stamp_ns if self.first_ns is None else self.first_ns
@@ -441,7 +437,7 @@ class _Replay:
             # if the live session accepted this entry, the next comparison shows a difference
             self.report.refused += 1
 
-    def _snapshot(self, snapshot: Snapshot) -> None:
+    def _snapshot(self, snapshot: journal.Snapshot) -> None:
         if self.synced and self.outputs_synced:
             self.report.snapshots_compared += 1
             # `renew` discards the earlier states, as the live session did, so that late samples have the same effect

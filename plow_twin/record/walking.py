@@ -18,21 +18,7 @@ from plow_twin.record.entries import Entries, Holes
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.solve.state import ROW
-from plow_twin.stream.journal import (
-    Digest,
-    Entry,
-    Estimated,
-    Loss,
-    Parameter,
-    PartOfPose,
-    Pose,
-    Reset,
-    Restore,
-    SetModel,
-    SetWear,
-    Snapshot,
-    Travel,
-)
+from plow_twin.stream import journal
 from plow_twin.stream.outputs import Published
 from plow_twin.stream.session import DIGEST_INTERVAL, Applied, Session
 
@@ -42,9 +28,17 @@ if TYPE_CHECKING:
 #: Largest number of samples by which a session advances in one call.
 BATCH: Final = 4096
 #: Types of entries that change the session. Samples between two entries of these types are sorted by their stamps.
-_ACTING: Final = (Travel, Reset, Loss, Restore, Snapshot, SetModel, SetWear)
+_ACTING: Final = (
+    journal.Travel,
+    journal.Reset,
+    journal.Loss,
+    journal.Restore,
+    journal.Snapshot,
+    journal.SetModel,
+    journal.SetWear,
+)
 #: Types of entries that change the session only if the motion of the session follows measurements.
-_FOLLOWED: Final = (Pose, PartOfPose, Estimated, Parameter)
+_FOLLOWED: Final = (journal.Pose, journal.PartOfPose, journal.Estimated, journal.Parameter)
 #: Number of consecutive failed advances after which the model is reset.
 _FAILURE_LIMIT: Final = 10
 
@@ -88,7 +82,7 @@ class Walker:
         self.failures = 0
         self.on_reset: Callable[[], object] = lambda: None
         self.speed_m_s = 0.0
-        self._opening: Snapshot | None = session.snapshot()
+        self._opening: journal.Snapshot | None = session.snapshot()
 
     def _open(self, log_time_ns: int) -> None:
         opening, self._opening = self._opening, None
@@ -97,18 +91,18 @@ class Walker:
             if self._writer is not None:
                 self._writer.write_entry(self._sequence, log_time_ns, opening)
 
-    def _entry(self, entry: Entry) -> None:
+    def _entry(self, entry: journal.Entry) -> None:
         self._open(self._log_time_ns)
         self._sequence += 1
         if self._writer is not None:
             self._writer.write_entry(self._sequence, self._log_time_ns, entry)
 
-    def apply(self, entry: Entry, log_time_ns: int = 0) -> None:
+    def apply(self, entry: journal.Entry, log_time_ns: int = 0) -> None:
         """Apply a journal entry that is not a sample."""
         self._log_time_ns = log_time_ns or self._log_time_ns
         self._entry(entry)
         self.session.apply(entry)
-        if isinstance(entry, Reset | SetWear | Restore):
+        if isinstance(entry, journal.Reset | journal.SetWear | journal.Restore):
             self.on_reset()
 
     def samples(self, stamp_ns: NDArray[np.int64], wrench: NDArray[np.float64], log_time_ns: NDArray[np.int64]) -> None:
@@ -132,7 +126,7 @@ class Walker:
         scene = self.session.twin.scene
         self._on_walked(Walked(stamp_ns, wrench, rows, done.published, makes, self.speed_m_s, scene))
         if count >= _FAILURE_LIMIT and rows.status[-_FAILURE_LIMIT:].all():
-            self.apply(Reset(int(stamp_ns[-1]), f"{_FAILURE_LIMIT} failed advances"), int(log_ns[-1]))
+            self.apply(journal.Reset(int(stamp_ns[-1]), f"{_FAILURE_LIMIT} failed advances"), int(log_ns[-1]))
 
     def _write(
         self,
@@ -154,7 +148,7 @@ class Walker:
     def close(self) -> None:
         """Write a digest of the final state to the journal."""
         if self.session.stamp_ns is not None:
-            self._entry(Digest(self.session.stamp_ns, self.session.twin.digest()))
+            self._entry(journal.Digest(self.session.stamp_ns, self.session.twin.digest()))
 
 
 class JournalWalk:
@@ -179,7 +173,7 @@ class JournalWalk:
         self._following = [walker for walker in self._same if walker.session.following is not None]
         self._acting = (*_ACTING, *_FOLLOWED) if self._following else _ACTING
         #: changes of the travel speed whose stamps have not been reached, in the order of the stamps
-        self._travels: list[Travel] = []
+        self._travels: list[journal.Travel] = []
         self._lost = not whole
         self._reached_ns = -1
         self.used = self.late = self.missing = 0
@@ -191,7 +185,7 @@ class JournalWalk:
         for place, count in self._holes.find(entries).items():
             self._whole(entries[begin:place])
             self.missing += count
-            self._entry(Loss(count))
+            self._entry(journal.Loss(count))
             begin = place
         self._whole(entries[begin:])
 
@@ -227,38 +221,38 @@ class JournalWalk:
         for walker in self._all:
             walker.speed_m_s = speed_m_s
             # if the stamp of the speed has already been reached, the speed takes effect immediately
-            walker.apply(Travel(max(0, self._reached_ns), speed_m_s))
+            walker.apply(journal.Travel(max(0, self._reached_ns), speed_m_s))
 
     def _begin_anew(self) -> None:
         for travel in self._travels:
             self._speed(travel.speed_m_s)
         self._travels, self._reached_ns = [], -1
 
-    def _entry(self, entry: Entry | Dropped) -> None:
+    def _entry(self, entry: journal.Entry | Dropped) -> None:
         match entry:
-            case Travel(stamp_ns, speed) if 0 <= self._reached_ns < stamp_ns:
+            case journal.Travel(stamp_ns, speed) if 0 <= self._reached_ns < stamp_ns:
                 insort(self._travels, entry, key=lambda travel: travel.stamp_ns)
-            case Travel(_, speed):
+            case journal.Travel(_, speed):
                 self._speed(speed)
-            case Reset() | Loss():
+            case journal.Reset() | journal.Loss():
                 self._begin_anew()
                 for walker in self._all:
-                    walker.apply(Reset(0, "loss") if isinstance(entry, Loss) else entry)
-            case Restore():
+                    walker.apply(journal.Reset(0, "loss") if isinstance(entry, journal.Loss) else entry)
+            case journal.Restore():
                 self._begin_anew()
                 for walker in self._all:
-                    walker.apply(entry if walker in self._same else Reset(0, "restore"))
-            case SetModel():
+                    walker.apply(entry if walker in self._same else journal.Reset(0, "restore"))
+            case journal.SetModel():
                 for walker in self._same:
                     walker.apply(entry)
-            case Pose() | PartOfPose() | Estimated() | Parameter():
+            case journal.Pose() | journal.PartOfPose() | journal.Estimated() | journal.Parameter():
                 for walker in self._following:
                     walker.apply(entry)
-            case Snapshot() if self._lost:
+            case journal.Snapshot() if self._lost:
                 for walker in self._own:
                     walker.apply(entry)
                     self._reached_ns = walker.session.stamp_ns or -1
-            case SetWear():
+            case journal.SetWear():
                 for walker in self._all:
                     walker.apply(entry) if walker in self._own else walker.on_reset()
-        self._lost = isinstance(entry, Loss) or (self._lost and not isinstance(entry, Snapshot))
+        self._lost = isinstance(entry, journal.Loss) or (self._lost and not isinstance(entry, journal.Snapshot))

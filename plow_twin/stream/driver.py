@@ -19,24 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.stream import journal
 from plow_twin.stream.failures import Failures
 from plow_twin.stream.health import RealTimeFactor
 from plow_twin.stream.intake import NS_PER_S, Intake, Verdict
-from plow_twin.stream.journal import (
-    Hold,
-    Mark,
-    Parameter,
-    ParameterValue,
-    Reset,
-    Restore,
-    Sample,
-    SetModel,
-    SetWear,
-    Snapshot,
-    Spread,
-    Travel,
-    Unload,
-)
 from plow_twin.stream.outputs import NOTHING, Published, Rows
 from plow_twin.stream.session import Series, Session
 from plow_twin.stream.silences import Silences
@@ -145,13 +131,13 @@ class Driver:
         publications in order. If the stamp of a sample jumps, the sample waits until the next sample arrives or a
         silence begins.
         """
-        run: list[Sample] = []
+        run: list[journal.Sample] = []
         for stamp_ns, wrench in arrived:
             if self.every_sample and not run and self._may_go_on(stamp_ns, wrench):  # fast path for most samples
                 self.intake.accept(stamp_ns, wrench)
                 self.newest_ns, self._received_ns, self._zeroed = stamp_ns, now_ns, False
                 self.silences.add_one(stamp_ns)
-                published = self._apply([Sample(stamp_ns, wrench)], now_ns)
+                published = self._apply([journal.Sample(stamp_ns, wrench)], now_ns)
                 if len(published.rows):
                     yield published
                 continue
@@ -169,7 +155,7 @@ class Driver:
         Plausible samples are applied together and yielded as a `Series`. The caller must journal and publish the series
         before it requests the next item. A sample that needs more checks is processed as in `samples`.
         """
-        run: list[Sample] = []
+        run: list[journal.Sample] = []
         goes_on = self.intake.go_on(stamps, wrench)
         ends = np.append(np.flatnonzero(~goes_on) + 1, len(stamps))
         place = 0
@@ -206,7 +192,7 @@ class Driver:
         return not (reached_ns is None or self._steps.waits) and self.intake.goes_on(stamp_ns, wrench, reached_ns)
 
     def _use_samples(
-        self, run: list[Sample], stamp_ns: int, wrench: tuple[float, float, float], now_ns: int
+        self, run: list[journal.Sample], stamp_ns: int, wrench: tuple[float, float, float], now_ns: int
     ) -> Iterator[Published]:
         """Judge a sample and append it to `run`, whose samples are applied together.
 
@@ -231,7 +217,7 @@ class Driver:
             self.newest_ns = stamp_ns
         self.silences.add_one(stamp_ns)
         self._received_ns, self._zeroed = now_ns, False
-        insort(run, Sample(stamp_ns, wrench), key=lambda sample: sample.stamp_ns)
+        insort(run, journal.Sample(stamp_ns, wrench), key=lambda sample: sample.stamp_ns)
 
     def due(self) -> Published:
         """Return the publication of all advances since the last publication."""
@@ -246,7 +232,7 @@ class Driver:
         timeout_ns = round(self.policy.excitation_timeout_s * NS_PER_S)
         jumped = self._steps.unopposed(now_ns, timeout_ns)
         if jumped is not None:
-            run: list[Sample] = []
+            run: list[journal.Sample] = []
             return Published.joined([*self._use_samples(run, *jumped[:2], now_ns), *self._use(run, now_ns)])
         silent_ns = now_ns - self._received_ns - timeout_ns
         if silent_ns <= 0:
@@ -261,8 +247,8 @@ class Driver:
         self.holds += 1
         if self.policy.hold == "zero" and not self._zeroed:
             self._zeroed = True
-            return self._advance(Unload(stamp_ns), now_ns, StreamState.STALE)
-        return self._advance(Hold(stamp_ns), now_ns, StreamState.STALE)
+            return self._advance(journal.Unload(stamp_ns), now_ns, StreamState.STALE)
+        return self._advance(journal.Hold(stamp_ns), now_ns, StreamState.STALE)
 
     def quiet_ns(self, now_ns: int) -> int:
         """Return a time [ns] during which a call of `silence` would have no effect."""
@@ -294,7 +280,7 @@ class Driver:
             self.clock.restart()
             self.clock.judge(stamp_ns, ())
             self._restart_model(stamp_ns, f"clock {verdict.value}", now_ns)
-        return self._advance(Hold(stamp_ns), now_ns, StreamState.RUNNING)
+        return self._advance(journal.Hold(stamp_ns), now_ns, StreamState.RUNNING)
 
     def travel(self, stamp_ns: int, speed_m_s: float) -> None:
         """Apply a travel speed along the face [m/s] from its stamp on; the sign gives the direction.
@@ -309,32 +295,32 @@ class Driver:
                 self.travel_misplaced += 1
             if ahead:
                 stamp_ns = reached_ns
-        self.session.apply(Travel(stamp_ns, speed_m_s))
+        self.session.apply(journal.Travel(stamp_ns, speed_m_s))
 
-    def parameter(self, name: str, value: ParameterValue) -> None:
+    def parameter(self, name: str, value: journal.ParameterValue) -> None:
         """Journal a changed parameter."""
-        self.session.apply(Parameter(name, value))
+        self.session.apply(journal.Parameter(name, value))
 
     def spread(self, stamp_ns: int, deviation: Sequence[float]) -> None:
         """Journal the standard deviations of the load (Fx, Fy [N], M [N m]) that apply from a stamp on."""
-        self.session.apply(Spread(stamp_ns, tuple(deviation)))
+        self.session.apply(journal.Spread(stamp_ns, tuple(deviation)))
 
     def mark(self, stamp_ns: int, text: str) -> None:
         """Journal a mark, which is a remark of the operator at a time."""
-        self.session.apply(Mark(stamp_ns, text))
+        self.session.apply(journal.Mark(stamp_ns, text))
 
-    def snapshot(self) -> Snapshot:
+    def snapshot(self) -> journal.Snapshot:
         """Journal and return the exact state; samples older than this state can no longer be inserted."""
         snapshot = self.session.renew()
         self.session.emit(snapshot)
         return snapshot
 
-    def restore(self, stamp_ns: int, snapshot: Snapshot) -> None:
+    def restore(self, stamp_ns: int, snapshot: journal.Snapshot) -> None:
         """Return to the motion of a snapshot. The stamp of the next sample corresponds to the model time of the
         snapshot.
         """
         self.failed.end()
-        self.session.apply(Restore(stamp_ns, snapshot.data))
+        self.session.apply(journal.Restore(stamp_ns, snapshot.data))
         self._begin_again()
         self.intake.restart()
         self.clock.restart()
@@ -350,7 +336,7 @@ class Driver:
         """
         self.session.check_model(changes)
         if dict(changes) != self.session.changes:
-            self.session.apply(SetModel(stamp_ns, json.dumps(dict(changes))))
+            self.session.apply(journal.SetModel(stamp_ns, json.dumps(dict(changes))))
 
     def set_wear(self, stamp_ns: int, depth_m: Sequence[float], reason: str) -> None:
         """Set the wear depth of each pad [m], for example after a measurement or after pads were replaced; the motion
@@ -365,7 +351,7 @@ class Driver:
         if len(depth) != PAIR_COUNT or not all(0.0 <= value < math.inf for value in depth):
             raise ValueError(f"wear depth: got {list(depth_m)!r}, expected {PAIR_COUNT} finite depths >= 0 in m")
         self.failed.end()
-        self.session.apply(SetWear(stamp_ns, depth, reason))
+        self.session.apply(journal.SetWear(stamp_ns, depth, reason))
         self._begin_again()
         self.intake.restart()
         self.clock.restart()
@@ -397,7 +383,7 @@ class Driver:
         self.failed.end()
         self.session.close()
 
-    def _is_late(self, sample: Sample) -> bool:
+    def _is_late(self, sample: journal.Sample) -> bool:
         reached_ns = self.session.stamp_ns
         return reached_ns is not None and sample.stamp_ns <= reached_ns
 
@@ -422,7 +408,7 @@ class Driver:
         if now_ns is not None:
             self._resets_ns.append(now_ns)
         self.failed.end()
-        self.session.apply(Reset(stamp_ns, reason))
+        self.session.apply(journal.Reset(stamp_ns, reason))
         self.resets += 1
         self._begin_again()
 
@@ -431,7 +417,7 @@ class Driver:
         self.silences.restart()
         self.state = StreamState.WAITING
 
-    def _use(self, run: list[Sample], now_ns: int) -> Iterator[Published]:
+    def _use(self, run: list[journal.Sample], now_ns: int) -> Iterator[Published]:
         samples = run.copy()
         run.clear()
         for part in self.session.parts(samples, each=self.every_sample):
@@ -442,7 +428,7 @@ class Driver:
             # after a reset, a silence is measured from the stamp that the model has reached
             self.newest_ns = self.session.stamp_ns
 
-    def _apply(self, samples: Sequence[Sample], now_ns: int) -> Published:
+    def _apply(self, samples: Sequence[journal.Sample], now_ns: int) -> Published:
         applied = self.session.apply_samples(samples, each=self.every_sample)
         self.rolled_back += applied.late
         self._advanced(now_ns)
@@ -453,7 +439,7 @@ class Driver:
             self.state = StreamState.RUNNING
         return applied.published
 
-    def _advance(self, entry: Hold | Unload, now_ns: int, state: StreamState) -> Published:
+    def _advance(self, entry: journal.Hold | journal.Unload, now_ns: int, state: StreamState) -> Published:
         rows = self.session.apply(entry)
         assert rows is not None, "a hold or an unload makes an advance"
         self._advanced(now_ns)

@@ -219,15 +219,7 @@ class Intake:
         self._newest_ns, self._newest_values = stamp_ns, values
 
     def refuse(self, verdict: Verdict, stamp_ns: int = 0, values: Sequence[float] = ()) -> None:
-        """Count a sample that is dropped without a call of `judge`.
-
-        Raises
-        ------
-        ValueError
-            If the verdict is not a reason to drop a sample.
-        """
-        if verdict.used:
-            raise ValueError(f"verdict: got {verdict.value}, expected a reason to drop")
+        """Count a sample that is dropped without a call of `judge`."""
         self.counts[verdict] += 1
         self._on_unused(verdict, stamp_ns, values)
 

@@ -230,27 +230,9 @@ class Loss:
 
 
 Entry = (
-    Sample
-    | Hold
-    | Unload
-    | Travel
-    | Reset
-    | SetWear
-    | SetModel
-    | Restore
-    | Mark
-    | Failed
-    | Spread
-    | Parameter
-    | Pose
-    | PartOfPose
-    | Gaps
-    | Unused
-    | Estimated
-    | Snapshot
-    | Digest
-    | Loss
-)
+    Sample | Hold | Unload | Travel | Reset | SetWear | SetModel | Restore | Mark | Failed | Spread | Parameter | Pose
+    | PartOfPose | Gaps | Unused | Estimated | Snapshot | Digest | Loss
+)  # fmt: skip
 
 
 def pose_entry(stamp_ns: int, pose: tuple[float, ...], deviation: tuple[float, ...] = ()) -> Pose | PartOfPose:

@@ -37,6 +37,8 @@ _ON_SIDES: Final = np.array(
     [np.flatnonzero(side) for side in (NORMAL_X < 0.0, NORMAL_X > 0.0, NORMAL_Y > 0.0, NORMAL_Y < 0.0)]
 )
 _STATE_SIZE: Final = 4 * PAIR_COUNT
+#: Length of the result of `Outputs.state` [B].
+STATE_BYTES: Final = 8 * (_STATE_SIZE + 1)
 #: Record of a slow part. `clearance` is in the order of `CLEARANCE_NAMES` [m]; `wear_rate` is the growth of each wear
 #: depth [m/s].
 SLOW: Final = np.dtype(
@@ -170,7 +172,9 @@ class Outputs:
     """Combine advances into publications without losing a peak, an impulse or a touch."""
 
     def __init__(self, scene: Scene) -> None:
-        self._scene, self._publish = scene, _publish()
+        #: scene of all later publications
+        self.scene = scene
+        self._publish = _publish()
         #: the window; it includes the newest advance if `_waits` is 1
         self._window = np.zeros(1, ROW)
         self._waits = 0
@@ -194,10 +198,6 @@ class Outputs:
         values = np.zeros(len(CLEARANCE_NAMES))
         values[_KNOWN] = shift
         self._shift = values if values.any() else None
-
-    def set_scene(self, scene: Scene) -> None:
-        """Use a scene with changed numbers for all later publications."""
-        self._scene = scene
 
     def clear_shift(self) -> None:
         """Publish the clearances of the model without a shift."""
@@ -330,8 +330,8 @@ class Outputs:
         return slow
 
     def _clearance(self, wear_depth: Array) -> Array:
-        best, points = clearances(self._scene, wear_depth), prior_points(self._scene, wear_depth)
-        low, high = (best if depth is wear_depth else clearances(self._scene, depth) for depth in points)
+        best, points = clearances(self.scene, wear_depth), prior_points(self.scene, wear_depth)
+        low, high = (best if depth is wear_depth else clearances(self.scene, depth) for depth in points)
         count = len(_CLEARANCES)
         found = np.empty((*wear_depth.shape[:-1], 3 * count))
         found[..., :count], found[..., count::2], found[..., count + 1 :: 2] = best, low, high
@@ -341,8 +341,8 @@ class Outputs:
 
     def modelled(self, wear_depth: Array) -> Array:
         """Return the clearances of the model without a shift, shape (6,) [m], in the order of `set_shift`."""
-        middle = clearances(self._scene, wear_depth)
-        low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
+        middle = clearances(self.scene, wear_depth)
+        low, high = (clearances(self.scene, points) for points in prior_points(self.scene, wear_depth))
         return np.stack((middle, low, high), axis=1)[:2].ravel()
 
     def state(self) -> bytes:
@@ -363,11 +363,6 @@ class Outputs:
         self._slow_wear_depth = parts[3].copy()
         slow_ns = int(np.frombuffer(data, np.int64, 1, offset=8 * _STATE_SIZE)[0])
         self._slow_ns = None if slow_ns < 0 else slow_ns
-
-    @staticmethod
-    def state_size() -> int:
-        """Return the length in bytes of the result of `state`."""
-        return 8 * (_STATE_SIZE + 1)
 
 
 def warm_up() -> None:

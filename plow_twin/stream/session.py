@@ -17,7 +17,6 @@ import struct
 from bisect import insort
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -26,29 +25,11 @@ from numpy.typing import NDArray
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import check_travel_speed
 from plow_twin.solve.samples import model_times
+from plow_twin.stream import journal
 from plow_twin.stream.driven import MOST_MEASURED, Driven, Following
 from plow_twin.stream.history import History
-from plow_twin.stream.journal import (
-    Digest,
-    Entry,
-    Estimated,
-    Hold,
-    Loss,
-    Parameter,
-    PartOfPose,
-    Pose,
-    Reset,
-    Restore,
-    Sample,
-    SetModel,
-    SetWear,
-    Snapshot,
-    Travel,
-    Unload,
-    whole_pose,
-)
 from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
-from plow_twin.stream.outputs import NONE, NOTHING, THE_ONE, Outputs, Published, Rows, Stock
+from plow_twin.stream.outputs import NONE, NOTHING, STATE_BYTES, THE_ONE, Outputs, Published, Rows, Stock
 
 #: Number of advances from one digest to the next.
 DIGEST_INTERVAL: Final = 100
@@ -82,7 +63,7 @@ class _Measured(NamedTuple):
     reached_ns: int
     known: float
     stamp_ns: int
-    entry: Pose | PartOfPose | Estimated
+    entry: journal.Pose | journal.PartOfPose | journal.Estimated
 
 
 class Applied(NamedTuple):
@@ -140,14 +121,11 @@ class _UndoneError(Exception):
 class Session:
     """One run of a twin. The inputs of the twin are entries of a journal.
 
-    The same entries in the same order give bit-identical motion, publications and digests.
-
     Model time is the stamp minus the origin, which is the first stamp by default. A `Reset` restores the initial motion
     but not the wear, which only `SetWear` changes. While the load is held or removed, the true load is unknown, so the
     pads do not wear. If the scene itself defines the loads, a `Hold` only advances the time.
 
-    To insert a late sample, the session goes back to the newest snapshot before its stamp. From this snapshot on, the
-    motion up to the newest sample is computed again. Motion after the newest sample is dropped.
+    After a late sample, the motion is computed again up to the newest sample. Motion after it is dropped.
 
     Parameters
     ----------
@@ -157,9 +135,8 @@ class Session:
     origin_ns
         Stamp of model time 0 [ns]; None for the first stamp.
     on_entry
-        Function that receives each entry before the session applies it, and each digest after its advance. An entry
-        with a number that is not finite is passed to the function before the twin refuses the entry. In a replay, the
-        twin refuses the same entry.
+        Function that receives each entry before the session applies it, and each digest after its advance. It also
+        receives an entry that the twin then refuses, because a number is not finite.
     rollback_span_s
         Largest age of a late sample relative to the newest sample [s]; with 0, late samples are refused.
     wear_depth
@@ -170,7 +147,7 @@ class Session:
         self,
         twin: Driven,
         origin_ns: int | None = None,
-        on_entry: Callable[[Entry], object] = lambda entry: None,
+        on_entry: Callable[[journal.Entry], object] = lambda entry: None,
         *,
         rollback_span_s: float = 0.0,
         wear_depth: Sequence[float] | None = None,
@@ -202,7 +179,7 @@ class Session:
         self.held = False
         self._wears = scene.wear is not None and scene.wear.coefficient_m2_n != 0.0
         self._speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
-        self._travels: list[Travel] = []
+        self._travels: list[journal.Travel] = []
         self._on_entry = on_entry
         self._advances = 0
 
@@ -226,9 +203,9 @@ class Session:
     def close(self) -> None:
         """Emit the digest that ends a journal."""
         if self.stamp_ns is not None:
-            self._on_entry(Digest(self.stamp_ns, self.twin.digest()))
+            self._on_entry(journal.Digest(self.stamp_ns, self.twin.digest()))
 
-    def apply(self, entry: Entry) -> Rows | None:
+    def apply(self, entry: journal.Entry) -> Rows | None:
         """Emit an entry and apply it; return the row of its advance, shape (1,), or None if the entry makes no advance.
 
         A `Digest` or a `Loss` describes the journal from which it was read. It is neither applied nor emitted.
@@ -239,59 +216,53 @@ class Session:
             If the stamp is older than all stored states, or a number is not finite. The motion is unchanged.
         """
         match entry:
-            case Sample():
+            case journal.Sample():
                 return self.apply_samples([entry]).rows[-1:]
-            case Hold() | Unload():
+            case journal.Hold() | journal.Unload():
                 return self._apply_hold(entry)
-            case Digest() | Loss():
+            case journal.Digest() | journal.Loss():
                 return None
-            case Travel(_, speed):
+            case journal.Travel(_, speed):
                 check_travel_speed(self.twin.scene, speed)
         self._on_entry(entry)
         match entry:
-            case Travel():
+            case journal.Travel():
                 self._apply_travel(entry)
-            case Reset():
+            case journal.Reset():
                 self._restart(self.wear_depth)
-            case SetWear(_, depth):
+            case journal.SetWear(_, depth):
                 self._restart(np.array(depth))
                 # the estimate refers to the wear before this change
                 self.outputs.clear_shift()
-            case Estimated(shift=shift):
+            case journal.Estimated(shift=shift):
                 self.outputs.set_shift(shift)
                 if self.stamp_ns is not None:
                     self._follow(self.stamp_ns, entry)
-            case SetModel(_, changes):
+            case journal.SetModel(_, changes):
                 self._change_model(read_changes(changes))
-            case Restore(_, data):
+            case journal.Restore(_, data):
                 self._restore_motion(data)
-            case Pose(stamp_ns) | PartOfPose(stamp_ns):
+            case journal.Pose(stamp_ns) | journal.PartOfPose(stamp_ns):
                 if self.following is not None and self.stamp_ns is not None and stamp_ns > self.stamp_ns + _AHEAD_NS:
                     self.poses_dropped += 1
                 else:
                     self._follow(stamp_ns, entry)
-            case Parameter("follow", "parameters") if self.following is not None:
+            case journal.Parameter("follow", "parameters") if self.following is not None:
                 self.following.follow_parameters()
                 self._forget()
-            case Snapshot(_, data):
+            case journal.Snapshot(_, data):
                 self._restore(data)
                 self._forget()
         return None  # entries of other types do not change the motion
 
-    def parts(self, samples: Sequence[Sample], *, each: bool = False) -> Iterator[Sequence[Sample]]:
-        """Yield parts of the samples for `apply_samples`. Each part must be applied before the next part is requested.
+    def parts(self, samples: Sequence[journal.Sample], *, each: bool = False) -> Iterator[Sequence[journal.Sample]]:
+        """Yield parts of samples, whose stamps must not fall, for `apply_samples`.
+
+        Each part must be applied before the next part is requested.
 
         A late sample and all samples after it form one part. A part without a late sample ends at the next digest or,
         if `each` is set, after one sample.
-
-        Raises
-        ------
-        ValueError
-            If the stamps fall.
         """
-        for earlier, later in pairwise(samples):
-            if later.stamp_ns < earlier.stamp_ns:
-                raise ValueError(f"stamp: got {later.stamp_ns} ns, expected at least {earlier.stamp_ns} ns")
         while samples:
             count = 1
             if self._is_late(samples[0].stamp_ns):
@@ -301,7 +272,7 @@ class Session:
             yield samples[:count]
             samples = samples[count:]
 
-    def apply_samples(self, samples: Sequence[Sample], *, each: bool = False) -> Applied:
+    def apply_samples(self, samples: Sequence[journal.Sample], *, each: bool = False) -> Applied:
         """Emit and apply a part of the samples that `parts` has yielded.
 
         The motion does not depend on the division into parts. If `each` is set, each sample is published, except that
@@ -443,7 +414,7 @@ class Session:
         digests = [digest for part in parts for digest in part.digests]
         return Applied(parts[-1].rows if rows is None else rows, published, digests, sum(part.failed for part in parts))
 
-    def emit(self, entry: Entry) -> None:
+    def emit(self, entry: journal.Entry) -> None:
         """Emit an entry that does not change the motion."""
         self._on_entry(entry)
 
@@ -456,13 +427,13 @@ class Session:
         largest, self._largest_error_m = self._largest_error_m, 0.0
         return largest
 
-    def renew(self) -> Snapshot:
+    def renew(self) -> journal.Snapshot:
         """Return a snapshot from which a journal can continue, and drop all stored earlier states."""
         snapshot = self.snapshot()
         self._forget()
         return snapshot
 
-    def snapshot(self) -> Snapshot:
+    def snapshot(self) -> journal.Snapshot:
         """Return the exact state of the twin, the outputs and the session."""
         known = self.stamp_ns is not None
         header = _HEADER.pack(
@@ -479,9 +450,9 @@ class Session:
         # changes of the scene are appended last, because `_split_twin` finds the changes after the data of the twin
         changes = json.dumps(self.changes).encode() if self.changes else b""
         data = header + travels + self.wear_depth.tobytes() + self.outputs.state() + self.twin.snapshot() + changes
-        return Snapshot(stamp_ns, data)
+        return journal.Snapshot(stamp_ns, data)
 
-    def _run(self, samples: Sequence[Sample], taken: NDArray[np.int64] = NONE) -> Applied:
+    def _run(self, samples: Sequence[journal.Sample], taken: NDArray[np.int64] = NONE) -> Applied:
         stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
         wrench = np.array([sample.wrench for sample in samples])
         advance = self._advance_in_pieces if self.held or self._travels else self._advance
@@ -530,24 +501,28 @@ class Session:
             self._largest_error_m = max(self._largest_error_m, float(rows["error_estimate"].max()))
         return Applied(rows, self.outputs.add(rows, stamps, taken), digests, failed)
 
-    def _follow(self, stamp_ns: int, entry: Pose | PartOfPose | Estimated, known: float = -math.inf) -> None:
+    def _follow(
+        self, stamp_ns: int, entry: journal.Pose | journal.PartOfPose | journal.Estimated, known: float = -math.inf
+    ) -> None:
         if self.following is None or self.origin_ns is None:
             return
         time = (stamp_ns - self.origin_ns) * 1e-9
-        if isinstance(entry, Estimated):
+        if isinstance(entry, journal.Estimated):
             self.following.add_estimate(entry.result, time, (entry.start_ns - self.origin_ns) * 1e-9)
         else:
-            self.following.add_pose(time, whole_pose(entry), known)
+            self.following.add_pose(time, journal.whole_pose(entry), known)
         measured, earliest_ns, reached_ns = self._measured, self.history.earliest_ns, self.stamp_ns or 0
         known = max(known, self.following.time)
         measured.append(_Measured(self.following.added, reached_ns, known, stamp_ns, entry))
         while measured and (earliest_ns is None or measured[0].reached_ns < earliest_ns):
             measured.popleft()
         if len(measured) > MOST_MEASURED:
-            del measured[next(place for place, one in enumerate(measured) if not isinstance(one.entry, Estimated))]
+            del measured[
+                next(place for place, one in enumerate(measured) if not isinstance(one.entry, journal.Estimated))
+            ]
             self.poses_dropped += 1
 
-    def _travel_on_the_way(self, travel: Travel, stamp_ns: int, wrench: NDArray[np.float64]) -> None:
+    def _travel_on_the_way(self, travel: journal.Travel, stamp_ns: int, wrench: NDArray[np.float64]) -> None:
         self._travels.pop(0)
         if self.stamp_ns is not None and travel.stamp_ns > self.stamp_ns:
             share = (travel.stamp_ns - self.stamp_ns) / (stamp_ns - self.stamp_ns)
@@ -572,7 +547,7 @@ class Session:
             bound_ns = self.stamp_ns if oldest_ns is None else oldest_ns
             raise ValueError(f"stamp: got {stamp_ns} ns, expected at least {limit}, {bound_ns} ns")
 
-    def _work_in(self, stamp_ns: int, late: Sequence[Sample], *travels: Travel) -> Applied:
+    def _work_in(self, stamp_ns: int, late: Sequence[journal.Sample], *travels: journal.Travel) -> Applied:
         """Go back to a state before a late stamp, and compute the motion again with late samples and travel speeds.
 
         The next publication covers the motion from the earliest late stamp that was inserted since the previous
@@ -587,7 +562,7 @@ class Session:
         self.outputs.begin_correction()
         return self._run(sorted([*again[len(known) :], *late], key=lambda sample: sample.stamp_ns))
 
-    def _rewind(self, stamp_ns: int, *more: Travel) -> list[Sample]:
+    def _rewind(self, stamp_ns: int, *more: journal.Travel) -> list[journal.Sample]:
         """Go back to the newest snapshot before `stamp_ns`; return the samples after the snapshot.
 
         The travel speeds after the snapshot and the speeds `more` are scheduled for their stamps again.
@@ -610,7 +585,7 @@ class Session:
         self._travels = sorted(known.values(), key=lambda travel: travel.stamp_ns)
         return samples
 
-    def _apply_hold(self, entry: Hold | Unload) -> Rows:
+    def _apply_hold(self, entry: journal.Hold | journal.Unload) -> Rows:
         stamp_ns = entry.stamp_ns
         if self.stamp_ns is not None and stamp_ns < self.stamp_ns:
             raise ValueError(f"stamp: got {stamp_ns} ns, expected at least the time reached, {self.stamp_ns} ns")
@@ -624,7 +599,7 @@ class Session:
             if not self._sampled and self.stamp_ns is not None and travel.stamp_ns > self.stamp_ns:
                 self._move(np.array([travel.stamp_ns]), _NO_LOAD, held=self.held)
             self._set_speed(travel)
-        load = _NO_LOAD if isinstance(entry, Unload) else self.twin.wrench[None]
+        load = _NO_LOAD if isinstance(entry, journal.Unload) else self.twin.wrench[None]
         rows = self._move(np.array([stamp_ns]), load, held=self.held)
         self._count(1)
         return rows
@@ -655,7 +630,7 @@ class Session:
             self.twin.set_travel_speed(self._speed)
         return held
 
-    def _apply_travel(self, travel: Travel) -> None:
+    def _apply_travel(self, travel: journal.Travel) -> None:
         newest_ns, oldest_ns = self.history.newest_sample_ns, self.history.oldest_ns
         if not self._wears:
             self._speed = travel.speed_m_s
@@ -667,13 +642,13 @@ class Session:
         elif oldest_ns is not None and travel.stamp_ns <= oldest_ns:
             # a speed older than all stored states takes effect at the newest sample or, without samples, at the oldest
             # stored state
-            self._set_speed(Travel(oldest_ns if newest_ns is None else newest_ns, travel.speed_m_s))
+            self._set_speed(journal.Travel(oldest_ns if newest_ns is None else newest_ns, travel.speed_m_s))
         elif newest_ns is None or oldest_ns is None or travel.stamp_ns >= newest_ns:
             self._set_speed(travel)
         else:
             self._work_in(travel.stamp_ns, [], travel)
 
-    def _set_speed(self, travel: Travel) -> None:
+    def _set_speed(self, travel: journal.Travel) -> None:
         self.history.add_travel(travel)
         self._use_speed(travel.speed_m_s)
 
@@ -685,7 +660,7 @@ class Session:
     def _count(self, advances: int) -> None:
         before, self._advances = self._advances, self._advances + advances
         if before // DIGEST_INTERVAL != self._advances // DIGEST_INTERVAL and self.stamp_ns is not None:
-            self._on_entry(Digest(self.stamp_ns, self.twin.digest()))
+            self._on_entry(journal.Digest(self.stamp_ns, self.twin.digest()))
 
     def _remember(self, *, kept: bool = True, resumed: bool = False) -> None:
         if self.stamp_ns is not None:
@@ -725,7 +700,7 @@ class Session:
         self.changes = changes
         if self._wears:
             self.twin.set_travel_speed(speed)
-        self.outputs.set_scene(self.twin.scene)
+        self.outputs.scene = self.twin.scene
         self.outputs.clear_shift()
         self._forget()
 
@@ -753,7 +728,7 @@ class Session:
         travels = _HEADER.unpack_from(data)[-1]
         end = _HEADER.size + travels * _TRAVEL.size
         depth = np.frombuffer(data, np.float64, PAIR_COUNT, offset=end)
-        twin_data, changes = self._split_twin(data[end + _WEAR_SIZE + self.outputs.state_size() :])
+        twin_data, changes = self._split_twin(data[end + _WEAR_SIZE + STATE_BYTES :])
         self._end_motion()
         known = "" if self.following is None else self.following.known
         if changes == self.changes and (depth == self.wear_depth).all():
@@ -774,16 +749,16 @@ class Session:
     def _restore(self, data: bytes) -> None:
         known, origin_ns, stamp_ns, advances, held, speed, travels = _HEADER.unpack_from(data)
         end = _HEADER.size + travels * _TRAVEL.size
-        split = end + _WEAR_SIZE + self.outputs.state_size()
+        split = end + _WEAR_SIZE + STATE_BYTES
         twin_data, changes = self._split_twin(data[split:])
         if changes != self.changes:
             self._use(changed_twin(self.twin, self._scene, changes))
             self.changes = changes
-            self.outputs.set_scene(self.twin.scene)
+            self.outputs.scene = self.twin.scene
         self.twin.restore(twin_data)
         self.outputs.set_state(data[end + _WEAR_SIZE : split])
         self.wear_depth = np.frombuffer(data, np.float64, PAIR_COUNT, offset=end).copy()
-        self._travels = [Travel(*found) for found in _TRAVEL.iter_unpack(data[_HEADER.size : end])]
+        self._travels = [journal.Travel(*found) for found in _TRAVEL.iter_unpack(data[_HEADER.size : end])]
         self.origin_ns = origin_ns if known else self.origin_ns
         self.stamp_ns = stamp_ns if known else None
         self._advances, self.held, self._speed = advances, held, speed
