@@ -175,7 +175,7 @@ class Recorder:
         self._split_due = False
         self._part_since = time.monotonic()
         self._queue: deque[_Item] = deque()
-        #: number of entries and publications in the queue minus the number of items in the queue
+        #: number of entries and publications in the queue beyond one for each item
         self._more = 0
         self._queue_size = queue_size
         self._flush_period_s = flush_period_s

@@ -329,7 +329,7 @@ class _Replay:
         assert self.sink is not None
         entry = record.entry
         if isinstance(entry, journal.Snapshot) and self.synced:
-            # the recorded snapshot does not fit the publications in the sink, which are more than the recorded ones
+            # the sink contains more publications than the recording, so the recorded snapshot does not fit
             entry = self.session.snapshot()
         self.sink.write_entry(record.sequence, record.log_time_ns, entry)
         published = (

@@ -86,7 +86,7 @@ class Following(Driven, Protocol):
         """The estimate (JSON) that the twin follows; empty while it follows the prior."""
 
     def follow_estimate(self, known: str) -> None:
-        """Continue from the present state with the estimate `known` (JSON), as the property `known` returns it."""
+        """Continue from the present state with the estimate `known` (JSON)."""
 
     def follow_parameters(self) -> None:
         """Continue as a single twin from the state of the median twin, without corrections by poses."""

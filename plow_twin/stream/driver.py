@@ -106,7 +106,7 @@ class Driver:
         self._received_ns = 0
         #: stamp of the newest sample used [ns]; None before the first sample and after a reset
         self.newest_ns: int | None = None
-        #: stamp up to which the model time is counted in `real_time` [ns]
+        #: stamp of the last advance that `real_time` has counted [ns]
         self._counted_ns: int | None = None
         self._zeroed = False
         #: time that the node has been inactive [ns]; under the scene's own loads, the model lags behind the node's

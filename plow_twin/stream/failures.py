@@ -10,8 +10,8 @@ from plow_twin.stream.journal import Failed
 class Failures:
     """Failed advances of a run.
 
-    A *stretch* consists of consecutive failures. `emit` receives a `Failed` entry at the first failure of a stretch. If
-    more failures follow, `emit` receives a second entry at the end of the stretch, which counts the further failures.
+    A *stretch* consists of consecutive failures. `emit` receives a `Failed` entry for the first failure of a stretch,
+    and an entry for all others at the end of the stretch.
     """
 
     def __init__(self, emit: Callable[[Failed], object]) -> None:

@@ -108,8 +108,7 @@ class Intake:
         self._newest_ns: int | None = None
         self._newest_values: Sequence[float] = ()
         self._before_jump_ns: int | None = None
-        #: whether the last sample continued the stamps before a jump, which shows that the stamps since the jump were
-        #: wrong
+        #: whether the last sample returned to the stamps before a jump, so that the stamps since the jump were wrong
         self.returned = False
         #: number of missing samples before the last jump
         self._missing_before = 0
@@ -185,9 +184,7 @@ class Intake:
         return not self.near(stamp_ns, newest_ns, reached_ns)
 
     def near(self, stamp_ns: int, newest_ns: int, reached_ns: int | None = None) -> bool:
-        """Return whether a stamp neither jumps relative to `newest_ns` nor relative to `reached_ns`, the time of the
-        model.
-        """
+        """Return whether a stamp is near `newest_ns` and the time of the model, `reached_ns`."""
         ahead_ns = stamp_ns - (newest_ns if reached_ns is None else max(newest_ns, reached_ns))
         return ahead_ns <= self.jump_forward_s * NS_PER_S and newest_ns - stamp_ns <= self.jump_back_s * NS_PER_S
 

@@ -7,7 +7,7 @@ from typing import Final
 
 from plow_twin.stream.intake import NS_PER_S, Intake, Verdict
 
-#: Number of stray stamps within `_WINDOW_NS` from which the clock of the samples is called unsteady.
+#: Number of stray stamps within `_WINDOW_NS` that makes the clock of the samples unsteady.
 _MOST_STRAYS: Final = 5
 _WINDOW_NS: Final = 10 * NS_PER_S
 

@@ -106,8 +106,8 @@ class OpcUa(Bridge):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._task: asyncio.Task[None] | None = None
         self._link: Link | None = None
-        #: lists of values that arrived while the history was read, and for each list, whether values before the list
-        #: were lost; None if values are used immediately
+        #: lists of values that wait for the end of a read of the history, and whether values before each list were
+        #: lost; None if values are used immediately
         self._held_back: list[tuple[list[tuple[int, Any]], bool]] | None = None
         #: monotonic time at which the connection broke [s], or None while it exists
         self._broken_s: float | None = None
