@@ -85,15 +85,7 @@ class Control:
 
 
 def call(path: Path, service: str, text: str | None = None) -> tuple[bool, str]:
-    """Request a service from a twin through its socket.
-
-    Returns
-    -------
-    success : bool
-        Whether the service succeeded.
-    message : str
-        Answer of the twin.
-    """
+    """Request a service from a twin through its socket; return success and the answer of the twin."""
     if not path.is_socket():
         kind = "a folder" if path.is_dir() else "a file" if path.exists() else "nothing there"
         raise ControlError(f"{path}: got {kind}, expected the socket that plow-twin live --control has opened")

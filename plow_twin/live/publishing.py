@@ -25,16 +25,9 @@ Outgoing = tuple[str, memoryview | Message]
 class Front(Protocol):
     """Interface of a live twin to its transport, which delivers the samples and sends the messages.
 
-    Attributes
-    ----------
-    name : str
-        Name of the twin, including the namespace.
-    topics : mapping
-        Resolved name of each output topic, by base name.
-    follows_samples : bool
-        Whether only samples advance the time, as with `/clock` or a file. If True, time stops while no samples arrive.
-    sends_motion : bool
-        Whether messages of the motion are sent. If False, the messages are only recorded.
+    `name` includes the namespace, and `topics` contains the resolved name of each output topic, by base name. With
+    `follows_samples`, only samples advance the time, as with `/clock` or a file. Without `sends_motion`, messages of
+    the motion are only recorded.
     """
 
     name: str

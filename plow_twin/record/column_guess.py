@@ -49,20 +49,9 @@ _NEEDED: Final = tuple(("excitation", name) for name in ROLES["excitation"])
 class Guess:
     """The guessed meaning of a file's columns.
 
-    Attributes
-    ----------
-    columns : dict
-        Column of each quantity, by role and name of the quantity.
-    units : dict
-        Unit of each quantity that is not in SI.
-    time : str
-        Name of the time column.
-    time_unit : str
-        Unit of the time column, which is empty if the column contains dates.
-    because : dict
-        How each column was found.
-    open : dict
-        Columns or units from which the user must choose, for each undecided quantity. The key of the time is `t`.
+    `columns` contains the column of each quantity, by role and name, and `units` the units that are not SI. `time_unit`
+    is empty if the time column contains dates. `because` states how each column was found. `open` contains the columns
+    or units from which the user must choose, for each undecided quantity (`t` for the time).
     """
 
     path: Path

@@ -399,5 +399,4 @@ class MemoryFile:
         """Do nothing."""
 
 
-#: A file to which a recording can be written.
 ByteFile: TypeAlias = UnbufferedFile | MemoryFile

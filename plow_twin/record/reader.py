@@ -57,32 +57,15 @@ class FileStatus(Enum):
 class RunReader:
     """Reader of the records of a run, in batches.
 
-    Parameters
-    ----------
-    path
-        Folder of the run, or one of its `.mcap` files.
-    tail
-        Wait for a run that is still being written. With a tail, the reader reads new parts, and yields an empty batch
-        at each end of the data.
+    `path` is the folder of the run, or one of its `.mcap` files. With `tail`, the reader waits for a run that is still
+    being written, reads new parts, and yields an empty batch at each end of the data.
 
-    Attributes
-    ----------
-    parts : list of Path
-        Files that are read, in order. Parts that are removed during the iteration are skipped.
-    repeated : dict
-        Files that repeat a part, with the file that is read instead.
-    foreign : dict
-        Files of another run. The value is the keys in which the header of the file differs from most headers.
-    status
-        State of the end of the recording, which is known after the iteration.
-    damaged_chunks
-        Number of damaged chunks that the iteration has found. A part that is not an MCAP file counts as one.
-    stop_reason
-        Reason of an early end of the recording.
-    counts
-        Number of records that the iteration has found, by topic.
-    position : float
-        Share of the data that has been read, from 0 to 1.
+    `parts` are the files that are read, in order; parts that are removed during the iteration are skipped. `repeated`
+    maps a file that repeats a part to the file that is read instead. `foreign` maps a file of another run to the keys
+    in which its header differs.
+
+    The iteration determines `status`, `damaged_chunks` (a part that is not an MCAP file counts as one), `stop_reason`,
+    `counts` (records by topic) and `position` (share of the data that has been read, from 0 to 1).
 
     Raises
     ------

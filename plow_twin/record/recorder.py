@@ -92,35 +92,18 @@ class LossReport:
 class Recorder:
     """Record a run to the folder `path`.
 
-    Parameters
-    ----------
-    path
-        Folder to create. In the folder `runs/monday`, the first file is `runs/monday/monday_0.mcap`.
-    header
-        Scene and settings of the run.
-    queue_size
-        Largest number of items in the queue. The last quarter of the queue is reserved for journal entries.
-    flush_period_s
-        Interval between writes to the file [s]. If the process is killed, journal entries of up to one interval are
-        lost, and messages of up to two intervals are lost.
-    chunk_size
-        Size at which a chunk is written to the file [B].
-    min_free_bytes
-        Free space on the disk below which recording pauses [B].
-    part_bytes
-        Size after which a new part (file) is started [B]. With 0, the size of a part is not limited.
-    part_s
-        Duration after which a new part is started [s]. With 0, the duration of a part is not limited.
-    keep_bytes
-        Total size of the completed parts above which the oldest parts are removed [B]. With 0, no part is removed.
-    ring_s
-        Duration of the ring [s]. With 0, the recorder has no ring and writes all data to the disk.
-    sync
-        Whether the recorder calls `fdatasync` after each write, so that the written data survive a loss of power.
-    now_ns
-        Function that returns the receive time [ns]. The recorder calls it in the thread of the caller.
-    on_error
-        Function that receives the reason when recording stops early. The recorder calls it once, in its own thread.
+    In the folder `runs/monday`, the first file is `runs/monday/monday_0.mcap`. The last quarter of the queue is
+    reserved for journal entries. If the process is killed, journal entries of up to `flush_period_s` [s] are lost, and
+    messages of up to twice this time. A chunk is written when it has `chunk_size` [B]. If the disk has less than
+    `min_free_bytes` [B], recording pauses.
+
+    A new part (file) is started after `part_bytes` [B] or `part_s` [s]. The oldest parts are removed while the
+    completed parts have more than `keep_bytes` [B]. With 0, these three are not limited. With `ring_s` [s], the
+    recorder has a ring of this duration, and does not write all data to the disk. With `sync`, written data survive a
+    loss of power.
+
+    `now_ns` returns the receive time [ns], in the thread of the caller. `on_error` receives the reason when recording
+    stops early, once, in the thread of the recorder.
 
     Raises
     ------

@@ -63,20 +63,9 @@ _SHORTEST_SPACING_S: Final = 1e-4
 class UnitDoubt:
     """Doubt that the numbers of a role are in SI units.
 
-    Attributes
-    ----------
-    names : tuple of str
-        Quantities that are in doubt. The name `t` means the stamps of the load.
-    found : str
-        Magnitude of the numbers.
-    expected : str
-        Magnitude that is expected in SI units.
-    likely : str
-        Unit that the numbers seem to have.
-    is_impossible : bool
-        Whether no head can move as the numbers state.
-    advice : str
-        Advice to the user if the doubt cannot be removed by stating a unit.
+    The name `t` in `names` means the stamps of the load. `found` and `expected` are magnitudes in SI units, and
+    `likely` is the unit that the numbers seem to have. If `is_impossible`, no head can move as the numbers state.
+    `advice` replaces the advice to state the unit.
     """
 
     role: str

@@ -53,7 +53,6 @@ class Walked:
     wrench: NDArray[np.float64]
     #: motion at the stamps, with the number of touches since the start of the run
     rows: AdvanceSeries
-    #: publications after all advances
     published: Published
     #: number of touches of each pair since the previous advance, shape (n, 8)
     makes: NDArray[np.int64]

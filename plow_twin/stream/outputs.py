@@ -172,7 +172,6 @@ class Outputs:
     """Combine advances into publications without losing a peak, an impulse or a touch."""
 
     def __init__(self, scene: Scene) -> None:
-        #: scene of all later publications
         self.scene = scene
         self._publish = _publish()
         #: the window; it includes the newest advance if `_waits` is 1

@@ -22,7 +22,6 @@ class Steps:
 
     def __init__(self, intake: Intake) -> None:
         self._intake = intake
-        #: the delayed sample
         self._jumped: Timed | None = None
         #: times of the latest stray stamps [ns]
         self._strays_ns: deque[int] = deque(maxlen=_MOST_STRAYS)
