@@ -51,6 +51,14 @@ def test_a_constant_factor_of_the_published_d_returns_its_restitution(e: float, 
     assert restitution.free_impact(contact, speed=speed) == pytest.approx(e, abs=3e-7)
 
 
+def test_impacts_below_the_speed_floor_have_a_higher_restitution() -> None:
+    """The damping factor is that of an impact at the floor, so D falls with the speed."""
+    contact = Contact("exact_restitution", 1e9, 1.5, restitution=0.4, impact_speed_floor_m_s=0.5)
+    delivered = restitution.free_impact(contact, speed=0.2)
+    assert delivered > 0.4
+    assert exact_damping_number(delivered) == pytest.approx(0.4 * exact_damping_number(0.4), rel=1e-7)
+
+
 @pytest.mark.parametrize("law", DELIVERED)
 def test_the_other_laws_deliver_their_published_restitution(law: str) -> None:
     for asked, known in zip(ASKED, DELIVERED[law], strict=True):
