@@ -21,20 +21,19 @@ from std_srvs.srv import Trigger
 from plow_twin.dashboard.access import DashboardError, PageAccess
 from plow_twin.dashboard.facts import facts_of
 from plow_twin.dashboard.feed import RATE_HZ, Feed, part_of
-from plow_twin.dashboard.run import pose_of
 from plow_twin.dashboard.screen import Screen
 from plow_twin.live.part import Part
 from plow_twin.live.timer import Timer
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.record import messages as plain
 from plow_twin.record.cdr import decode
+from plow_twin.record.rows import poses_of
 from plow_twin.ros.connections import WithoutEvents
 from plow_twin.ros.main import make_executor
 from plow_twin.ros.messages import UNREADABLE, read_wrench
 from plow_twin.ros.qos import DIAGNOSTICS, OUTPUTS, sensor_input
 from plow_twin.ros.start import ros
 from plow_twin.scene_file import load_scene
-from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.topics import Cadence, names_of
 
 #: Parameters of the node that the page shows.
@@ -96,7 +95,7 @@ class NodeWatch:
         values = map(parameter_value_to_python, answer.values)
         parameters = {name: value for name, value in zip(_SHOWN, values, strict=False) if value is not None}
         self._source = parameters.get("excitation_source")
-        found = load_scene(scene_path(scene or str(parameters.get("scene", ""))))
+        found = load_scene(scene or str(parameters.get("scene", "")))
         return facts_of(found, parameters, f"node {self.name}")
 
     def listen(self, feed: Feed) -> None:
@@ -161,7 +160,7 @@ class NodeWatch:
             self._motion.add_points(low, high)
 
     def _pose(self, message: plain.Odometry) -> None:
-        self._motion.pose = pose_of(np.array([*message.position[:2], *message.orientation[2:]]))
+        self._motion.pose = poses_of(np.array([*message.position[:2], *message.orientation[2:]]))
 
     def _clearance(self, message: plain.JointState) -> None:
         self._motion.set_clearance(message.position)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from plow_twin.dashboard.access import PageAccess
 from plow_twin.dashboard.facts import facts_of
-from plow_twin.dashboard.feed import RATE_HZ, Array, Feed, part_of
+from plow_twin.dashboard.feed import RATE_HZ, Feed, part_of
 from plow_twin.dashboard.screen import Screen
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.record.entries import Batch
@@ -23,7 +23,7 @@ from plow_twin.record.follow import Tail
 from plow_twin.record.header import RunHeader
 from plow_twin.record.outputs import publication_templates
 from plow_twin.record.reader import RunReader
-from plow_twin.record.rows import Rows, rows_by_topic
+from plow_twin.record.rows import Rows, poses_of, rows_by_topic
 from plow_twin.record.unused import InputCounts
 from plow_twin.stream.intake import NS_PER_S
 from plow_twin.stream.journal import Hold, Mark
@@ -92,7 +92,7 @@ class RunFeed:
         if "contact_forces" in newest:
             motion.penetration, _, motion.force = newest["contact_forces"].reshape(3, PAIR_COUNT)
         if "head_state" in newest:
-            motion.pose = pose_of(newest["head_state"])
+            motion.pose = poses_of(newest["head_state"])
         if "clearance" in newest:
             motion.set_clearance(newest["clearance"])
 
@@ -107,11 +107,6 @@ class RunFeed:
 def _within(rows: Rows, second: int) -> Rows:
     chosen: NDArray[np.bool_] = rows.stamp_ns // NS_PER_S == second
     return Rows(rows.sequence[chosen], rows.stamp_ns[chosen], rows.numbers[chosen])
-
-
-def pose_of(numbers: Array) -> Array:
-    """Return x, y [m], theta [rad] of the numbers in a `head_state` message."""
-    return np.array([numbers[0], numbers[1], 2.0 * np.arctan2(numbers[2], numbers[3])])
 
 
 def show_run(path: Path, access: PageAccess, stopped: Callable[[], bool], on_open: Callable[[Screen], object]) -> None:

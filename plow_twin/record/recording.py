@@ -17,7 +17,7 @@ from plow_twin.record.entries import Batch
 from plow_twin.record.header import RunHeader
 from plow_twin.record.outputs import REPLAYED, publication_templates
 from plow_twin.record.reader import FileStatus, RunReader
-from plow_twin.record.rows import Rows, rows_by_topic
+from plow_twin.record.rows import Rows, poses_of, rows_by_topic
 from plow_twin.stream.journal import PartOfPose, Pose, whole_pose
 from plow_twin.stream.topics import JOINT_STATE, Topic
 
@@ -298,6 +298,5 @@ def _poses(batch: Batch) -> Batched | None:
 def _plain(name: str, rows: Rows) -> Batched:
     values = rows.numbers
     if name == "head_state":
-        theta = 2.0 * np.arctan2(values[:, 2], values[:, 3])
-        values = np.column_stack((values[:, :2], theta, values[:, 4:7]))
+        values = np.column_stack((poses_of(values), values[:, 4:7]))
     return Batched(rows.stamp_ns, values)

@@ -47,6 +47,12 @@ class Rows:
         return cls(sequence, stamp_ns, numbers)
 
 
+def poses_of(numbers: Array) -> Array:
+    """Return x, y [m], theta [rad], shape (..., 3), of the numbers of `head_state`, shape (..., 7)."""
+    theta = 2.0 * np.arctan2(numbers[..., 2:3], numbers[..., 3:4])
+    return np.concatenate((numbers[..., :2], theta), axis=-1)
+
+
 def rows_by_topic(
     outputs: list[Outputs], topics: Mapping[str, str], templates: Mapping[str, Template]
 ) -> dict[str, Rows]:

@@ -19,7 +19,7 @@ from plow_twin.record.entries import Batch, Entries, Holes
 from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.record.outputs import publication_templates
 from plow_twin.record.reader import FileStatus, RunReader
-from plow_twin.record.rows import Rows, rows_by_topic
+from plow_twin.record.rows import Rows, poses_of, rows_by_topic
 from plow_twin.stream.journal import Hold, Loss, Pose, Reset, Travel, Unload
 from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES, clearances
 from plow_twin.view import layout
@@ -287,8 +287,7 @@ class Drawing:
     def _poses(self, measured: Sequence[tuple[int, Pose]], steps: Indexes, head: Rows, at: Indexes) -> None:
         if not (measured or self.measured.rows):
             return
-        theta = 2.0 * np.arctan2(head.numbers[:, 2], head.numbers[:, 3])
-        self.pose.add(head.stamp_ns, at, 1e3 * np.column_stack((head.numbers[:, :2], theta)))
+        self.pose.add(head.stamp_ns, at, 1e3 * poses_of(head.numbers))
         rising = sorted((entry.stamp_ns, max(int(steps[place]), 0), entry.pose) for place, entry in measured)
         if rising:
             stamps, places, poses = zip(*rising, strict=True)

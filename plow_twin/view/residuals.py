@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from plow_twin.record.rows import Rows
+from plow_twin.record.rows import Rows, poses_of
 from plow_twin.stream.journal import Pose
 from plow_twin.view.columns import Array, Indexes
 
@@ -28,8 +28,7 @@ class Residuals:
         entry. `head` has rows of `head_state`. A pose beyond the last row of `head` is compared at a later call.
         """
         self._waiting += [(pose.stamp_ns, max(int(steps[place]), 0), pose.pose) for place, pose in poses]
-        predicted = np.column_stack((head.numbers[:, :2], 2.0 * np.arctan2(head.numbers[:, 2], head.numbers[:, 3])))
-        stamps = head.stamp_ns
+        stamps, predicted = head.stamp_ns, poses_of(head.numbers)
         if self._last is not None and len(stamps) and self._last[0] < stamps[0]:
             stamps = np.concatenate(([self._last[0]], stamps))
             predicted = np.concatenate((self._last[1][None], predicted))
