@@ -54,6 +54,10 @@ class Row:
     amplification: float | None = None
     status: str = "ok"
 
+    def time(self, walls_s: Sequence[float]) -> None:
+        """Set the median and the shortest of several run times [s]."""
+        self.wall_ms, self.wall_min_ms, self.runs = 1e3 * median(walls_s), 1e3 * min(walls_s), len(walls_s)
+
 
 @dataclass
 class Case:
@@ -120,8 +124,8 @@ def _first_run(case: Case) -> Callable[[], Sample] | None:
 
 
 def _summarise(case: Case) -> None:
-    walls, row, last = [1e3 * sample.wall_s for sample in case.samples], case.row, case.samples[-1]
-    row.wall_ms, row.wall_min_ms, row.runs = median(walls), min(walls), len(walls)
+    row, last = case.row, case.samples[-1]
+    row.time([sample.wall_s for sample in case.samples])
     row.steps, row.evaluations, row.events = last.steps, last.evaluations, last.events
 
 

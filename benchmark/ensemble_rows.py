@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable, Iterator, Sequence
+from statistics import median
 
 import heyoka_peer
 import numpy as np
@@ -102,8 +103,8 @@ def lanes_rows(columns: int, rows: int, repeats: int, notify: Notify) -> Iterato
     one_by_one.events = sum(one.events or 0 for one in last)
     in_lanes.section, in_lanes.scene = LANES_SECTION, f"{name}, in lanes"
     for row, walls in ((in_lanes, lanes), (one_by_one, loop)):
-        row.wall_ms, row.wall_min_ms, row.runs = 1e3 * float(np.median(walls)), 1e3 * min(walls), len(walls)
-        row.value = row.wall_ms / (1e3 * float(np.median(lanes)))
+        row.time(walls)
+        row.value = median(walls) / median(lanes)
         yield row
 
 
@@ -128,7 +129,7 @@ def _own_row(
         walls.append(wall)
     error = _member_errors(scenes, ensemble.q, exact)
     row = Row(SECTION, name, OURS, f"tol={tol:g}, threads={workers}", SPARSE, T_END)
-    row.wall_ms, row.wall_min_ms, row.runs = 1e3 * float(np.median(walls)), 1e3 * min(walls), len(walls)
+    row.time(walls)
     row.error, row.steps, row.events = float(error.max()), int(ensemble.steps.sum()), int(ensemble.events.sum())
     row.value = float((error > LISTED).sum())
     return row, error
@@ -173,8 +174,8 @@ def _heyoka_rows(name: str, scenes: Sequence[Scene], exact: Array, notify: Notif
             return
         assert sample.q is not None
         error = _member_errors(scenes, np.moveaxis(sample.q, 2, 0), exact)
-        row.wall_ms = row.wall_min_ms = 1e3 * sample.wall_s
-        row.runs, row.error, row.value = 1, float(error.max()), float((error > LISTED).sum())
+        row.time([sample.wall_s])
+        row.error, row.value = float(error.max()), float((error > LISTED).sum())
         yield row
         if row.error <= LISTED:
             return

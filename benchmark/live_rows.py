@@ -118,8 +118,7 @@ def _start_row(name: str, cache: str) -> Row:
         row.status = f"failed: {done.stderr.strip().splitlines()[-1]}"
         return row
     said = json.loads(done.stdout)
-    row.wall_ms = row.wall_min_ms = 1e3 * said["ready_s"]
-    row.runs, row.value = 1, float(said["compiled"])
-    row.status = "ok"
+    row.time([said["ready_s"]])
+    row.value = float(said["compiled"])
     row.setting += f", import {said['import_s']:.2f} s, {said['read']} kernels read from the cache"
     return row

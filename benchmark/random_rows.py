@@ -53,8 +53,8 @@ def _row(saved: random_scenes.RandomScenes, index: int, tol: float, chaotic: boo
         row.status = f"failed: {problem}"
         return row
     assert sample.q is not None
-    row.wall_ms = row.wall_min_ms = 1e3 * sample.wall_s
-    row.runs, row.steps, row.events = 1, sample.steps, sample.events
+    row.time([sample.wall_s])
+    row.steps, row.events = sample.steps, sample.events
     row.error = random_scenes.distance(scene, sample.q, saved.q[index])
     row.value = row.error / tol
     if chaotic:
