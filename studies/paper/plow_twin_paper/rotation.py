@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from plow_twin.model.scene import Scene
 from plow_twin.run.simulate import Result, simulate
 from plow_twin_paper import sets as paper_sets
+from plow_twin_paper.rows_motion import force_table
 from plow_twin_paper.values import CORNERS, SENSE_NAMES
 
 #: Distance [m] above which two motions are treated as separated.
@@ -84,13 +85,11 @@ def rotation_rows(rotation: Rotation) -> list[RotationRow]:
 
 
 def _forces(rotation: Rotation) -> Iterator[RotationRow]:
-    letters = paper_sets.letters_of_pairs(rotation.scenes[0])
+    tables = [force_table(*run) for run in zip(rotation.scenes, rotation.results, strict=True)]
     for sense, sense_name in SENSE_NAMES.items():
-        chosen = paper_sets.of_sense(sense)
         for corner in CORNERS:
-            (pair,) = (index for index, letter in enumerate(letters) if letter == corner and chosen[index])
             for statistic, name in (("max", "largest force"), ("mean_in_contact", "mean force in contact")):
-                values = [list(result.statistics.values())[pair][statistic] / 1e3 for result in rotation.results]
+                values = [table[sense, corner][statistic] / 1e3 for table in tables]
                 yield RotationRow(f"{sense_name}, {corner}: {name}", "kN", *values)
 
 
