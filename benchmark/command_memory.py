@@ -20,7 +20,6 @@ from file_rate import write_load
 from plow_twin.model.scene import Wear
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
-from plow_twin.scene_file.presets import scene_path
 from plow_twin.solve.state import ROW
 
 _BATCH = 8192
@@ -38,7 +37,7 @@ COMMANDS = {
 
 
 def write_poses(path: Path, load: Path, count: int) -> None:
-    twin, rng = Twin(load_scene(scene_path("paper")), excitation="sampled"), np.random.default_rng(1)
+    twin, rng = Twin(load_scene("paper"), excitation="sampled"), np.random.default_rng(1)
     rows = np.zeros(_BATCH, ROW)
     with load.open() as loads, path.open("w") as file:
         loads.readline()
@@ -65,7 +64,7 @@ def run(folder: Path, *words: str) -> tuple[float, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("minutes", type=int, nargs="*", default=[10, 60])
-    scene = replace(load_scene(scene_path("paper")), wear=Wear(1e-14, pad_area_m2=0.02, travel_speed_m_s=0.5))
+    scene = replace(load_scene("paper"), wear=Wear(1e-14, pad_area_m2=0.02, travel_speed_m_s=0.5))
     for minutes in parser.parse_args().minutes:
         with tempfile.TemporaryDirectory() as name:
             os.chdir(name)

@@ -71,10 +71,8 @@ def main() -> None:
     from work_precision import prepare_bare
 
     from plow_twin.scene_file import load_scene
-    from plow_twin.scene_file.presets import scene_path
 
-    scene = load_scene(scene_path(chosen.scene))
-    run = prepare_bare(scene, 0.1, chosen.tol)
+    run = prepare_bare(load_scene(chosen.scene), 0.1, chosen.tol)
     run()
     _write_map()
     with tempfile.TemporaryDirectory() as folder:

@@ -30,7 +30,6 @@ from plow_twin.record.recorder import Recorder
 from plow_twin.record.replay import replay
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
-from plow_twin.scene_file.presets import scene_path
 from plow_twin.solve.state import ROW
 from plow_twin.stream.journal import Sample
 from plow_twin.stream.session import Session
@@ -46,7 +45,7 @@ _SHORT_S = 0.1
 
 def record(folder: Path, seconds: float, outputs: bool) -> int:
     """Record a run. Return its size [B]."""
-    scene = load_scene(scene_path("paper"))
+    scene = load_scene("paper")
     kind = "all" if outputs else "none"
     header = RunHeader(dump_scene(scene), record_outputs=kind)
     recorder = Recorder(folder, header, queue_size=10**7)
@@ -82,7 +81,7 @@ def _wrenches(index: NDArray[np.int64]) -> NDArray[np.float64]:
 
 def move(seconds: float, rows: bool) -> None:
     """Advance a twin by the samples of the recording, with or without computing the rows of its publications."""
-    twin = Twin(load_scene(scene_path("paper")), excitation="sampled")
+    twin = Twin(load_scene("paper"), excitation="sampled")
     index, memory = np.arange(round(1000 * seconds)), np.zeros(_BATCH, ROW)
     for begin in range(0, len(index), _BATCH):
         here = index[begin : begin + _BATCH]

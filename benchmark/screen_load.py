@@ -17,7 +17,6 @@ from plow_twin.dashboard.access import PageAccess
 from plow_twin.dashboard.facts import facts_of
 from plow_twin.dashboard.screen import Screen
 from plow_twin.scene_file import load_scene
-from plow_twin.scene_file.presets import scene_path
 from plow_twin.solve.state import ROW
 from plow_twin.stream.outputs import NOTHING, Published
 
@@ -34,7 +33,7 @@ threading.Event().wait()
 
 def measured(pages: int, seconds: float) -> dict[str, float]:
     rows = np.zeros(1, ROW)
-    with Screen(PageAccess("127.0.0.1", 0), facts_of(load_scene(scene_path("paper")), {}, "")) as screen:
+    with Screen(PageAccess("127.0.0.1", 0), facts_of(load_scene("paper"), {}, "")) as screen:
         screen.feed._load = lambda: np.zeros(3)
         address = screen.url.replace("http", "ws") + "data"
         readers = subprocess.Popen([sys.executable, "-c", READER, address, str(pages)])

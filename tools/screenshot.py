@@ -20,7 +20,6 @@ from PIL import Image
 from rerun.experimental import ViewerClient
 
 from plow_twin.scene_file import load_scene
-from plow_twin.scene_file.presets import scene_path
 from plow_twin.view import to_rrd
 
 SIZE = (1400, 900)
@@ -84,7 +83,7 @@ def main() -> None:
         port = probe.getsockname()[1]
     with tempfile.TemporaryDirectory() as folder:
         rrd, shot = Path(folder) / "run.rrd", Path(folder) / "shot.png"
-        to_rrd(options.run, rrd, others={Path(file).stem: load_scene(scene_path(file)) for file in options.others})
+        to_rrd(options.run, rrd, others={Path(file).stem: load_scene(file) for file in options.others})
         viewer = start_viewer(port, Path(folder))
         try:
             client = connect(port)

@@ -12,7 +12,6 @@ import click
 
 from plow_twin.cli.console import DONE, DONE_WITH_LOSS, busy, counts, output_console, say_error, table
 from plow_twin.cli.options import FILE, NEW_FILE, POSITIVE, json_option, quiet_option
-from plow_twin.scene_file.presets import scene_path
 
 if TYPE_CHECKING:
     from plow_twin.estimate.coefficient import History
@@ -166,7 +165,7 @@ def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
     from plow_twin.scene_file import load_scene
 
     if not Path(name).exists() or own_run(Path(name)) is None:
-        return load_scene(scene_path(name)), None, {}
+        return load_scene(name), None, {}
     reader = RunReader(Path(name))
     left, newest = left_by(reader)
     counts = {"journal": reader.lost.get("journal", 0), "damaged_chunks": reader.damaged_chunks, **reader.lost_parts}

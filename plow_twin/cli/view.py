@@ -167,11 +167,10 @@ def _made_run(
 
 def _scenes(files: tuple[str, ...]) -> dict[str, Scene]:
     from plow_twin.scene_file import load_scene
-    from plow_twin.scene_file.presets import scene_path
 
     stems = [Path(file).stem for file in files]
     names = [stem if stems.count(stem) == 1 else file for stem, file in zip(stems, files, strict=True)]
-    return {name: load_scene(scene_path(file)) for name, file in zip(names, files, strict=True)}
+    return {name: load_scene(file) for name, file in zip(names, files, strict=True)}
 
 
 def _show(recording: Path, out: object, summary: ViewSummary, quiet: bool) -> int:

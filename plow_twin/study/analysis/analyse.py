@@ -33,7 +33,6 @@ from plow_twin.record.unit_check import check_units
 from plow_twin.record.walking import JournalWalk, Walked, Walker
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
-from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.driven import Driven
 from plow_twin.stream.intake import Intake
 from plow_twin.stream.journal import Loss, Pose, Reset, Restore, SetWear
@@ -327,15 +326,15 @@ def analyse(
         raise RecordingError(f"{path}: expected a run of plow_twin: recordings of other programs cannot be followed")
     if reader is not None:
         own = reader.header.scene(reader.path)
-        chosen, name = (own, _OF_THE_RUN) if scene is None else (load_scene(scene_path(str(scene))), str(scene))
+        chosen, name = (own, _OF_THE_RUN) if scene is None else (load_scene(scene), str(scene))
     else:
         file = scene or (path / "scene.yaml" if path.is_dir() else path.with_name("scene.yaml"))
         if scene is None and not file.is_file():
             raise RecordingError(f"{path}: not a run of plow_twin: a scene is needed, expected --scene or {file}")
-        chosen, name = load_scene(scene_path(str(file))), str(file)
+        chosen, name = load_scene(file), str(file)
     predictions = [Prediction(name, chosen, LoadTotals(chosen))]
     for other in others:
-        with_scene = load_scene(scene_path(str(other)))
+        with_scene = load_scene(other)
         predictions.append(Prediction(str(other), with_scene, LoadTotals(with_scene)))
     if reader is not None:
         if units:

@@ -19,7 +19,6 @@ from plow_twin.record.chunks import ChunkReader
 from plow_twin.record.durable import write_whole
 from plow_twin.record.reader import read_header
 from plow_twin.scene_file import dump_scene, load_scene
-from plow_twin.scene_file.presets import scene_path
 from plow_twin.study.analysis.analyse import MAPPED_LOAD, OnProgress, analyse
 from plow_twin.study.analysis.report import write_report
 
@@ -196,7 +195,7 @@ def _scene_state(scene: Path | None) -> list[str] | None:
     if scene is None:
         return None
     try:
-        text = dump_scene(load_scene(scene_path(str(scene))))
+        text = dump_scene(load_scene(scene))
     except (PlowTwinError, OSError, ValueError):  # the analysis reports the error
         text = ""
     return [str(scene), hashlib.blake2b(text.encode(), digest_size=16).hexdigest()]
