@@ -1,4 +1,4 @@
-"""Connection to a Dask cluster. Results are returned in order of arrival."""
+"""Connection to a Dask cluster."""
 
 from __future__ import annotations
 

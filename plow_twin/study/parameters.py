@@ -1,16 +1,15 @@
 """Parameters of a scene, named by paths such as `contact.stiffness` and `head.com_offset_m[0]`.
 
-A parameter is a number or a word. The path of a parameter of a load contains the name of the load:
-`loads.fx1.phase_rad`. Four paths are settings of a study and not fields of a scene:
+A parameter is a number or a word. The path of a load's parameter contains the name of the load: `loads.fx1.phase_rad`.
+Four paths are no fields of a scene; they are applied after all other parameters:
 
     loads.<name>.sign       sign of the first non-zero component of the load's force; -1 reverses the force
     loads.<name>.arm_sign   sign of the first non-zero coordinate of the point of action; -1 reverses both coordinates
     loads.<name>.scale      factor of the load's force and free moment
     clearance.scale         factor of both clearances: 1 for a total, 2 for a published clearance per side
 
-These four settings are applied after all other parameters. The path `frame.labels` takes one of eight words. For
-example, `bottom_right_ccw` puts corner a at the bottom right, with b, c and d counter-clockwise from a. Setting
-`contact.damping` removes a restitution, and setting a restitution removes a damping. Setting a path of `friction`
+The path `frame.labels` takes one of eight words: `bottom_right_ccw` puts corner a at the bottom right, with b, c and d
+counter-clockwise from a. A damping replaces a restitution, and a restitution replaces a damping. A path of `friction`
 switches friction on.
 """
 
@@ -107,8 +106,6 @@ def parameter_of(scene: Scene, path: str) -> Value | None:
 def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
     """Return the scene with new values. The mark of each changed number is removed.
 
-    See `plow_twin.model.scene` for marks, which state where a number comes from.
-
     Raises
     ------
     StudyError
@@ -125,7 +122,7 @@ def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
             raise StudyError(f"{path}: got {value!r}, expected a {'word' if words else 'number'}")
     parts: dict[str, Any] = {name: getattr(scene, name) for name in PARTS}
     loads = {load.name: load for load in scene.loads}
-    # sign and scale act on the new values of the fields
+    # signs and scales are applied last, to the new values of the other parameters
     for path, value in sorted(values.items(), key=lambda item: item[0].rsplit(".", 1)[1] in _DERIVED):
         owner, field_name = path.rsplit(".", 1)
         if path == "frame.labels":

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def require(*modules: str) -> None:
-    """Raise `ModuleNotFoundError` if a module is missing, so that a long computation does not end without a report."""
+    """Raise `ModuleNotFoundError` if a module is missing, before a long computation begins."""
     for module in modules:
         import_module(module)
 

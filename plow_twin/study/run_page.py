@@ -1,7 +1,4 @@
-"""A run as one self-contained HTML file with a summary, a picture, curves and tables.
-
-The file contains no rerun viewer, which would be too large (`docs/recording.md`).
-"""
+"""A run as one self-contained HTML file with a summary, a picture, curves and tables."""
 
 from __future__ import annotations
 
@@ -29,7 +26,7 @@ from plow_twin.view.run_curves import RunCurves
 
 Array = NDArray[np.float64]
 
-#: Largest number of rows in a table. Of further rows, only the number is shown.
+#: Largest number of rows in a table. Further rows are only counted.
 _MOST_ROWS: Final = 200
 _PADS: Final = np.array([CLEARANCE_NAMES.index(name) for name in PAD_NAMES])
 _LOADS: Final = ("Fx", "Fy", "M")

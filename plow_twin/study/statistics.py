@@ -10,11 +10,11 @@
     contact_points.ccw.2      share of the contact time of `ccw` in which exactly two corners carry force
     events, steps             number of contact changes; number of steps of the solver
 
-A path may begin with a different quantity than `max` [N]. These quantities are `mean_in_contact` [N], `mean_over_time`
-[N], `impulse` [N s], `time_in_contact` [s], `makes` (number of touches) and `wear_depth` [m]. For a group of pairs,
-`max` and `wear_depth` return the largest value. Impulses, times and touches are summed, and means are computed from the
-sums. The word `cw` selects the pairs that stop a clockwise swing. A corner is named by its letter or by its place, such
-as `top_left`. A set is written as letters (`ad`), or as places joined by `+`.
+In place of `max` [N], a path may begin with `mean_in_contact` [N], `mean_over_time` [N], `impulse` [N s],
+`time_in_contact` [s], `makes` (number of touches) or `wear_depth` [m]. For a group of pairs, `max` and `wear_depth` are
+the largest value, impulses, times and touches are sums, and means are computed from the sums. `cw` selects the pairs
+that stop a clockwise swing. A corner is named by its letter or by its place, such as `top_left`. A set is written as
+letters (`ad`), or as places joined by `+`.
 """
 
 from __future__ import annotations

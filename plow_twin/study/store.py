@@ -32,8 +32,7 @@ _CHUNK_NAME: Final = re.compile(r"\d{5,}\.npz|\.\d{5,}\.npz\.\d+")
 class Store:
     """The stored chunks of one sweep, in a folder that is created if necessary.
 
-    A chunk has `chunk` members. If the folder already contains the sweep, the stored number of members per chunk is
-    used. `fresh` deletes a sweep in the folder.
+    A chunk has `chunk` members, or as many as the chunks that are already stored. `fresh` deletes a stored sweep.
 
     Raises
     ------

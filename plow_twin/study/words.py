@@ -8,7 +8,7 @@ from typing import Final
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.study.statistics import unit_of
 
-#: Unit in pictures, and its factor from SI, by the suffix of a parameter's name. The first matching suffix is used.
+#: Unit in pictures and its factor from SI, by the first suffix that a parameter's name has.
 _ENDS: Final = {
     "_kg_m2": ("kg m²", 1.0),
     "_kg": ("kg", 1.0),

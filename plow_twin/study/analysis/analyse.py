@@ -50,16 +50,15 @@ _COLUMNS: Final = (
     *(f"force_{name}" for name in PAIR_NAMES),
     *(f"gap_{name}" for name in PAIR_NAMES),
 )
-#: Tolerance of the solver for a recording that another program has written, because such a recording states no
-#: tolerance.
+#: Tolerance of the solver for recordings of other programs.
 _TOLERANCE: Final = 1e-9
-#: Time [ns] by which a measured stamp must be older than the newest stamp to show that the clock has stepped back.
+#: A stamp that is older than the newest stamp by more than this time [ns] shows that the clock has stepped back.
 _STEP_NS: Final = 1_000_000_000
-#: Largest absolute value, in any unit, of a measurement that is used. The squares of larger values may overflow.
+#: Measured values above this number are not used, because their squares may overflow.
 _LARGEST: Final = 1e15
 _OF_THE_RUN: Final = "of the run"
 _MAP: Final = "map_"
-#: Name of a parameter that only the runs written by an analysis have in their headers.
+#: Parameter in the header of each run that an analysis has written, and of no other run.
 MAPPED_LOAD: Final = f"{_MAP}excitation"
 #: Callback that receives the share of the work done, 0..1.
 OnProgress = Callable[[float], object]
@@ -119,8 +118,8 @@ class Prediction:
     def is_of_longest(self, signal: Thinned) -> NDArray[np.bool_]:
         """Return for each measured value whether it belongs to the longest stretch.
 
-        A value belongs to the stretch that contains its stamp. If the clock has stepped back, several stretches may
-        contain the stamp. In this case, the value belongs to the stretch in which it arrived.
+        A value belongs to the stretch that contains its stamp. If several stretches contain the stamp, because the
+        clock has stepped back, the value belongs to the stretch in which it arrived.
         """
         at, rows = signal.series()
         if len(self.spans) < 2:
@@ -162,7 +161,7 @@ class Measured:
         """Add the finite numbers of a message to the signals."""
         before, newest = self._latest.get(role, (0, stamp_ns))
         back = newest - stamp_ns > _STEP_NS
-        # if the clock of the measurement steps back before the clock of the load, a new stretch begins here
+        # the clock of the measurement may step back before the clock of the load
         stretch = max(stretch, before + back)
         self._latest[role] = stretch, stamp_ns if back else max(newest, stamp_ns)
         prefix = {"forces": "force_", "gaps": "gap_"}.get(role, "")
@@ -310,8 +309,8 @@ def analyse(
     out
         Folder in which a recording of another program is converted to a run named `run`.
     tail, on_caught_up
-        A `Tail` reads a run while it is still being written. Whenever all data written so far have been read,
-        `on_caught_up` receives the intermediate result.
+        A `Tail` reads a run while it is being recorded. `on_caught_up` receives the result so far, each time the
+        analysis has read all recorded data.
 
     Raises
     ------

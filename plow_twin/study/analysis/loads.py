@@ -43,7 +43,7 @@ class Pass:
 
 
 class Series:
-    """A series of any length. Up to `_IN_MEMORY`, it is stored in memory. A longer series is stored on the disk."""
+    """A series of any length. Beyond `_IN_MEMORY` bytes, it is stored on the disk."""
 
     def __init__(self) -> None:
         self._file = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115 (goes with this object)
@@ -124,11 +124,7 @@ class LoadTotals:
         self._last = (int(stamps[-1]), *(column[-1].copy() for column in last))
 
     def _contact_loss(self, walked: Walked, steps: Array) -> Array:
-        """Return the energy [J] that the contacts dissipate between rows.
-
-        This energy is the work of the load minus the gain in energy. The work of the load between two rows is the mean
-        load of the two rows times the displacement.
-        """
+        """Return the energy [J] that the contacts dissipate between rows: the work of the load minus the gain."""
         now = walked.wrench, walked.rows.q, walked.rows.v, walked.rows.penetration
         first = (column[0] for column in now) if self._last is None else self._last[1:]
         before = [np.concatenate((one[None], column[:-1])) for one, column in zip(first, now, strict=True)]
@@ -202,8 +198,6 @@ class LoadTotals:
         if self.slide_wear:
             pieces = {piece for _, piece in self.slide_wear}
             total = np.sum(list(self.slide_wear.values()), axis=0) / len(pieces)
-            # the mean over the face equals the wear of the pads times the length of a pad, divided by the length of the
-            # face
             out["slide_mean_m"] = dict(zip(PAIR_NAMES, total.tolist(), strict=True))
             out["slide_pieces"] = len(pieces)
         return out

@@ -21,9 +21,7 @@ def _holds(folder: Path, kinds: Sequence[str] = _KINDS) -> bool:
 
 
 def _is_recording(folder: Path, results: Sequence[Path]) -> bool:
-    """Return whether a folder is one recording. Such a folder contains parts of a recording, or files but no folder
-    with a run.
-    """
+    """Return whether a folder is one recording, and not a folder of several recordings."""
     if not _holds(folder):
         return False
     if (folder / "metadata.yaml").is_file() or any(folder.glob(f"{glob.escape(folder.name)}_*")):
@@ -35,9 +33,7 @@ def _is_recording(folder: Path, results: Sequence[Path]) -> bool:
 
 
 def left_out(path: Path, results: Sequence[Path] = ()) -> list[Path]:
-    """Return the items in a folder that `expand` omits, which are empty folders, tables beside runs, and runs in a
-    run.
-    """
+    """Return the items in a folder that `expand` omits: empty folders, tables beside runs, and runs inside a run."""
     if not path.is_dir():
         return []
     folders = [item for item in sorted(path.iterdir()) if item.is_dir()]
@@ -94,10 +90,7 @@ def counted_once(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
 
 
 def _identity(path: Path) -> object:
-    """Return a key that is equal for two copies of a recording.
-
-    The key is the random id and the part number of a run, or the path of another recording.
-    """
+    """Return a key that is equal for two copies of a run."""
     try:
         header = read_header(mcap_path(path))
     except (RecordingError, OSError):  # the analysis reports the error

@@ -23,7 +23,7 @@ LEFT_OUT: Final = "left out: no recording"
 
 
 def write_report(found: Analysis, out: Path) -> None:
-    """Write all files of an analysis into the folder `out`. An error of the disk names the file."""
+    """Write all files of an analysis into the folder `out`."""
     with naming(out):
         out.mkdir(parents=True, exist_ok=True)
         facts = found.facts()

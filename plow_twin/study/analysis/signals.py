@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Largest lag [s] of the search. The lag must be smaller than a load period, because signals that are shifted by a
-#: whole period are similar.
+#: Largest lag [s] of the search, less than a load period. Signals that are shifted by a whole period are similar.
 LARGEST_LAG_S: Final = 1.0
 _FEWEST: Final = 8
 _MOST_POINTS: Final = 400_000

@@ -22,15 +22,15 @@ from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.study.analysis.analyse import MAPPED_LOAD, OnProgress, analyse
 from plow_twin.study.analysis.report import write_report
 
-#: File with the inputs of an analysis. The file is written last, so it exists only if the analysis is complete.
+#: File with the inputs of an analysis. It is written last, so it shows that the analysis is complete.
 _ASKED: Final = "asked.json"
 _FILES: Final = (_ASKED, "analysis.json", "report.html", "measured.parquet")
-#: Names of the tables. The names of tables of further scenes end in a number.
+#: Names of the tables. A number marks a table of a further scene (`--with`).
 _TABLE: Final = re.compile(r"(predicted|clearance|face|slide_wear)(_\d+)?\.parquet")
 
 
 def names_apart(paths: Sequence[Path]) -> list[str]:
-    """Return for each recording the shortest end of its path that no second path has."""
+    """Return a name for each recording: the shortest end of its path that is unique."""
     whole = [path.absolute() for path in paths]
     stems = Counter(path if path.is_dir() else path.with_suffix("") for path in whole)
     parts = [
@@ -104,7 +104,7 @@ class Task:
         self._keep(self._old(), inputs)
 
     def _old(self) -> list[Path]:
-        """Return the files of an earlier analysis; the first file is the file that marks the analysis as complete."""
+        """Return the files of an earlier analysis, beginning with `_ASKED`."""
         if self.out is None or not self.out.is_dir():
             return []
         found = sorted(path for path in self.out.iterdir() if path.name in _FILES or _TABLE.fullmatch(path.name))

@@ -35,9 +35,7 @@ OnProgress = Callable[[float, float], object]
 
 @dataclass(frozen=True)
 class Search:
-    """Numbers that limit the effort of one start, such as the number of screened points and the number of
-    generations.
-    """
+    """Limits of the effort of one start."""
 
     screen: int = 200
     population: int = 30

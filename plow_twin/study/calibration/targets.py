@@ -97,9 +97,7 @@ class Target:
 
 
 def _wrong_way(s: Array, least: Array) -> Array:
-    """Return a measure of the violation of a rise, which is the sum of all downward steps plus the missing part of the
-    rise.
-    """
+    """Return the sum of all downward steps, plus the part of the rise `least` that is missing."""
     down = np.maximum(0.0, -np.diff(s, axis=1)).sum(axis=1)
     return np.asarray(down + np.maximum(0.0, least - (s[:, -1] - s[:, 0])))
 

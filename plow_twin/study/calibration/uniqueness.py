@@ -22,11 +22,9 @@ _DISTANCE: Final = 0.1
 
 @dataclass(frozen=True)
 class Identifiability:
-    """Singular values of the Jacobian dr/dz at the optimum. Here r are the residuals, and z are the unknowns with a
-    range.
+    """Singular values of the Jacobian dr/dz of the residuals r by the unknowns z that have a range, at the optimum.
 
-    `weakest` is the singular vector of the smallest singular value. It is the combination of unknowns that the data
-    determine least.
+    `weakest` is the singular vector of the smallest value: the combination of unknowns that the data determine least.
     """
 
     paths: tuple[str, ...]

@@ -152,8 +152,7 @@ def _tested(differences: Array, mean: Array, fewest: int) -> tuple[Array, Array,
     """Return share, low, high and adjusted probability of each column. Row 0 contains values, all further rows contain
     draws.
 
-    Student's t distribution has the degrees of freedom of the smaller group, so that the probabilities are rather too
-    large.
+    Student's t distribution has the degrees of freedom of the smaller group, so the probabilities are rather too large.
     """
     drawn = np.divide(differences, mean, out=np.full_like(mean, np.nan), where=mean > 0.0)
     low, high = np.nanpercentile(drawn[1:], (2.5, 97.5), axis=0)

@@ -190,11 +190,7 @@ class _RunSums:
         self._contact.add(ends, np.hstack((work, in_contact[len(in_contact) - count :], np.ones((count, 1)))))
 
     def silent(self) -> set[int]:
-        """Return the windows that overlap a time without samples.
-
-        The first message after such a time contains the peaks and sums of the whole time. The window of this message is
-        therefore included.
-        """
+        """Return the windows that overlap a time without samples, with the window of the first message after it."""
         known, silent = np.array(sorted(self.messages.rows)), set[int]()
         for begin, end in self._silent_ns:
             first = np.searchsorted(known, begin // self._window_ns)

@@ -171,7 +171,7 @@ def simulated_impact(before: ArrayLike) -> Array:
         scene = impact_scene(state)
         motion = simulate(scene, t_end=_WHOLE, output_dt=_WHOLE)
         (vx, vy, omega), theta = motion.v[-1], motion.q[-1, 2]
-        # the centre of mass is half a metre from the origin, so even the small rotation during the impact moves it
+        # the rotation during the impact moves the centre of mass, which is half a metre from the origin
         x, y = scene.head.com_offset_m
         c, s = np.cos(theta), np.sin(theta)
         state[3:5] = _to_surface(vx - omega * (s * x + c * y), vy + omega * (c * x - s * y), ELLIPSE.tilt)

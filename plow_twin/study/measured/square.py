@@ -42,9 +42,8 @@ SQUARE: Final = np.array(
 class Marker:
     """Place of the tracked coordinate frame on the block.
 
-    Two observations show that the frame is not at the centre of the block. In 242 of 250 drops, the block lies flat at
-    rest, but its tracked angle at rest is not zero. The tracked height at rest depends on the side on which the block
-    lies.
+    The frame is not at the centre of the block: at rest, the tracked angle is not zero, and the tracked height depends
+    on the side on which the block lies.
     """
 
     #: Measured angle minus true angle of the block [rad].
@@ -81,9 +80,7 @@ MARKER: Final = Marker(-0.0308, (2.3e-4, 5.2e-4))
 
 @dataclass(frozen=True)
 class Scatter:
-    """Standard deviations of three kinds: random parts of parameters, errors of fitted speeds, and errors of measured
-    rows.
-    """
+    """Standard deviations of random parts of parameters, of fitted speeds, and of measured rows."""
 
     #: Variation from touch to touch: restitution [1], logarithm of the friction, and place along the table where the
     #: force acts [m].
@@ -186,9 +183,7 @@ def _free_flight(block: NDArray[np.void], axis: int, times: Array) -> tuple[Arra
 
 
 def _leaves_flight(rows: Array) -> bool:
-    """Return whether the last row follows an impact, which shows by a deviation of the angle from a line or by a rise
-    after a fall.
-    """
+    """Return whether the last row follows an impact: its angle deviates from a line, or it rises after a fall."""
     t = np.arange(-3.0, 1.0)
     turn = float(np.polyval(np.polyfit(t[:3], rows[-4:-1, 2], 1), t[3]))
     return bool(
