@@ -122,7 +122,6 @@ def _alone(task: Any, quiet: bool) -> dict[str, Any]:
 
 
 def _run(tasks: list[Any], workers: int, dask: str | None, quiet: bool) -> list[dict[str, Any]]:
-    """Analyse recordings on all cores or on a cluster. Results that an interrupted command has written are used."""
     from plow_twin.study.analysis.many import run_many
 
     with progress("analysing", quiet) as on_progress:
@@ -176,7 +175,6 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
 
 def _show_contacts(console: Console, results: Sequence[dict[str, Any]]) -> None:
     shown = table("Contacts computed", "run", "time [s]", "impacts [1/min]", "largest force [kN]", "at")
-    # the name of a run may be long, so it is wrapped
     shown.columns[0].no_wrap, shown.columns[0].overflow = False, "fold"
     for facts in results:
         loads = facts["loads"]

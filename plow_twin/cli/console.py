@@ -139,7 +139,7 @@ def busy(title: str, quiet: bool) -> Iterator[None]:
 
 
 def table(title: str, *columns: str) -> Table:
-    """Return a table in which the first column contains text, and all columns after it contain numbers."""
+    """Return a table with a first column of text and further columns of numbers."""
     result = Table(title=title, title_justify="left")
     for index, name in enumerate(columns):
         result.add_column(name, justify="left" if index == 0 else "right", no_wrap=index == 0)
@@ -147,10 +147,7 @@ def table(title: str, *columns: str) -> Table:
 
 
 def show_facts(console: Console, facts: Mapping[Any, Any], indent: int = 0) -> None:
-    """Print each fact on a line, without wrapping of long texts.
-
-    If the value of a fact is a mapping, the items of the mapping are printed as indented lines.
-    """
+    """Print each fact on a line. The items of a mapping are printed as indented lines."""
     for key, value in facts.items():
         name = " " * indent + str(key)
         if isinstance(value, Mapping) and value:

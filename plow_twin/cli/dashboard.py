@@ -42,10 +42,7 @@ dashboard_option = click.option("--dashboard", is_flag=True, help="Show the run 
 
 
 def access_of(options: dict[str, Any]) -> PageAccess:
-    """Return the address and the token of the page from the options.
-
-    If an option is invalid, `PageAccess.of` or `listening` raises an error.
-    """
+    """Return the address and the token of the page. Raise `DashboardError` if they cannot be used."""
     from plow_twin.dashboard.access import PageAccess, listening
 
     access = PageAccess.of(options["listen"], options["token_file"])
@@ -54,9 +51,9 @@ def access_of(options: dict[str, Any]) -> PageAccess:
 
 
 def access_if_shown(options: dict[str, Any]) -> PageAccess | None:
-    """Return the result of `access_of`, or None without the option `--dashboard`.
+    """Return the result of `access_of`, or None without `--dashboard`.
 
-    Without the option `--dashboard`, the options `--listen` and `--token-file` are errors.
+    Raise an error if `--listen` or `--token-file` is given without `--dashboard`.
     """
     if options["dashboard"]:
         return access_of(options)

@@ -188,10 +188,7 @@ def _measured(source: Path, scene: Path | None, mapping: Path | None, folder: bo
 
 
 def _load_of(measured: Measured) -> tuple[Load, int]:
-    """Return the load and the number of unusable rows.
-
-    If the load was not measured, the returned load is zero during the measured poses or gaps.
-    """
+    """Return the load and the number of unusable rows. A load that was not measured is zero."""
     from plow_twin.estimate.measurements import Load
 
     if len(measured.load):

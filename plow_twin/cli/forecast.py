@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
 
 
-#: Smallest plausible ratio of a limit to the clearance. If the ratio is smaller, the limit was probably given in m, not
-#: in mm.
+#: Ratio of a limit to the clearance below which the limit was probably given in m instead of mm.
 _METRES: Final = 1e-2
 
 
@@ -156,10 +155,7 @@ def _check_limits(limits_m: tuple[float, float], scene: Scene) -> None:
 
 
 def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
-    """Return the scene, the last estimate, and the losses of the journal.
-
-    If `name` is a run, the scene at the end of the run is returned. If `name` is not a run, the estimate is None.
-    """
+    """Return a scene, or the scene at the end of a run, with its last estimate and the losses of its journal."""
     from plow_twin.record.estimated import left_by
     from plow_twin.record.reader import RunReader, own_run
     from plow_twin.scene_file import load_scene

@@ -11,7 +11,7 @@ from typing import Final
 
 from plow_twin.live.stop import stop_signals
 
-#: Time after a signal in which a verb must end [s]. After this time, the process is ended.
+#: Time after a signal in which a verb must end [s].
 PATIENCE_S: Final = 3.0
 
 
@@ -19,8 +19,8 @@ PATIENCE_S: Final = 3.0
 def interruptible(on_overdue: Callable[[], object] = lambda: None) -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether a stop signal has arrived.
 
-    If the context has not ended `PATIENCE_S` seconds after the signal, `on_overdue` is called and the process ends with
-    exit code 1. The process is ended because a library that waits for a viewer cannot be interrupted.
+    If the context has not ended `PATIENCE_S` seconds after the signal, because a library is waiting, `on_overdue` is
+    called and the process ends with exit code 1.
     """
     asked, done = threading.Event(), threading.Event()
     receive, send = os.pipe()

@@ -21,8 +21,7 @@ class Report:
     """Printer of reports.
 
     Status and alarms are printed as text when they change, unless `quiet` is true. With `lines`, all parts are printed
-    as JSON lines. An alarm is reported when it is raised and when it is acknowledged. If the reader is slow, lines are
-    dropped and counted, so that the twin is not delayed.
+    as JSON lines. If the reader is slow, lines are dropped and counted, so that the twin is not delayed.
     """
 
     def __init__(self, *, lines: bool, quiet: bool, stamp_ns: Callable[[], int]) -> None:

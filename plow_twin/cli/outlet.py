@@ -16,8 +16,7 @@ _PATIENCE_S: Final = 2.0
 class Outlet:
     """Queue of lines that a separate thread writes in order.
 
-    The function `write` writes a line and returns whether the write succeeded. The function `on_loss` is called when
-    the first line is dropped.
+    `write` writes a line and returns whether it succeeded. `on_loss` is called when the first line is dropped.
     """
 
     def __init__(self, write: Callable[[str], bool], on_loss: Callable[[], object] = lambda: None) -> None:

@@ -1,7 +1,4 @@
-"""List the numbers of a scene, and quantities that are derived from the numbers.
-
-The *mark* of a number states whether the number is given, measured, reconstructed or assumed.
-"""
+"""List the numbers of a scene, and quantities that are derived from the numbers."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ Fact = dict[str, Any]
 
 
 def numbers(scene: Scene) -> list[Fact]:
-    """Return the key, value, unit, mark and source of each number of a scene, including the numbers in lists."""
+    """Return the key, value, unit, mark and source of each number of a scene."""
     rows = [row for key in SECTIONS for row in _numbers_of(getattr(scene, key), key, scene)]
     for index, load in enumerate(scene.loads):
         rows += _numbers_of(load, f"loads[{index}]", scene)

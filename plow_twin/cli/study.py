@@ -25,10 +25,7 @@ def study() -> None:
 
 
 def paper_command() -> click.Command:
-    """Return the verb `paper` of the package `plow_twin_paper`, which may be installed or in a clone.
-
-    If the package is missing, the returned verb raises an error that explains the installation.
-    """
+    """Return the verb `paper` of the package `plow_twin_paper`, or a verb that explains how to install the package."""
     if CLONE.is_dir() and str(CLONE) not in sys.path:
         sys.path.append(str(CLONE))
     try:

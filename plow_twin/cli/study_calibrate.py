@@ -113,10 +113,9 @@ def calibrate(
 
 
 def _merged(proposed: Sequence[str], given: Sequence[str]) -> tuple[str, ...]:
-    """Return the unknowns in the target file, `proposed`, after changes by the unknowns of the user, `given`.
+    """Return the unknowns of the user, `given`, and those of the target file, `proposed`, that they do not replace.
 
-    An unknown of the user replaces the unknown of the same parameter. Damping and restitution count as one parameter.
-    The text `PATH=fixed` removes an unknown.
+    Damping and restitution count as one parameter. The text `PATH=fixed` removes an unknown.
     """
     paths = {text.partition("=")[0] for text in given}
     if paths & {"contact.damping", "contact.restitution"}:

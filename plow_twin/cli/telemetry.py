@@ -51,7 +51,7 @@ def telemetry_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def ways_of(options: dict[str, Any]) -> list[WayOut]:
-    """Return the receivers that the options request. If an option is invalid, `telemetry.access` raises an error."""
+    """Return the receivers that the options request."""
     if options["sparkplug"] and not options["mqtt_out"]:
         raise click.UsageError("--sparkplug: expected --mqtt-out with the broker")
     if not any(options[name] for name in ("mqtt_out", "influx", "opcua")):

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from plow_twin.view.rrd import ViewSummary
 
 
-#: Largest factor by which a drawing enlarges the clearance. A larger factor would draw the cavity far from the frame.
+#: Largest factor by which a drawing enlarges the clearance.
 _MOST_EXAGGERATED = 1e4
 
 
@@ -146,10 +146,7 @@ def _still(run: Path, png: Path | None, html: Path | None) -> tuple[FileStatus, 
 def _made_run(
     recording: Path, scene: str | None, mapping: Path | None, units: dict[str, str], quiet: bool
 ) -> Iterator[tuple[Path, bool]]:
-    """Yield a run that the model computes from a recording of another program.
-
-    The second value is True if a part of the recording could not be used.
-    """
+    """Yield a run computed from a recording of another program, and whether a part of the recording was not used."""
     from tempfile import TemporaryDirectory
 
     from plow_twin.study.analysis.analyse import analyse
@@ -202,8 +199,8 @@ def _serve(file: Path, port: int) -> int:
     command = [program, str(file), "--serve-web", "--bind", LOOPBACK, "--port", str(data_port)]
     click.echo(f"serving until interrupted: {page_address(port, data_port)}")
     sys.stdout.flush()
-    # The program replaces this process, so that the program receives the signals. Only errors are logged, because the
-    # address of the page in the log selects the light theme, in which labels cannot be read.
+    # The program replaces this process and so receives its signals. Its log would print an address of the page with
+    # the light theme, in which labels cannot be read.
     os.execve(program, [*command, "--web-viewer-port", str(port)], {"RUST_LOG": "error", **os.environ})
 
 
