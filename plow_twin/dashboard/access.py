@@ -38,10 +38,9 @@ class PageAccess:
 
     @classmethod
     def of(cls, listen: str, token_file: Path | None) -> PageAccess:
-        """Return the access for HOST:PORT. The token is the first line of a file, or is taken from the environment.
+        """Return the access for HOST:PORT, with the token in the first line of a file or in the environment.
 
-        `DashboardError` is raised if the address cannot be parsed. It is raised if there is no token although machines
-        in the network can reach the address.
+        Raise `DashboardError` if the address is invalid, or if other machines can reach it without a token.
         """
         try:
             parts = urlsplit(f"//{listen}")

@@ -1,4 +1,4 @@
-"""State of the server of the screen. It consists of the newest values, and of the history of the last hour."""
+"""State of the server of the screen: the newest values, and the history of the last hour."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Board:
         self._history = History()
         self._not_taken = 0
         self._updated_s = time.monotonic()
-        #: Event that is set by the next update. Each update replaces the event by a new event.
+        #: Event that the next update sets and replaces.
         self.news = asyncio.Event()
         self.pages = 0
 
@@ -51,7 +51,7 @@ class Board:
         news.set()
 
     def since(self, version: int) -> dict[str, Any]:
-        """Return all values that are newer than the update `version`. If `version` is 0, return all values."""
+        """Return all values that are newer than the update `version`."""
         found: dict[str, Any] = {
             "version": self.version,
             "age": round(time.monotonic() - self._updated_s, 2),

@@ -1,4 +1,4 @@
-"""Feed of a separate process. The feed collects the publications of a twin, and sends updates at a fixed rate.
+"""Sender of a twin's newest values and peaks to a separate process, at a fixed rate.
 
 If an update does not fit in the buffer of the link, its peaks and newest values become part of the next update.
 """
@@ -28,8 +28,7 @@ _LONGEST: Final = 1000
 #: Largest number of operator requests that are handled in one call.
 _MOST_ASKED: Final = 8
 _NO_LOAD: Final = np.full(3, np.nan)
-#: States of a clearance that has a measured value. The names are repeated here, because the import of the package
-#: `estimate` takes long.
+#: States of a clearance that has a measured value, written out because the import of `estimate` takes long.
 _KNOWN_STATES: Final = ("estimated", "rough")
 
 
@@ -190,7 +189,7 @@ class Feed:
     def part(self, name: str, part: Part) -> None:
         """Add a status, which replaces the previous status with the same name."""
         level, message, values = part
-        # the diagnostics have a part with the name of this topic, which is recognised by its key `estimates`
+        # the diagnostics have a part `estimate` too, with the key `estimates`
         if name == "estimate" and "estimates" not in values:
             self._sum_up()  # publications before the estimate come first
             self.motion.estimate = values
@@ -205,7 +204,7 @@ class Feed:
         del self._events[:-_EVENTS]
 
     def turn(self) -> None:
-        """Handle operator requests and send an update. This method must be called at the rate of the updates."""
+        """Handle operator requests and send an update. Call this method at the rate of the updates."""
         self.hear()
         self.send()
         if self._link.broken and not self._ended:
@@ -263,7 +262,7 @@ def _joined(rows: list[NDArray[np.void]], name: str) -> NDArray[Any]:
 
 
 def part_of(message: Message) -> Part:
-    """Convert a status or named numbers to the form that the page reads. Peaks represent the contact forces."""
+    """Convert a status or named numbers to the form that the page reads."""
     if isinstance(message, DiagnosticStatus):
         return message.level, message.message, dict(message.values)
     if not isinstance(message, JointState):

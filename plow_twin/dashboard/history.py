@@ -1,4 +1,4 @@
-"""History of the last hour for the screen. It contains the extremes in each second of the stamps."""
+"""History of the last hour for the screen: the extremes in each second of the stamps."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ _CLEARANCES: Final = tuple(f"{name}{point}" for name in ("horizontal", "vertical
 class History:
     """The seconds of the last hour. A page can request the seconds that have changed since its last update.
 
-    A second is a list of the time [s], eight peaks, six extremes of the load, six clearances, and the hold flag. The
-    hold flag is True if the load had no new samples. If the intervals of the peaks are known, the list ends with the
-    5 % and the 95 % points of the peaks.
+    A second is a list of the time [s], eight peaks, six extremes of the load, six clearances, and 1 if the load was
+    held. If the intervals of the peaks are known, the list ends with the 5 % and the 95 % points of the peaks.
     """
 
     def __init__(self) -> None:

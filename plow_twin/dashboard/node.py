@@ -43,8 +43,7 @@ _SHOWN: Final = (
 )  # fmt: skip
 #: Longest time to wait for the answer of a service [s].
 _PATIENCE_S: Final = 5.0
-#: Depths of the queues. The first depth is for topics from which only the newest message is needed. The second depth is
-#: for topics from which all messages are needed.
+#: Depths of the queues for topics from which only the newest message is needed, or all messages.
 _NEWEST, _ALL = 1, 1000
 
 
@@ -82,12 +81,9 @@ class NodeWatch:
         self._executor.spin_once(timeout_sec=0.1)
 
     def facts(self, scene: str | None) -> dict[str, Any]:
-        """Return the facts of the node.
+        """Return the facts of the node. If its scene file cannot be read on this machine, `scene` is needed.
 
-        The argument `scene` is needed if the scene file of the node cannot be read on this machine. It replaces the
-        scene of the node.
-
-        `DashboardError` is raised if the node does not answer. `SceneError` is raised if the scene cannot be read.
+        Raise `DashboardError` if the node does not answer, and `SceneError` if the scene cannot be read.
         """
         answer = self._called(self._ask, GetParameters.Request(names=list(_SHOWN)))
         if answer is None:

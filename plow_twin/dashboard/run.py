@@ -65,7 +65,7 @@ class RunFeed:
             self._feed.motion.was_held |= self._feed.motion.held
             while not (self._feed.send() or self._stopped()):
                 time.sleep(_WAIT_S)
-        self._say(batch)  # this call is the last, because an estimate replaces earlier clearances
+        self._say(batch)  # last, because an estimate replaces earlier clearances
 
     def _counted(self) -> dict[str, str]:
         others = self._inputs.facts()
@@ -110,10 +110,7 @@ def _within(rows: Rows, second: int) -> Rows:
 
 
 def show_run(path: Path, access: PageAccess, stopped: Callable[[], bool], on_open: Callable[[Screen], object]) -> None:
-    """Show a recording until `stopped` returns True. The function `on_open` receives the screen.
-
-    The recording may still be in progress.
-    """
+    """Show a recording, which may be in progress, until `stopped` returns True. `on_open` receives the screen."""
     reader = RunReader(path, Tail(stopped))
     header = reader.header
     with Screen(access, facts_of(header.scene(reader.path), header.parameters, str(path))) as screen:

@@ -1,4 +1,4 @@
-"""The operator's screen of a twin. It consists of a server process, and of a feed that sends updates to the server."""
+"""The operator's screen of a twin: a server process, and the feed that sends updates to it."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from plow_twin.dashboard.feed import Array, Feed
 class Screen(Beside):
     """Context manager that runs the server of the screen and the feed.
 
-    The arguments that are passed on are described in `Feed`. `DashboardError` is raised if the address cannot be used.
-    `ModuleNotFoundError` is raised if a library of the server is not installed.
+    The arguments after `access` are those of `Feed`. Raise `DashboardError` if the address cannot be used, and
+    `ModuleNotFoundError` if a library of the server is not installed.
     """
 
     def __init__(

@@ -1,7 +1,6 @@
 """Server of the screen, run as a separate process: `python -m plow_twin.dashboard.server LINK SOCKET`.
 
-A page receives a new update only after it has received the previous update. A slow page therefore receives fewer
-updates, and does not delay the updates of any other page.
+A slow page receives fewer updates, and does not delay other pages.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from plow_twin.dashboard.board import Board
 from plow_twin.dashboard.link import Link
 
 PAGE: Final = Path(__file__).with_name("page")
-#: Largest number of open pages. If the number is reached, new pages are refused.
+#: Largest number of open pages.
 MOST_PAGES: Final = 50
 #: Longest time in which a page must receive an update or send its token [s].
 _PATIENCE_S: Final = 20.0
@@ -56,7 +55,7 @@ class Guard:
         self._app, self._access = app, access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request to the application, or refuse the request."""
+        """Pass a request to the application, or refuse it."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return

@@ -1,7 +1,4 @@
-"""Compare the forces of a demo with the true forces, which are the forces of the synthetic machine.
-
-The compared forces are the forces of the twin and the forces of the nominal scene.
-"""
+"""Compare the forces of the twin and of the nominal scene with the true forces of the synthetic machine."""
 
 from __future__ import annotations
 
@@ -48,7 +45,7 @@ class Comparison:
 
 
 def compare_forces(run: Path, wider_m: float) -> Comparison | None:
-    """Compare the forces of a run with the forces of a machine whose clearances are larger by `wider_m` [m].
+    """Compare the forces of a run with those of a machine whose clearances are larger by `wider_m` [m].
 
     The result is None if the run has no forces.
     """

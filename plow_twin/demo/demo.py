@@ -125,7 +125,7 @@ def _run(
         "scene": _worn_scene(folder),
         "record_path": (folder / "run").resolve(),
         "expected_rate": _RATE_HZ,
-        # the queues are long enough that no sample is lost on a busy machine
+        # no sample is lost on a busy machine
         "qos_overrides./excitation.subscription.reliability": "reliable",
         "input_depth": QUEUE,
         "excitation_timeout": 60.0,  # longer than the run, so that the hold policy is never applied
@@ -183,7 +183,7 @@ def _follow(source: Child, twin: Child, watch: Watch, spin: Any, bar: Progress, 
         now = watch.number("state", "model_time_s")
         if now > reached:
             moved, reached = time.monotonic(), now
-        # the wait for the first sample is longer, because the publisher starts slowly on a busy machine
+        # on a busy machine, the publisher starts slowly
         elif time.monotonic() - moved > (patience := _STUCK_S if reached else _START_TIMEOUT_S):
             raise DemoError(f"no progress for {patience:g} s at model time {reached:g} s\n{twin.output()}")
         bar.update(task, completed=reached)
@@ -201,7 +201,7 @@ def _until(name: str, reached: Any, spin: Any, twin: Child, timeout_s: float) ->
 
 
 class Child:
-    """A process of the demo. The output of the process is written to a file."""
+    """A process of the demo, whose output is written to a file."""
 
     def __init__(self, arguments: list[str], log: Path) -> None:
         self._name = arguments[0]

@@ -1,7 +1,6 @@
 """The program `excitation_publisher`: a scene's load as samples on `excitation`, in real time or as fast as possible.
 
-With `--sensor`, the program publishes synthetic measurements on `head_pose`, in addition to the load. They are the pose
-of a head in a wider guide, with the noise of a sensor, so that the true clearance is known. With `--cutting`, a
+With `--sensor`, the program also publishes noisy poses of a head in a wider guide on `head_pose`. With `--cutting`, a
 stochastic cutting load is added, and the speed along the face is published on `travel`.
 
 At the speed `real`, each sample is sent at its time on the steady clock. A late sample is sent immediately. At the
@@ -49,7 +48,7 @@ from plow_twin.stream.intake import NS_PER_S
 FIRST_STAMP_NS: Final = NS_PER_S
 #: Largest number of samples without an answer at the speed `fast`.
 WINDOW: Final = 200
-#: Number of samples by which a reliable reader may be late. At 1 kHz, the number corresponds to 100 s.
+#: Number of samples by which a reliable reader may be late, 100 s at 1 kHz.
 QUEUE: Final = 100_000
 _CLOCK_EVERY: Final = 10
 _TRAVEL_S: Final = 0.1
@@ -58,7 +57,7 @@ _POSE_HZ: Final = 100.0
 _POSE_NOISE: Final = np.array([5e-4, 5e-4, 2e-3])
 #: Time without an answer after which samples are counted as lost [s].
 _STALL_S: Final = 2.0
-#: Layout of the first bytes of a serialised message with a stamp. Four bytes of encapsulation precede sec and nanosec.
+#: Layout of a serialised message up to its stamp: four bytes of encapsulation, sec and nanosec.
 _STAMP: Final = struct.Struct("<4xiI")
 
 

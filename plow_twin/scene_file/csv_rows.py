@@ -36,10 +36,7 @@ def open_csv(path: Path) -> IO[str]:
 
 
 def tables(folder: Path) -> list[Path]:
-    """Return the CSV and Parquet files of a folder, sorted by name.
-
-    A Parquet file with the name of a CSV file is omitted.
-    """
+    """Return the CSV files of a folder, and the Parquet files without a CSV file of the same name, sorted by name."""
     found = {path.stem: path for ending in (SUFFIX, ".csv") for path in folder.glob(f"*{ending}")}
     return [found[name] for name in sorted(found)]
 
@@ -54,10 +51,7 @@ _OTHERS: Final = {
 
 
 def check_text(begin: bytes) -> None:
-    """Raise a `csv.Error` if the first bytes are those of UTF-16 text, a workbook or an archive.
-
-    Spreadsheets save UTF-16 text as "Unicode text".
-    """
+    """Raise a `csv.Error` if the first bytes are those of UTF-16 text, a workbook or an archive."""
     for first, kind in _OTHERS.items():
         if begin.startswith(first):
             raise csv.Error(f"got {kind}, expected UTF-8 (export a spreadsheet as CSV UTF-8)")

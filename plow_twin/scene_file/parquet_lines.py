@@ -15,13 +15,11 @@ if TYPE_CHECKING:
 
 SUFFIX: Final = ".parquet"
 _ROWS: Final = 4096
-#: Largest number of rows per byte of a file. Without this limit, a few compressed bytes could contain any number of
-#: rows.
+#: Largest number of rows per byte of a file, because a few compressed bytes can contain any number of rows.
 _MOST_PER_BYTE: Final = 100
 #: Number of rows that is always accepted.
 _ALWAYS: Final = 1_000_000
-#: Largest size [B] of an unpacked column in a row group, which must fit into memory. Most writers make row groups of
-#: 128 MB.
+#: Largest size [B] of an unpacked column in a row group, which must fit into memory.
 _LARGEST_COLUMN: Final = 2**29
 #: Largest number of columns.
 _MOST_COLUMNS: Final = 10_000
@@ -35,11 +33,10 @@ def is_parquet(path: Path) -> bool:
 
 
 class ParquetLines(io.RawIOBase):
-    """A Parquet file that is read as UTF-8 text. The first line contains the names of the columns. A line for each row
-    follows.
+    """A Parquet file that is read as UTF-8 text: a line with the names of the columns, then a line for each row.
 
-    Numbers are written without loss of digits. Times with a zone are written in UTC. Times without a zone are written
-    unchanged. A missing value gives an empty cell. Columns of lists, structures or bytes are omitted.
+    Numbers are written without loss of digits, and times with a zone in UTC. A missing value gives an empty cell.
+    Columns of lists, structures or bytes are omitted.
 
     Raises
     ------

@@ -31,8 +31,7 @@ from plow_twin.scene_file.validation import validate
 from plow_twin.scene_file.yaml_text import load_yaml, read_yaml
 
 _SECTIONS: Final = "the sections of a scene"
-#: Valid parts that replace parts with problems, so that a `Scene` can be built. The `Scene` finds conflicts between the
-#: parts without problems.
+#: Valid parts in place of parts with problems, so that a `Scene` can report conflicts between the other parts.
 _SOUND: Final[Mapping[str, Any]] = MappingProxyType(
     {
         "head": Head(1.0, 1.0),

@@ -1,7 +1,6 @@
 """JSON Schema of the scene file, made from the dataclasses of `plow_twin.model.scene`.
 
-A number or a list of numbers may be replaced by a mapping `{value, mark, source}`. The samples of a table cannot be
-replaced by a mapping.
+A number or a list of numbers, except the samples of a table, may be a mapping `{value, mark, source}`.
 """
 
 from __future__ import annotations

@@ -56,12 +56,12 @@ class _Shown:
 NOTHING: Final = _Shown("nothing")
 #: Largest length of a value or a name in a message, in characters.
 _LONGEST: Final = 200
-#: Largest number of reported problems. For each problem, the search for the most similar known key takes time.
+#: Largest number of reported problems.
 MOST_PROBLEMS: Final = 50
 
 
 def validate(raw: Any, schema: Schema, name: str) -> list[Problem]:
-    """Return the problems of plain data in the order of the schema. In messages, the name of the data is `name`."""
+    """Return the problems of plain data in the order of the schema. Messages call the data `name`."""
     problems = (problem for error in _validator()(schema).iter_errors(raw) for problem in _explain(error, name))
     # jsonschema reports one error for each missing key, and `_explain` yields all missing keys for each error
     unique: dict[str, Problem] = {}
@@ -111,10 +111,7 @@ def _explain(error: ValidationError, whole: str) -> Iterator[Problem]:
 
 
 def _closest_branch(key: str, error: ValidationError, whole: str) -> Iterator[Problem]:
-    """Yield the problems of the `anyOf` branch for the type of the value.
-
-    Without such a branch, yield one problem of the key.
-    """
+    """Yield the problems of the `anyOf` branch for the type of the value, or one problem of the key."""
     branches: dict[Any, list[ValidationError]] = {}
     for inner in error.context or ():
         branches.setdefault(inner.schema_path[0], []).append(inner)

@@ -1,8 +1,7 @@
 """Reader and writer of YAML. The reader limits size and nesting, because files may be malicious.
 
-Scalars follow the YAML 1.2 core schema. The limits are checked on the events of the parser, before a document is built.
-The reason is that libyaml recurses in C for nested collections, and that a few lines with aliases can expand to any
-number of values.
+Scalars follow the YAML 1.2 core schema. The limits are checked on the events of the parser, before a document is built,
+because libyaml recurses in C, and a few aliases can expand to any number of values.
 """
 
 from __future__ import annotations
@@ -189,7 +188,6 @@ def dump_yaml(data: Any, *, flow: bool = True) -> str:
 
 def _repeated_keys(node: yaml.Node, path: str) -> Iterator[Problem]:
     if isinstance(node, yaml.SequenceNode):
-        # scalars are skipped, because they have no keys; the search in long tables is therefore fast
         for index, item in enumerate(node.value):
             if not isinstance(item, yaml.ScalarNode):
                 yield from _repeated_keys(item, f"{path}[{index}]")

@@ -18,8 +18,7 @@ from plow_twin.view.columns import Array, Batches, Indexes, TimeAxis
 ENTITY: Final = "contact_set"
 FREE: Final = "free"
 Color = tuple[int, int, int]
-#: Colours of four kinds of sets: no contact, contacts that stop a ccw rotation, contacts that stop a cw rotation,
-#: contacts of both kinds.
+#: Colours of sets: no contact, contacts that stop a ccw rotation, contacts that stop a cw rotation, and both.
 _COLORS: Final[tuple[Color, ...]] = ((235, 235, 235), (86, 180, 233), (240, 160, 60), (204, 121, 167))
 _CCW_BITS: Final = int((STOPS_COUNTER_CLOCKWISE.astype(np.int64) << np.arange(PAIR_COUNT)).sum())
 
@@ -66,10 +65,7 @@ class ContactSets:
         )
 
     def name(self, mask: int) -> str:
-        """Return the name of a set of pairs.
-
-        The name contains the corners that stop a ccw rotation, followed by the corners that stop a cw rotation.
-        """
+        """Return the name of a set of pairs, such as `ccw a+d, cw b`."""
         parts = []
         for word, bits in (("ccw", mask & _CCW_BITS), ("cw", mask & ~_CCW_BITS)):
             corners = sorted(self._names[corner] for corner in range(4) if bits >> 2 * corner & 3)

@@ -32,8 +32,7 @@ from plow_twin.view.residuals import Residuals
 from plow_twin.view.section import ARROW_MM_PER_N, LABEL_MM, LOAD_COLOR, PAIR_COLORS, Section
 from plow_twin.view.what_if import WhatIf
 
-#: Largest drawn difference between the recorder's clock and a stamp [ns]. A larger difference shows that stamps come
-#: from a different clock.
+#: Largest drawn age of a sample [ns]. A larger age shows that the stamps come from another clock than the recorder's.
 _LARGEST_AGE_NS: Final = 3_600_000_000_000
 _GREY: Final = (150, 155, 165)
 _WHITE: Final = (235, 235, 235)
@@ -294,10 +293,7 @@ class Drawing:
             self.measured.add(np.array(stamps), np.array(places), 1e3 * np.array(poses))
 
     def _growth_m(self, numbers: Array) -> Array:
-        """Return the growth of the clearances by wear [m], with its interval, in the order of `layout.GROWTH`.
-
-        Estimates and parameter changes have no effect on the result.
-        """
+        """Return the growth of the clearances by wear [m], with its interval, in the order of `layout.GROWTH`."""
         new = clearances(self._scene, np.zeros(PAIR_COUNT))[:2]
         best, low, high = (clearances(self._scene, numbers[:, pads])[:, :2] - new for pads in _PAD_POINTS)
         return np.concatenate((best, np.stack((low, high), axis=2).reshape(len(numbers), 4)), axis=1)
@@ -323,10 +319,7 @@ class Drawing:
         self.band.add(stamps, steps, np.where(bound[:, None], sides[:, :, 1], sides[:, :, 0]))
 
     def _color_bands(self, stamps: Indexes, steps: Indexes) -> None:
-        """Set the colours of the bands.
-
-        The first stroke is opaque, because the legend shows its colour. All later strokes are faint.
-        """
+        """Set the colours of the bands: an opaque first stroke, whose colour the legend shows, and faint strokes."""
         behind = int(np.searchsorted(stamps, stamps[0] + 2 * self.band.span_ns))
         changes = [0, min(max(1, behind), len(stamps) - 1)]
         for entity in layout.BAND:

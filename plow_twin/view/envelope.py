@@ -12,8 +12,7 @@ Indexes = NDArray[np.int64]
 
 #: Largest number of rows that are stored without bins.
 MOST_ROWS: Final = 8000
-#: Largest number of bins, about one for each pixel. With narrower bins, the picture would show a beat between bins and
-#: load period.
+#: Largest number of bins, about one for each pixel.
 _MOST_BINS: Final = 700
 
 

@@ -1,7 +1,4 @@
-"""Chart of the largest contact force along the face, for each pass.
-
-The face is divided into pieces of equal length. The chart shows the largest force of each pass in each piece.
-"""
+"""Chart of the largest contact force in each piece of the face, for each pass."""
 
 from __future__ import annotations
 
@@ -30,7 +27,7 @@ _EARLIER: Final = (90, 110, 130)
 
 
 class FaceChart:
-    """Chart of the forces along the face. The attribute `known` is true once the head has moved along the face."""
+    """Chart of the forces along the face. `known` is true once the head has moved along the face."""
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis) -> None:
         self._lines = Batches(stream, axis, "face/force", rr.LineStrips2D, ("strips", "colors"))

@@ -32,13 +32,12 @@ AGE: Final = ("quality/sample_age_ms",)
 INTERVAL: Final = ("quality/sample_interval_ms",)
 TOTAL: Final = tuple(f"clearance/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
 GROWTH: Final = tuple(f"growth/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
-#: Areas between the bounds of a clearance. The names of the areas sort before the names of the clearances, so that the
-#: curves are drawn on top of the areas.
+#: Areas between the bounds of a clearance. Their names sort before those of the curves, which are drawn on top of them.
 BAND: Final = tuple(f"{group}/band/{way}" for group in ("clearance", "growth") for way in ("horizontal", "vertical"))
 RESIDUAL: Final = ("residual/x", "residual/y", "residual/theta")
 WEAR: Final = tuple(f"wear/{name}" for name in CLEARANCE_NAMES if name.startswith("pad_"))
 
-#: Contents of a view without the bounds. The bands already show the bounds, and a legend has room for eight names only.
+#: Contents of a view without the bounds, which the bands show. A legend has room for only eight names.
 _WITHOUT_BOUNDS: Final = (
     "$origin/**",
     *(f"- $origin/{name}" for name in CLEARANCE_NAMES if name.endswith(("/p05", "/p95"))),
@@ -56,8 +55,7 @@ _WHAT_IF_COLORS: Final = (
     (204, 121, 167),
     (240, 228, 66),
 )
-#: Opacity of a stroke of a band (255: opaque). Several wide, faint strokes overlap at each pixel and give an even area
-#: without stripes.
+#: Opacity of a stroke of a band (255: opaque). Several faint strokes overlap at each pixel.
 _BAND_ALPHA: Final = 10
 _BAND_WIDTH: Final = 6.0
 _CLEARANCE_COLORS: Final = {"horizontal": (86, 180, 233), "vertical": (240, 160, 60)}
@@ -134,7 +132,6 @@ def _plot(
     legend: rrb.Corner2D = rrb.Corner2D.RightTop,
     contents: Sequence[str] = ("$origin/**",),
 ) -> rrb.TimeSeriesView:
-    # rerun draws a legend only in a corner inside the plot
     return rrb.TimeSeriesView(origin=origin, contents=list(contents), name=name, plot_legend=legend)
 
 

@@ -203,10 +203,7 @@ def _curves(
 
 
 def _widest(times: NDArray[np.float64], begin: float, end: float) -> int:
-    """Return the index after the longest step that overlaps a gap from `begin` to `end` [s].
-
-    The result is `len(times)` if no step overlaps the gap.
-    """
+    """Return the index after the longest step that overlaps a gap from `begin` to `end` [s], or `len(times)`."""
     steps = np.where((times[1:] > begin) & (times[:-1] < end), np.diff(times), 0.0)
     return int(steps.argmax()) + 1 if steps.any() else len(times)
 

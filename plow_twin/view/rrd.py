@@ -67,8 +67,6 @@ def to_rrd(
 ) -> ViewSummary:
     """Write a complete or truncated recording as a rerun file.
 
-    Only a few chunks of the recording are in memory at a time.
-
     Parameters
     ----------
     path

@@ -173,10 +173,7 @@ class RunCurves:
             self._break_lines()
 
     def _failed(self, stamp_ns: int, since_ns: int, advances: int) -> None:
-        """Add a series of failed advances.
-
-        The first call is for the first advance of the series, and the last call for all remaining advances.
-        """
+        """Add failed advances. The first entry of a series is for its first advance, the second for all others."""
         first = self.first_ns or 0
         self.failed += advances
         if stamp_ns == since_ns:

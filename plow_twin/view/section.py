@@ -82,8 +82,7 @@ class Section:
     def corners(self, pose: Iterable[float] = (0.0, 0.0, 0.0)) -> Array:
         """Corners of the frame, or of a block at a pose, in the order of `CORNER_NAMES`, shape (4, 2).
 
-        The corners of a block are named by their present place. The names at the corners of a block therefore change
-        when it has turned by more than 45 degrees.
+        The corners of a block are named by their present place, also when it has turned by more than 45 degrees.
         """
         # distance of the middle of a rounded corner from the intersection of its sides, along each axis
         within = self.radius * (1.0 - math.sqrt(0.5))
@@ -111,8 +110,7 @@ class Section:
     def exaggerated(self, penetration: Array, factor: float) -> tuple[Array, NDArray[np.bool_]]:
         """Return the four walls with gaps widened by `factor`, shape (4, 2, 2), and whether each touches, shape (4,).
 
-        The walls are ordered top, right, bottom, left. The gaps at the two corners beside a wall, including the wear of
-        the pads, determine the line of the wall. The wall ends where it meets the next walls.
+        The walls are ordered top, right, bottom, left. The gaps at its two corners determine the line of a wall.
         """
         places = (0.5 * self.frame * _SIGNS - _OUTWARDS * (_MM * factor * penetration)[:, None]) * _FLIP
         walls = np.array([(0, 2), (3, 5), (4, 6), (7, 1)])
@@ -127,7 +125,7 @@ class Section:
         along = _SIGNS - _OUTWARDS
         depth = np.minimum(PAD_MM_PER_MM * wear_depth_mm, 0.25 * self.frame.min())[:, None]
         middles = (corners - 0.5 * depth * _OUTWARDS - (0.5 * _PAD_MM + 12.0) * along) * _FLIP
-        # the label of the vertical wall is closer to the centre than the label of the horizontal wall
+        # the label of a vertical wall is closer to the centre
         inwards = np.stack((np.full(PAIR_COUNT, 0.5), np.where(np.abs(_OUTWARDS[:, 0]) > 0.5, 0.26, 0.64)), axis=1)
         labels = corners * inwards * _FLIP - [0.0, LABEL_MM]
         return middles, 0.5 * (depth * np.abs(_OUTWARDS) + _PAD_MM * np.abs(along)), labels

@@ -19,16 +19,14 @@ import rerun.blueprint as rrb
 from plow_twin.errors import RecordingError
 
 LOOPBACK: Final = "127.0.0.1"
-#: Memory limits of viewer and server. Beyond their limits, viewer and server discard the oldest data.
+#: Memory of viewer and of server, beyond which they discard the oldest data.
 _MEMORY: Final = "2GB"
 _START_S: Final = 60.0
 
 
 def viewer_program() -> str:
-    """Return the path of the rerun program, or raise `RecordingError` if it is not installed.
-
-    The wrapper script `rerun` is avoided if possible, because the end of the script would not end its child process.
-    """
+    """Return the path of the rerun program, or raise `RecordingError` if it is not installed."""
+    # the end of the wrapper script `rerun` on PATH would not end its child process
     found = find_spec("rerun_cli")
     beside = Path(found.origin).with_name("rerun") if found is not None and found.origin is not None else None
     program = str(beside) if beside is not None and beside.exists() else shutil.which("rerun")
@@ -84,7 +82,7 @@ def _address(port: int) -> str:
 
 
 def page_address(web_port: int, port: int) -> str:
-    """Return the address of the web page in the dark theme, which makes the names in the cross-section legible."""
+    """Return the address of the web page in the dark theme."""
     return f"http://{LOOPBACK}:{web_port}/?url={quote(_address(port), safe='')}&theme=dark"
 
 

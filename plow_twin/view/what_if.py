@@ -21,9 +21,7 @@ from plow_twin.view.columns import Array, Curves, Indexes, TimeAxis
 class WhatIf:
     """Simulation of different scenes with the journal of a run, and curves of their forces.
 
-    Without scenes, nothing is drawn.
-
-    If the run used the loads of its own scene, its journal contains no load, and `RecordingError` is raised.
+    If the journal contains no load, because the run used the loads of its own scene, `RecordingError` is raised.
     """
 
     def __init__(
