@@ -1,4 +1,4 @@
-"""heyoka, the peer that is most similar to this solver: compiled Taylor series with event detection.
+"""heyoka on the bench scenes: compiled Taylor series with event detection.
 
 The contact modes of the eight pairs are parameters of the equations. Each pair has two terminal events, whose Python
 callbacks set its mode: the penetration changes sign, or the force becomes attractive. The Hunt-Crossley force d^1.5 has
@@ -81,8 +81,7 @@ def _begin_of(tol: float) -> float:
 def _events(guards: list[tuple[Any, Any]], inside: Array, event: Any) -> list[Any]:
     """Return the terminal events that set the modes.
 
-    A touch and an attractive force each have an event for their start and one for their end. In a
-    batch, the callbacks receive the lane of the event. `inside` has the shape of the modes.
+    In a batch, the callbacks receive the lane of the event. `inside` has the shape of the modes.
     """
 
     def touches(pair: int) -> Callable[..., bool]:

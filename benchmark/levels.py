@@ -50,8 +50,8 @@ def ladders(rows: Sequence[Row], scene: str, output_s: float, member: Member) ->
 def reach(ladder: Sequence[Row], level: float) -> Reached | None:
     """Return the shortest time for an error of at most `level`.
 
-    One setting gives the time, or it is interpolated between two neighbouring settings, linearly in the logarithms of
-    time and error. Of these two settings, the looser misses the level and the tighter reaches it.
+    The time is that of a setting, or is interpolated between a setting that misses the level and the next tighter
+    setting, linearly in the logarithms of time and error.
     """
     done = [row for row in ladder if row.status == "ok" and row.error is not None and row.wall_ms is not None]
     times = [Reached(_wall(row), row.solver, row.setting) for row in done if _error(row) <= level]

@@ -56,8 +56,7 @@ CASES = (ECHO, RAW_ECHO, ON_SAMPLE, RECORDED, FIXED, FIXED_RECORDED, Case("fixed
 def echo(raw: bool = False, namespace: str = "live_load") -> None:
     """Answer each sample with three messages of the size of the node's messages.
 
-    With `raw`, the messages are serialised in advance, and only the stamp of the sample is written into them. No rclpy
-    node can do less work.
+    With `raw`, the messages are serialised in advance, and only the stamp of the sample is written into them.
     """
     import rclpy
     from geometry_msgs.msg import WrenchStamped
@@ -179,10 +178,7 @@ def source(rate_hz: float, seconds: float) -> subprocess.Popen[bytes]:
 
 
 def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, float]:
-    """Run an answering process.
-
-    Return the samples sent, used and lost, its share of a core, and the ages of its messages.
-    """
+    """Run an answering process. Return its counts of samples, its share of a core, and the ages of its messages."""
     with running(answerer) as (probe, process_id):
         sender, ages, figures = source(rate_hz, seconds), probe.ages, probe.figures
         try:
@@ -354,10 +350,7 @@ def _append_age(ages: list[float], data: bytes) -> None:
 
 
 def cpu_s(process_id: int) -> float:
-    """Return the CPU time [s] of all threads of a process.
-
-    The scheduler's file is more precise than the ticks of `stat`.
-    """
+    """Return the CPU time [s] of all threads of a process, from the scheduler, which is more precise than `stat`."""
     tasks = Path(f"/proc/{process_id}/task").iterdir()
     return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) * 1e-9
 
@@ -405,8 +398,7 @@ def soak(minutes: float, rate_hz: float) -> bool:
 def _growth(minutes: list[float], sizes: list[float]) -> tuple[float, float]:
     """Return the slope per hour after the first quarter, and the half-width of its 95 % interval.
 
-    Memory grows in steps, so that neighbouring samples are correlated. The slope is therefore fitted to the means of
-    six blocks.
+    Memory grows in steps, so the slope is fitted to the means of six blocks.
     """
     import numpy as np
 

@@ -1,8 +1,7 @@
 """DOP853 compiled by numba. It locates each change of contact on its dense output, and restarts at this time.
 
-An expert would write such a solver for this problem. Method and step control are those of Hairer, Norsett and Wanner,
-Solving ODEs I, sec. II.5 and II.6, with the coefficients of SciPy. Contact modes are constant within a step. Output
-rows are read from the dense output.
+Method and step control are those of Hairer, Norsett and Wanner, Solving ODEs I, sec. II.5 and II.6, with the
+coefficients of SciPy. Contact modes are constant within a step. Output rows are read from the dense output.
 """
 
 from __future__ import annotations

@@ -326,10 +326,7 @@ class Square:
         self.flights = np.array([fit_flight(drops.pose[i, : drops.flight_rows[i]]).state for i in self.usable])
 
     def errors(self, block: np.ndarray, marker: Marker, chosen: np.ndarray, bounces: int) -> np.ndarray:
-        """Return the mean distance [m] and angle [rad] over `bounces` bounces, shape (k, 2).
-
-        Drops with fewer bounces are omitted.
-        """
+        """Return the mean distance [m] and angle [rad], shape (k, 2), of the drops with at least `bounces` bounces."""
         enough = chosen[self.rows[chosen, bounces - 1] > 0]
         states = marker.state_of_block(self.flights[enough])
         tossed = toss(states, self.rows[enough, bounces - 1].max() + 1, np.full(len(enough), block, block.dtype))
@@ -347,9 +344,8 @@ class Square:
     def against_rigid(self) -> dict[str, Any]:
         """Return the errors of rigid and of compliant impacts over one bounce.
 
-        The errors are given for all drops, for drops with two corners that touch simultaneously, and for all other
-        drops. Both models have the marker, the rounded corners and the drag. e and mu of the rigid impacts are fitted
-        to all drops.
+        The errors are those of all drops, of drops with two corners that touch simultaneously, and of all other drops.
+        e and mu of the rigid impacts are fitted to all drops.
         """
         every = np.flatnonzero(self.rows[:, 0] > 0)
         states, rows = MARKER.state_of_block(self.flights[every]), int(self.rows[every, 0].max()) + 1
@@ -377,10 +373,7 @@ class Square:
     def fit(
         self, chosen: np.ndarray, start: np.ndarray, names: tuple[str, ...], rounds: int = 3
     ) -> tuple[np.ndarray, Marker]:
-        """Fit block and marker to the chosen drops.
-
-        Large distances are bounded, and the second bounce has a smaller weight.
-        """
+        """Fit block and marker to the chosen drops."""
 
         def numbers(x: np.ndarray) -> tuple[np.ndarray, Marker]:
             block = start.copy()
@@ -443,10 +436,7 @@ class Square:
         return {"pairs": len(apart), "distance_mm": round(1e3 * float(np.median(apart)), 1)}
 
     def held_out(self, start: np.ndarray = SQUARE, names: tuple[str, ...] = FITTED) -> dict[str, Any]:
-        """Fit block and marker to each half of the drops.
-
-        Return the errors on the other half over one, two and three bounces.
-        """
+        """Fit block and marker to each half of the drops. Return the errors on the other half, by number of bounces."""
         half = np.random.default_rng(1).permutation(len(self.usable)) % 2
         far: list[list[np.ndarray]] = [[], [], []]
         fitted = []

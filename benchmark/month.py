@@ -85,10 +85,7 @@ def visit(one: Machine, worn: Scene, rng: np.random.Generator) -> tuple[Load, Po
 
 
 def one_month(seed: int, day_m: float) -> dict[str, Any]:
-    """Estimate the clearances on each of the `DAYS`, and the wear coefficient.
-
-    `day_m` is the travel along the face per day [m].
-    """
+    """Estimate the clearances on each of the `DAYS`, and the wear coefficient, for a travel `day_m` [m] per day."""
     rng = np.random.default_rng([20261123, seed])
     one = machine(rng)
     path = true_path(one, rng, day_m)

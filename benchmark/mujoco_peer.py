@@ -68,8 +68,7 @@ def prepare(p: Array, integrator: str, dt: float, output_dt: float) -> Callable[
     applied[0] = load[:, None] * p[11:14] - np.array([0.0, 0.0, p[4] * p[6] * p[7]])
     start = np.zeros((1, mujoco.mj_stateSize(model, full)))
     mujoco.mj_getState(model, mujoco.MjData(model), start[0], full)
-    # the states of all steps need much memory, so the run is divided into pieces; only the time in the engine is
-    # measured
+    # the states of all steps need much memory, so the run is divided into pieces
     piece = max(stride, 20_000 // stride * stride)
 
     def run() -> Sample:

@@ -1,8 +1,8 @@
 """`plow-twin live` with an OPC UA server that writes three values at 1 kHz: loss, share of a core, and age.
 
-`python benchmark/live_load.py --opcua [--minutes 10]` first connects a bare asyncua client for a tenth of the time. The
-age at this client is the part that the server and the loopback connection cause. Both processes request SCHED_FIFO, so
-that other programs do not delay them. The load of the machine is printed with the results.
+`python benchmark/live_load.py --opcua [--minutes 10]` first connects a bare asyncua client for a tenth of the time, to
+measure the part of the age that the server and the connection cause. Both processes request SCHED_FIFO, so that other
+programs do not delay them.
 """
 
 from __future__ import annotations

@@ -37,10 +37,7 @@ def rigid_toss(initial: np.ndarray, rows: int, block: np.ndarray, impact: Impact
 
 
 def deepest(z: np.ndarray, block: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the depth of each corner [m], and the arms of its lowest point, shape (m, 4) each.
-
-    The arms (across, up) are measured from the centre.
-    """
+    """Return the depth of each corner [m], and the arms (across, up) of its lowest point, shape (m, 4) each."""
     signs = np.array([[1.0, -1.0, -1.0, 1.0], [1.0, 1.0, -1.0, -1.0]]) * float(block["half"])
     c, s = np.cos(z[:, 2:3]), np.sin(z[:, 2:3])
     across, up = c * signs[0] - s * signs[1], s * signs[0] + c * signs[1] - float(block["radius"])

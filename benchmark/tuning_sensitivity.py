@@ -63,10 +63,7 @@ def varied(name: str, value: tuning.Value) -> Iterator[None]:
 
 
 def run(truth: Truth) -> dict[str, Any]:
-    """Return errors, intervals and states of one estimate.
-
-    If the estimate raises an error, return the error as `failed`.
-    """
+    """Return errors, intervals and states of one estimate, or its error as `failed`."""
     try:
         found = estimate(truth.nominal, truth.load, truth.poses, forces=truth.forces)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
@@ -90,9 +87,8 @@ def verdict(row: dict[str, Any]) -> list[Any]:
 def summary(name: str, factor: float, rows: list[dict[str, Any]]) -> str:
     """Return a summary of the effect of one variation on the clearances and verdicts.
 
-    The summary contains the largest change of a clearance in units of its standard deviation, and the ratios of RMSE
-    and width to RMSE and width with the chosen value. It also contains the number of estimated clearances whose
-    interval contains the truth, and the number of changed verdicts.
+    It consists of the largest change of a clearance in standard deviations, the ratios of RMSE and width to those with
+    the chosen value, the number of intervals that contain the truth, and the number of changed verdicts.
     """
     base = {row["group"]: row for row in rows if row["name"] == ""}
     own = [row for row in rows if row["name"] == name and row["factor"] == factor]

@@ -41,8 +41,7 @@ FIXED_STEPS = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5)
 LEAN_STEPS = (*FIXED_STEPS, 5e-6, 2e-6, 1e-6)
 _LADDER = _decades(2, 13)
 _C_LADDERS = {"adams": _decades(2, 14), "bdf": _decades(2, 14, 1)}
-#: Tolerances of peers that are slower than `odeint` at every error; they are run with sparse output only. Radau and BDF
-#: of `solve_ivp` take seconds.
+#: Tolerances of peers that are slower than `odeint` at every error; they are run with sparse output only.
 _SUNDAE = _decades(2, 13, 1)
 _RADAU, _BDF = (1e-3, 1e-5, 1e-7), (1e-3, 1e-5)
 _SOLVE_IVP = {"LSODA": _decades(3, 12, 1), "DOP853": _decades(3, 12, 1), "Radau": _RADAU, "BDF": _BDF}

@@ -1,7 +1,6 @@
 """Write the tables of pages and the files of `config` that are made from results or code: `python tools/pages.py`.
 
-A page marks the place of a table by `<!-- made: NAME -->` and `<!-- end -->`; the text between is replaced by what
-`TABLES[NAME]` returns.
+A page marks the place of a table by `<!-- made: NAME -->` and `<!-- end -->`; `TABLES[NAME]` makes the text between.
 """
 
 from __future__ import annotations

@@ -51,5 +51,5 @@ def _gallery() -> str:
         for source in sorted(folder.iterdir()):
             if source.suffix in LANGUAGES:
                 parts.append(f"`{source.relative_to(ROOT)}`\n\n{_shown(source)}")
-    # links in the list at the top, which lead to the READMEs, are changed to point to the parts below
+    # links to the READMEs point to the parts below
     return re.sub(r"\]\((\w+)/README\.md\)", r"](#\1)", "\n\n".join(parts))

@@ -1,6 +1,4 @@
-"""The command `plow-twin study paper`, which computes the paper's figures and numbers and compares them with the
-paper.
-"""
+"""The command `plow-twin study paper`, which compares the paper's figures and numbers with this model."""
 
 from __future__ import annotations
 

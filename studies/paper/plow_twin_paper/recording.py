@@ -1,8 +1,4 @@
-"""A run of a scene as a recording and as a rerun file, in the format of the live node.
-
-The twin receives the loads of the scene as samples, which are interpolated linearly. The recording therefore contains
-the load.
-"""
+"""A run of a scene as a recording and as a rerun file, with the loads of the scene as samples."""
 
 from __future__ import annotations
 

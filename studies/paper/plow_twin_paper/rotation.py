@@ -1,10 +1,9 @@
-"""Three models of the head's rotation. One has a constant moment of gravity, as in the paper. Two are exact rigid
-bodies.
+"""Three models of the head's rotation: a constant moment of gravity, as in the paper, and two exact rigid bodies.
 
 If the centre of mass is not at the centre of the cavity, the mass matrix couples translation and rotation. The paper
 omits this coupling and uses a constant moment -m g arm (section 2). The equivalent offset is `com_offset_m = (arm, 0)`.
-The paper does not state the reference point of the inertia I. One exact model therefore takes I about the centre of
-mass, and the second exact model takes I about the centre of the cavity.
+The paper does not state the reference point of the inertia I, so the exact models take I about the centre of mass and
+about the centre of the cavity.
 """
 
 from __future__ import annotations

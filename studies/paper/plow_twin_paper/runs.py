@@ -32,8 +32,7 @@ from plow_twin_paper.values import (
 Array = NDArray[np.float64]
 OnProgress = Callable[[float], object]
 
-#: Length of the shortest run [s]. It is two load periods, because the motion is treated as settled in the second
-#: period.
+#: Length of the shortest run [s]: two load periods, of which the second is treated as settled.
 SHORTEST_S: Final = 2.0 * PERIOD_S
 #: Length of the longest run [s]. Its output for the three models of rotation takes about one gigabyte.
 LONGEST_S: Final = 1000.0

@@ -13,15 +13,13 @@ from plow_twin.model.scene import Scene
 from plow_twin.run.simulate import Result
 from plow_twin_paper.values import SHORTEST_HOLD_S, Sense
 
-#: Mode of a pair that carries force. A pair in mode 0 is apart. A pair in mode 2 is in contact, but its force is zero.
+#: Mode of a pair that carries force.
 _CARRIES = 1
 
 
 @dataclass(frozen=True)
 class Hold:
-    """A time in which exactly the corners `corners`, such as `abd`, carry force. The text is empty if no corner carries
-    force.
-    """
+    """A time in which exactly the corners `corners`, such as `abd`, carry force."""
 
     start_s: float
     end_s: float

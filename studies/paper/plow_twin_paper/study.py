@@ -1,6 +1,4 @@
-"""The study of the paper, which computes figures and numbers, compares them with the published values, and reports
-them.
-"""
+"""Report that compares the paper's figures and numbers with computed values."""
 
 from __future__ import annotations
 
