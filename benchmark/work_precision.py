@@ -61,8 +61,7 @@ def _case(
 
 def prepare_simulate(
     scene: Scene,
-    output_dt: float | None,
-    t_end: float = T_END,
+    output_dt: float,
     tol: float = 1e-9,
     dt: float | None = None,
     *,
@@ -80,10 +79,10 @@ def prepare_simulate(
         return simulate(scene, end, output_dt, tol, method, dt, energy_balance, sensitivity=sensitivity)
 
     if sensitivity or whole_call:
-        call(output_dt or t_end)  # this call compiles the code
+        call(output_dt)  # this call compiles the code
 
     def run() -> Sample:
-        wall, result = timed(lambda: call(t_end))
+        wall, result = timed(lambda: call(T_END))
         solver = result.solver
         return Sample(
             wall if whole_call else result.wall_s, result.q, solver["steps"], solver["evaluations"], len(result.events)

@@ -54,11 +54,6 @@ class Curves:
         self._last: tuple[Indexes, Indexes] | None = None
         self._waiting = self.rows = self.sent = 0
 
-    @property
-    def thinned(self) -> bool:
-        """True if only the extremes of spans are sent."""
-        return self.span_ns > 0
-
     def add(self, stamps: Indexes, steps: Indexes, values: Array) -> None:
         """Add stamps [ns], shape (n,), steps, shape (n,), and values, shape (n, number of entities)."""
         if len(stamps):
@@ -169,9 +164,6 @@ class Batches:
         self._values = {name: [] for name in self._fields}
 
 
-def buffers(*owners: object) -> Iterator[Curves | Batches]:
-    """Yield all `Curves` and `Batches` among the attributes of the owners."""
-    for owner in owners:
-        for value in vars(owner).values():
-            if isinstance(value, Curves | Batches):
-                yield value
+def buffers(owner: object) -> Iterator[Curves | Batches]:
+    """Yield all `Curves` and `Batches` among the attributes of an object."""
+    return (value for value in vars(owner).values() if isinstance(value, Curves | Batches))

@@ -305,7 +305,7 @@ class Drawing:
             ends = zip(self._band_end, (stamps, steps, total), strict=True)
             stamps, steps, total = (np.concatenate(pair) for pair in ends)
         self._band_end = stamps[-1:], steps[-1:], total[-1:]
-        if len(stamps) > 1 and not self.band.thinned:
+        if len(stamps) > 1 and not self.band.span_ns:
             rows = np.arange(0.0, len(stamps) - 1, 1.0 / _BAND_ROWS)
             known = np.arange(len(stamps))
             total = np.stack([np.interp(rows, known, column) for column in total.T], axis=1)

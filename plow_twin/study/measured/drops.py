@@ -1,4 +1,4 @@
-"""Measured drops of the square: the first flight, the bounces, and the comparison with the predicted bands."""
+"""Measured drops of the square: the first flight and the bounces."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.study.measured.square import LEAST_ROWS, RATE_HZ, bands
+from plow_twin.study.measured.square import LEAST_ROWS, RATE_HZ
 
 Array = NDArray[np.float64]
 
@@ -49,13 +49,6 @@ class Drops:
     def until(self, index: int, bounce: int) -> int:
         """Return the row of a bounce, counted from 0, or the row of the last bounce if the drop has fewer bounces."""
         return self.bounces[index][min(bounce, len(self.bounces[index]) - 1)]
-
-    def inside(self, index: int) -> NDArray[np.bool_]:
-        """Return whether x, z and theta lie in the predicted 90 % bands up to the third bounce, shape (rows, 3)."""
-        rows = self.until(index, 2) + 1
-        points = bands(self.pose[index, : self.flight_rows[index]], rows)
-        found: NDArray[np.bool_] = (self.pose[index, :rows] >= points[:, 0]) & (self.pose[index, :rows] <= points[:, 2])
-        return found
 
 
 def _flight_rows(pose: Array) -> int:
