@@ -11,33 +11,27 @@ import click
 from click.core import ParameterSource
 
 from plow_twin.cli.console import DONE, say_error
-from plow_twin.cli.options import FILE, PLACE, find_ros_wheels, node_options, wait_option
+from plow_twin.cli.options import FILE, PLACE, combined, find_ros_wheels, node_options, wait_option
 
 if TYPE_CHECKING:
     from plow_twin.dashboard.access import PageAccess
     from plow_twin.dashboard.screen import Screen
 
 
-def access_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options `--listen` and `--token-file`."""
-    for option in (
-        click.option(
-            "--token-file",
-            type=FILE,
-            help="File whose first line is the token of the page; by default PLOW_TWIN_DASHBOARD_TOKEN.",
-        ),
-        click.option(
-            "--listen",
-            metavar="HOST:PORT",
-            default="127.0.0.1:8070",
-            show_default=True,
-            help="Address of the page; other machines need a token. With port 0, a free port is chosen.",
-        ),
-    ):
-        command = option(command)
-    return command
-
-
+access_options = combined(
+    click.option(
+        "--listen",
+        metavar="HOST:PORT",
+        default="127.0.0.1:8070",
+        show_default=True,
+        help="Address of the page; other machines need a token. With port 0, a free port is chosen.",
+    ),
+    click.option(
+        "--token-file",
+        type=FILE,
+        help="File whose first line is the token of the page; by default PLOW_TWIN_DASHBOARD_TOKEN.",
+    ),
+)
 dashboard_option = click.option("--dashboard", is_flag=True, help="Show the run on a page in the browser.")
 
 

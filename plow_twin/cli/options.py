@@ -27,20 +27,31 @@ map_option = click.option(
 )  # fmt: skip
 
 
-def wait_option(text: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+
+def combined(*options: Decorator) -> Decorator:
+    """Return a decorator that adds several options to a command."""
+
+    def add(command: Callable[..., Any]) -> Callable[..., Any]:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return add
+
+
+def wait_option(text: str) -> Decorator:
     """Return the option `--wait` [s] with the help text `text`."""
     return click.option("--wait", type=click.FloatRange(0.0), default=10.0, show_default=True, help=text)
 
 
-def node_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options that identify a running node."""
-    for option in (
-        click.option("--scene", help="Scene of the node; needed if its path on the node's machine cannot be read."),
-        click.option("--name", default="plow_twin", show_default=True, help="Name of the node."),
-        click.option("--namespace", default="", help="Namespace of the node."),
-    ):
-        command = option(command)
-    return command
+#: Options that identify a running node.
+node_options = combined(
+    click.option("--namespace", default="", help="Namespace of the node."),
+    click.option("--name", default="plow_twin", show_default=True, help="Name of the node."),
+    click.option("--scene", help="Scene of the node; needed if its path on the node's machine cannot be read."),
+)
 
 
 def find_ros_wheels() -> None:

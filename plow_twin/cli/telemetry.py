@@ -2,52 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from plow_twin.cli.console import DONE, DONE_WITH_LOSS, say_error
-from plow_twin.cli.options import FILE, POSITIVE, find_ros_wheels, node_options, wait_option
+from plow_twin.cli.options import FILE, POSITIVE, combined, find_ros_wheels, node_options, wait_option
 
 if TYPE_CHECKING:
     from plow_twin.telemetry.access import WayOut
 
 
-def telemetry_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options for the receivers of results."""
-    for option in (
-        click.option(
-            "--out-access",
-            type=FILE,
-            help="YAML file with users, certificates and secret files for the receivers.",
-        ),
-        click.option(
-            "--out-rate",
-            type=POSITIVE,
-            default=1.0,
-            show_default=True,
-            help="Rate of the updates [Hz]; peaks are those since the previous update.",
-        ),
-        click.option("--opcua-acknowledge", is_flag=True, help="Allow clients of --opcua to acknowledge alarms."),
-        click.option(
-            "--opcua", metavar="URL", help="Serve results to OPC UA clients at opc.tcp://HOST:PORT (extra opcua)."
-        ),
-        click.option(
-            "--influx", metavar="URL", help="Send results to InfluxDB, http[s]://HOST:PORT/ORG/BUCKET (extra influx)."
-        ),
-        click.option(
-            "--sparkplug",
-            metavar="GROUP/NODE",
-            default="",
-            help="Send results to the broker of --mqtt-out as this Sparkplug B edge node (extra sparkplug).",
-        ),
-        click.option(
-            "--mqtt-out", metavar="URL", help="Send results as JSON to mqtt[s]://HOST:PORT/PREFIX (extra mqtt)."
-        ),
-    ):
-        command = option(command)
-    return command
+#: Options for the receivers of results.
+telemetry_options = combined(
+    click.option("--mqtt-out", metavar="URL", help="Send results as JSON to mqtt[s]://HOST:PORT/PREFIX (extra mqtt)."),
+    click.option(
+        "--sparkplug",
+        metavar="GROUP/NODE",
+        default="",
+        help="Send results to the broker of --mqtt-out as this Sparkplug B edge node (extra sparkplug).",
+    ),
+    click.option(
+        "--influx", metavar="URL", help="Send results to InfluxDB, http[s]://HOST:PORT/ORG/BUCKET (extra influx)."
+    ),
+    click.option(
+        "--opcua", metavar="URL", help="Serve results to OPC UA clients at opc.tcp://HOST:PORT (extra opcua)."
+    ),
+    click.option("--opcua-acknowledge", is_flag=True, help="Allow clients of --opcua to acknowledge alarms."),
+    click.option(
+        "--out-rate",
+        type=POSITIVE,
+        default=1.0,
+        show_default=True,
+        help="Rate of the updates [Hz]; peaks are those since the previous update.",
+    ),
+    click.option(
+        "--out-access", type=FILE, help="YAML file with users, certificates and secret files for the receivers."
+    ),
+)
 
 
 def ways_of(options: dict[str, Any]) -> list[WayOut]:
