@@ -59,22 +59,22 @@ def _plans(runs: PaperRuns) -> list[tuple[str, str, str, str, Callable[[], Figur
         (
             "paper_fig08", "Fig. 8: counter-clockwise contacts, close-up",
             "One, two and three points carry force, two most often; three sets are quoted at their times.",
-            "Vertical lines: the quoted times.", lambda: motion.fig08(runs),
+            "Vertical lines: the quoted times.", lambda: motion.close_up(runs, "ccw"),
         ),
         (
             "paper_fig09", "Fig. 9: clockwise contacts, close-up",
             "One, two and three points carry force; three sets are quoted at their times.",
-            "Vertical lines: the quoted times.", lambda: motion.fig09(runs),
+            "Vertical lines: the quoted times.", lambda: motion.close_up(runs, "cw"),
         ),
         (
             "paper_fig10", "Fig. 10: largest force against the vertical clearance",
             "Every point's largest force rises, then falls; the largest is at a or b.", "Runs as long as the case's.",
-            lambda: trends.fig10(runs),
+            lambda: trends.trend(runs.vertical, "vertical", "horizontal"),
         ),
         (
             "paper_fig11", "Fig. 11: largest force against the horizontal clearance",
             "Every point's largest force rises; the largest is at a or b.", _falls(runs),
-            lambda: trends.fig11(runs),
+            lambda: trends.trend(runs.horizontal, "horizontal", "vertical"),
         ),
         (
             "paper_fig13", "Fig. 13: contact of the four inner faces",
@@ -85,12 +85,12 @@ def _plans(runs: PaperRuns) -> list[tuple[str, str, str, str, Callable[[], Figur
         (
             "paper_fig14", "Fig. 14: inner faces, vertical clearance 20, 25, 30 mm",
             "RecurDyn: the trend of Fig. 10.", "Horizontal clearance 20 mm (assumed, as in Fig. 10).",
-            lambda: trends.fig14(runs),
+            lambda: trends.faces(runs.faces_vertical, "vertical"),
         ),
         (
             "paper_fig15", "Fig. 15: inner faces, horizontal clearance 20, 25, 30 mm",
             "RecurDyn: the trend of Fig. 11.", "Vertical clearance 20 mm (assumed, as in Fig. 11).",
-            lambda: trends.fig15(runs),
+            lambda: trends.faces(runs.faces_horizontal, "horizontal"),
         ),
     ]  # fmt: skip
     return plans

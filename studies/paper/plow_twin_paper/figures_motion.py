@@ -79,17 +79,7 @@ def _published(panel: Any, sense: Sense, corner: str) -> None:
             panel.axhline(force.value_n / 1e3, color="black", linestyle=line, linewidth=1.2, label=name)
 
 
-def fig08(runs: PaperRuns) -> Figure:
-    """Draw a close-up of the counter-clockwise contacts."""
-    return _close_up(runs, "ccw")
-
-
-def fig09(runs: PaperRuns) -> Figure:
-    """Draw a close-up of the clockwise contacts."""
-    return _close_up(runs, "cw")
-
-
-def _close_up(runs: PaperRuns, sense: Sense) -> Figure:
+def close_up(runs: PaperRuns, sense: Sense) -> Figure:
     """Draw the forces of one direction of swing in a period around the quoted times, and the contacts of each point."""
     times = {moment: shown_time(moment.time_s, runs.t_end) for moment in MOMENTS if moment.sense == sense}
     # a shorter run may end before some quoted times, so all quoted times move back by the same number of periods

@@ -25,17 +25,8 @@ _FORMS: Final = (
 _FIRST_S: Final = 4.0
 
 
-def fig10(runs: PaperRuns) -> Figure:
-    """Draw the largest force of each point as a function of the vertical clearance."""
-    return _sweep(runs.vertical, "vertical", "horizontal")
-
-
-def fig11(runs: PaperRuns) -> Figure:
-    """Draw the largest force of each point as a function of the horizontal clearance."""
-    return _sweep(runs.horizontal, "horizontal", "vertical")
-
-
-def _sweep(sweep: Sweep, along: str, fixed: str) -> Figure:
+def trend(sweep: Sweep, along: str, fixed: str) -> Figure:
+    """Draw the largest force of each point as a function of a clearance (Figs 10 and 11)."""
     with sheet(8.0, 4.6) as figure:
         panel = figure.subplots()
         for column, corner in enumerate(CORNERS):
@@ -85,17 +76,8 @@ def _mark(panels: Any, found: tuple[float, float], text: str, level: int) -> Non
     )  # fmt: skip
 
 
-def fig14(runs: PaperRuns) -> Figure:
-    """Draw the forces on the inner faces at three vertical clearances."""
-    return _faces(runs.faces_vertical, "vertical")
-
-
-def fig15(runs: PaperRuns) -> Figure:
-    """Draw the forces on the inner faces at three horizontal clearances."""
-    return _faces(runs.faces_horizontal, "horizontal")
-
-
-def _faces(runs: tuple[FaceRun, ...], along: str) -> Figure:
+def faces(runs: tuple[FaceRun, ...], along: str) -> Figure:
+    """Draw the forces on the inner faces at three clearances (Figs 14 and 15)."""
     with sheet(11.0, 4.8) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1, 1.4))
         for column, face in enumerate(FACES):
