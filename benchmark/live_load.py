@@ -200,12 +200,12 @@ def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, fl
         "lost": int(figures.get("samples_lost", 0)),
         "messages": len(ages),
         "core": round(share, 3),
-        **_quantiles(ages),
+        **quantiles(ages),
         "age_max_of_first_second_ms": round(first_s, 3),
     }
 
 
-def _quantiles(ages: list[float], without: Any = math.nan) -> dict[str, Any]:
+def quantiles(ages: list[float], without: Any = math.nan) -> dict[str, Any]:
     found = sorted(ages)
     return {f"age_p{p}_ms": round(found[len(found) * p // 100], 3) if found else without for p in (50, 99)}
 
@@ -258,7 +258,7 @@ def _one_estimating(on: bool, seconds: float) -> dict[str, float]:
             "core": round(share, 3),
             "core_of_the_estimate": round(estimate_share, 3),
             "estimates": int(probe.figures.get("estimates") or 0),
-            **_quantiles(probe.ages),
+            **quantiles(probe.ages),
         }
 
 
@@ -340,7 +340,7 @@ def beside(seconds: float) -> None:
         print(json.dumps({
             "case": name, "messages": len(ages),
             "core": round(median(shares[name]), 3), "x_echo": round(median(ratios), 3),
-            **_quantiles(ages),
+            **quantiles(ages),
         }))  # fmt: skip
 
 
@@ -373,15 +373,15 @@ def soak(minutes: float, rate_hz: float) -> bool:
                 "threads": _status(process_id, "Threads"),
                 "files": len(os.listdir(f"/proc/{process_id}/fd")),
                 "core": round((cpu_s(process_id) - busy) / PERIOD_S, 3),
-                **_quantiles(ages, None),  # None instead of NaN if no message arrived
+                **quantiles(ages, None),  # None instead of NaN if no message arrived
                 "queued": int(figures.get("queued") or 0),
-                **_account(figures),
+                **account(figures),
             })  # fmt: skip
             print(json.dumps(rows[-1]), flush=True)
             probe.ages.clear()
         probe.figures.clear()
         probe.spin(lambda: "samples_used" in probe.figures, 10.0)
-        account = _account(probe.figures)
+        counted = account(probe.figures)
     later = rows[len(rows) // 2 :]
     hours = ((later[-1]["minute"] or 0.0) - (later[0]["minute"] or 0.0)) / 60.0
     for key in ("rss_mib", "threads", "files", "age_p50_ms", "queued"):
@@ -391,8 +391,8 @@ def soak(minutes: float, rate_hz: float) -> bool:
     slope, width = _growth([row["minute"] or 0.0 for row in rows], [row["rss_mib"] or 0.0 for row in rows])
     print(f"rss_mib after the first quarter: {slope:.2f} +- {width:.2f} an hour (95 %)")
     sent = round(rate_hz * 60.0 * minutes)
-    print(f"sent {sent}, {account}: {sent - sum(account.values())} not accounted for")
-    return sent == sum(account.values())
+    print(f"sent {sent}, {counted}: {sent - sum(counted.values())} not accounted for")
+    return sent == sum(counted.values())
 
 
 def _growth(minutes: list[float], sizes: list[float]) -> tuple[float, float]:
@@ -411,7 +411,7 @@ def _growth(minutes: list[float], sizes: list[float]) -> tuple[float, float]:
     return float(slope), 2.776 * spread  # 97.5 % point of Student's t with four degrees of freedom
 
 
-def _account(figures: dict[str, str]) -> dict[str, int]:
+def account(figures: dict[str, str]) -> dict[str, int]:
     dropped = sum(int(value) for key, value in figures.items() if key.startswith("dropped_"))
     return {
         "used": int(figures.get("samples_used", 0)),

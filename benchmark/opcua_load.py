@@ -23,7 +23,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from live_load import ROOT, cpu_s
+from live_load import ROOT, account, cpu_s, quantiles
 
 NODES = ("Load.Fx", "Load.Fy", "Load.M")
 NAMESPACE = 2
@@ -97,12 +97,8 @@ async def hear(port: int) -> None:
         while len(ages) != heard or heard <= len(NODES):
             heard = len(ages)
             await asyncio.sleep(SILENCE_S)
-    found = sorted(ages[len(NODES) :])
-    print(json.dumps({"values": len(found)} | _quantiles(found)))
-
-
-def _quantiles(ages: list[float]) -> dict[str, float]:
-    return {f"age_p{share}_ms": round(ages[len(ages) * share // 100], 2) for share in (50, 99)}
+    found = ages[len(NODES) :]
+    print(json.dumps({"values": len(found)} | quantiles(found)))
 
 
 def measure(minutes: float, rate_hz: float) -> bool:
@@ -152,9 +148,7 @@ def _live(
     counts, source = parts["input"], parts["source"]
     return {
         "sent": round(rate_hz * seconds),
-        "used": int(counts["samples_used"]),
-        "dropped": sum(int(value) for key, value in counts.items() if key.startswith("dropped_")),
-        "lost": int(counts["samples_lost"]),
+        **account(counts),
         "values": int(float(source["values"])),
         "notifications_lost": int(source["notifications_lost"]),
         "overflows": int(source["overflows"]),
