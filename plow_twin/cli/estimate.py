@@ -153,7 +153,7 @@ def estimate(
 
 @dataclass(frozen=True)
 class _Task:
-    """An estimate to compute. `first_ns` is the stamp of the time 0 of the measurements, or None if it is unknown."""
+    """An estimate to compute. `first_ns` is the stamp at time 0, or None if it is unknown."""
 
     scene: Scene
     load: Load

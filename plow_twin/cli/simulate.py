@@ -107,10 +107,7 @@ def simulate(
 def _run(
     scene: str, quiet: bool, t_end: float, *settings: Any, **limits: Any
 ) -> tuple[Result, LimitError | RunInterrupted | None]:
-    """Simulate the scene, and return the result and None.
-
-    If the simulation ends at a limit or after Ctrl-C, return the result up to the end and the reason.
-    """
+    """Return the result of a simulation, and the reason if it ended early: a limit or Ctrl-C."""
     from plow_twin.errors import LimitError, RunInterrupted, SceneError, ToleranceWarning
     from plow_twin.run.simulate import simulate as run
     from plow_twin.scene_file import load_scene

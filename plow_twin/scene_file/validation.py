@@ -124,7 +124,7 @@ def _closest_branch(key: str, error: ValidationError, whole: str) -> Iterator[Pr
 
 
 def _is_misfit(error: ValidationError) -> bool:
-    """Return whether an error shows that the type or the keys of a value do not fit an `anyOf` branch."""
+    """Return whether the type or the keys of a value do not fit the `anyOf` branch of an error."""
     keys_alone = error.validator == "required" and "properties" not in cast(Schema, error.schema)
     return keys_alone or error.validator in ("type", "const", "enum")
 

@@ -9,8 +9,7 @@ Four paths are no fields of a scene; they are applied after all other parameters
     clearance.scale         factor of both clearances: 1 for a total, 2 for a published clearance per side
 
 The path `frame.labels` takes one of eight words: `bottom_right_ccw` puts corner a at the bottom right, with b, c and d
-counter-clockwise from a. A damping replaces a restitution, and a restitution replaces a damping. A path of `friction`
-switches friction on.
+counter-clockwise from a. Damping and restitution replace each other. A path of `friction` switches friction on.
 """
 
 from __future__ import annotations

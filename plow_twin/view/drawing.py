@@ -236,7 +236,7 @@ class Drawing:
         for index in sorted(entries.others):
             self._back(samples[: np.searchsorted(samples, index)], stamps, steps)
             entry, stamp_ns = entries.others[index], int(stamps[index])
-            # the time of an entry without a stamp is the stamp that the model has reached
+            # an entry without a stamp is drawn at the stamp that the model has reached
             if not hasattr(entry, "stamp_ns"):
                 reached = np.flatnonzero(advance[:index])
                 stamp_ns = int(stamps[reached[-1]]) if reached.size else self.stamp_ns

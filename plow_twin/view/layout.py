@@ -171,7 +171,7 @@ def band_colors(entity: str) -> list[tuple[int, ...]]:
 
 
 def style_load(stream: rr.RecordingStream, largest: Iterable[float]) -> None:
-    """Put the largest loads into the names of the load curves, because the axis of a low plot has too few labels."""
+    """Put the largest loads into the names of the load curves."""
     for entity, name, unit, color, value in zip(LOAD, *_LOAD_NAMES, _LOAD_COLORS, largest, strict=True):
         named = f"{name}, to {value:.3g} {unit}" if value else f"{name} [{unit}]"
         _style(stream, entity, named, color)

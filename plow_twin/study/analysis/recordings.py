@@ -74,7 +74,7 @@ def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
 
 
 def counted_once(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
-    """Return the recordings without repetitions, and a sentence for each repetition of a path or a run."""
+    """Return the recordings without repetitions of a path or a run, and a message for each repetition."""
     kept: dict[object, Path] = {}
     left: list[str] = []
     for path in paths:

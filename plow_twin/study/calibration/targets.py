@@ -118,7 +118,7 @@ class TargetSet:
         unique: list[Mapping[str, Value]] = []
         for target in self.targets:
             unique += [setting for setting in target.settings if setting not in unique]
-        # the setting of most targets comes first, because a candidate that fails there needs no further runs
+        # the setting of most targets comes first: a candidate that fails there needs no further runs
         uses = [sum(setting in target.settings for target in self.targets) for setting in unique]
         order = sorted(range(len(unique)), key=lambda index: -uses[index])
         object.__setattr__(self, "settings", tuple(unique[index] for index in order))
