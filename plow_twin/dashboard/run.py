@@ -98,10 +98,8 @@ class RunFeed:
 
     def _say(self, batch: Batch) -> None:
         for outputs in batch.outputs:
-            for channel in [number for number, (topic, _) in outputs.topics.items() if topic in self._slow]:
-                for index in np.flatnonzero(outputs.messages.channel == channel).tolist():
-                    record = outputs.record(index)
-                    self._feed.part(self._slow[record.topic], part_of(record.message()))
+            for record in outputs.on(self._slow):
+                self._feed.part(self._slow[record.topic], part_of(record.message()))
 
 
 def _within(rows: Rows, second: int) -> Rows:

@@ -5,7 +5,7 @@ A record is a journal entry or an output, that is, a message that the twin sent.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -178,6 +178,11 @@ class Outputs:
 
     def __getitem__(self, chosen: slice) -> Outputs:
         return Outputs(self.messages[chosen], self.sequence[chosen], self.topics)
+
+    def on(self, topics: Container[str]) -> Iterator[OutputRecord]:
+        """Yield the records of the given topics, one topic after another."""
+        for channel in [number for number, (topic, _) in self.topics.items() if topic in topics]:
+            yield from map(self.record, np.flatnonzero(self.messages.channel == channel).tolist())
 
     def record(self, index: int) -> OutputRecord:
         """Return the message at `index` as a record."""

@@ -87,12 +87,9 @@ class _Log:
                 log.last_ns = int(stamps[-1])
             for _, entry in sorted(batch.entries.others.items()):
                 log._entry(entry)
-            for part in batch.outputs:
-                for channel in [number for number, (name, _) in part.topics.items() if name == alarms]:
-                    for index in np.flatnonzero(part.messages.channel == channel).tolist():
-                        message = part.record(index).message()
-                        if isinstance(message, DiagnosticStatus):
-                            log.alarms += [text for text in alarm_texts(dict(message.values)) if text not in log.alarms]
+            for message in (record.message() for part in batch.outputs for record in part.on((alarms,))):
+                if isinstance(message, DiagnosticStatus):
+                    log.alarms += [text for text in alarm_texts(dict(message.values)) if text not in log.alarms]
         return log
 
     def _entry(self, entry: Any) -> None:

@@ -396,13 +396,10 @@ class Drawing:
     def _statuses(self, batch: Batch) -> None:
         """Write changes of status and alarms. Changes before the first sample are written at the first sample."""
         topics = (self.header.topic("status"), self.header.topic(ALARMS))
-        for part in batch.outputs:
-            for channel in [number for number, (name, _) in part.topics.items() if name in topics]:
-                for index in np.flatnonzero(part.messages.channel == channel).tolist():
-                    record = part.record(index)
-                    message = record.message()
-                    if isinstance(message, DiagnosticStatus):
-                        self._early.append((record.publish_time_ns, message))
+        for record in (record for part in batch.outputs for record in part.on(topics)):
+            message = record.message()
+            if isinstance(message, DiagnosticStatus):
+                self._early.append((record.publish_time_ns, message))
         if self._axis.first_ns is not None:
             self._write_statuses()
 
