@@ -22,8 +22,6 @@ def _grid(output_dt: float) -> Array:
 
 
 def _rhs(p: Array) -> Rhs:
-    """Return a compiled function for the time derivative of the state."""
-
     def rhs(t: float, y: Array) -> Array:
         out = np.empty(6)
         rhs_into(t, y, out, p)

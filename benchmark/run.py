@@ -119,7 +119,6 @@ def _run(chosen: set[str], repeats: int, quick: bool, notify: Notify) -> list[Ro
 
 
 def _publish(rows: list[Row], measured: str) -> None:
-    """Draw the picture, write all tables to the results, and update the figures of the pages."""
     import figures
     import plot
 

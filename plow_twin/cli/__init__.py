@@ -47,7 +47,7 @@ def _open_what_is_closed() -> None:
 
 @contextmanager
 def _ending_at_once() -> Iterator[None]:
-    """End the process at Ctrl-C without a traceback. No data need to be saved, because no work has begun."""
+    """End the process at Ctrl-C without a traceback."""
 
     def end(*_: object) -> None:
         os.write(2, b"plow-twin: interrupted\n")

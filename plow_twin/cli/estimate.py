@@ -164,8 +164,6 @@ class _Task:
 
 @dataclass(frozen=True)
 class _Given:
-    """All measurements, and the number of rows that could not be used."""
-
     measured: Measured
     load: Load
     poses: Poses

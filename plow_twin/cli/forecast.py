@@ -180,7 +180,7 @@ def _estimate(path: Path) -> Any:
 
 
 def _history(path: Path) -> History:
-    """Return the clearances in a CSV file. If the file is invalid, raise RecordingError or LifeError."""
+    """Return the clearances in a CSV file."""
     from plow_twin.estimate.coefficient import History
     from plow_twin.estimate.life import LifeError
     from plow_twin.record.sources import read_columns

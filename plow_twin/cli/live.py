@@ -278,7 +278,7 @@ def _bridge(source: str, options: dict[str, Any], rate_hz: float) -> Bridge:
 
 
 def _tables(folder: Path, *, growing: bool) -> list[Path]:
-    """Return the tables in a folder. If the tables are growing, Parquet files are omitted."""
+    """Return the tables in a folder, without Parquet files if the tables are growing."""
     from plow_twin.scene_file.csv_rows import tables
     from plow_twin.scene_file.parquet_lines import is_parquet
 

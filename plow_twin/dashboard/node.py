@@ -132,7 +132,7 @@ class NodeWatch:
         return future.result() if future.done() else None
 
     def _subscribe(self, kind: type, topic: str, quality: QoSProfile, take: Callable[[Any], None]) -> None:
-        """Subscribe to an output. The messages are decoded to the classes that recordings use."""
+        """Subscribe to an output, decoded to the classes that recordings use."""
         message_type = plain.JointState.TYPE if kind is JointState else plain.DiagnosticStatus.TYPE
         message_type = plain.Odometry.TYPE if kind is Odometry else message_type
         self.node.create_subscription(kind, topic, lambda data: take(decode(data, message_type)), quality, raw=True)

@@ -105,7 +105,7 @@ def _set_environment(folder: Path) -> None:
 
 
 def _worn_scene(folder: Path) -> Path:
-    """Write the scene of the paper with wear, so that the clearance grows. Return the path of the scene."""
+    """Write the scene of the paper with wear. Return its path."""
     wear = Wear(coefficient_m2_n=1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0)
     assumed = Provenance(Mark.ASSUMED, "hard steel guide in coal dust, 1e-15 .. 1e-13 m^2/N; not in the paper")
     paper = load_scene("paper")

@@ -146,7 +146,7 @@ def _is_plain(kind: pa.DataType) -> bool:
 
 
 def _as_text(batch: pa.RecordBatch) -> pa.RecordBatch:
-    """Convert instants to UTC and durations to seconds, for CSV. Numbers are unchanged."""
+    """Convert instants to UTC and durations to seconds, for CSV."""
     import pyarrow as pa
 
     columns = []

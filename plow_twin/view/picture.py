@@ -184,8 +184,7 @@ def _curves(
 ) -> None:
     """Draw curves. If the rows are in bins, draw the band from the least to the largest value of each bin.
 
-    `only_largest` omits the bands, for forces, because their least value is nearly always zero. Lines are interrupted
-    at the `gaps` (start and end [s]).
+    `only_largest` omits the bands. Lines are interrupted at the `gaps` (start and end [s]).
     """
     axis.set_ylabel(label)
     if not rows:

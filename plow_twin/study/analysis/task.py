@@ -143,7 +143,7 @@ class Task:
         return {**found.facts(), "lossy": found.lossy}
 
     def _asked(self) -> dict[str, Any]:
-        """Return the inputs that determine the result, such as the recording, the scenes and the mapping."""
+        """Return the inputs that determine the result."""
         folder = self.path if self.path.is_dir() else self.path.parent
         parts = [*sorted(folder.glob("*.mcap")), *beside_folders(folder)]
         beside = folder / "scene.yaml" if self.scene is None else None

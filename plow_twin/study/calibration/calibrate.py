@@ -155,7 +155,7 @@ def _evolve(
 
 
 def _screened(space: Space, objective: Objective, points: Array, keep: int) -> Array:
-    """Return the objective of every point. A run may stop early if its point cannot be among the best `keep` points."""
+    """Return the objective of every point. Points that cannot be among the best `keep` may stop early."""
     batch = max(keep, 64)
     values = np.zeros(0)
     for begin in range(0, len(points), batch):

@@ -136,7 +136,7 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
 
 
 class _RunSums:
-    """Sums for each window of a run. The messages of each topic are added batch by batch."""
+    """Sums for each window of a run."""
 
     def __init__(self, window_ns: int, silences: Silences) -> None:
         self._window_ns, self._silences = window_ns, silences
@@ -222,7 +222,7 @@ class _RunSums:
 
 
 def _between(sums: _Sums, count: _Sums, numbers: list[int]) -> Array:
-    """Return the means of windows. The mean of a window without a message is interpolated."""
+    """Return the means of windows, interpolated for a window without a message."""
     known = sorted(sums.rows)
     means = sums.of(known) / count.of(known)
     return np.column_stack([np.interp(numbers, known, column) for column in means.T])
