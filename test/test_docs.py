@@ -108,6 +108,11 @@ def test_no_heading_begins_with_a_digit() -> None:
     assert found == []
 
 
+def test_every_row_of_a_table_is_a_single_line() -> None:
+    pages = [*PAGES, *(ROOT / "examples").glob("**/README.md")]
+    assert [line for page in pages for line in re.findall(r"^\|.*[^|\n]$", page.read_text(), re.MULTILINE)] == []
+
+
 def test_every_page_is_in_the_site_s_contents() -> None:
     contents = (ROOT / "mkdocs.yml").read_text().partition("nav:")[2]
     made = {"index.md", "examples.md"}
