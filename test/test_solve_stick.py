@@ -270,7 +270,7 @@ def test_painleves_case_is_an_impact_without_collision() -> None:
         assert result.force[-1, pair] == 0.0
 
 
-# in the quick run, `test_solve_support.test_a_restored_twin_and_a_batch_go_on_alike` has friction
+# in the quick run, `test_solve_rounded` restores a twin with stick
 @pytest.mark.stress
 @pytest.mark.parametrize("most", [None, 2000])
 def test_a_restored_twin_a_batch_and_a_bounded_twin_go_on_alike(most: int | None) -> None:

@@ -143,9 +143,8 @@ def test_a_tilted_throw_agrees_with_equations_of_its_own() -> None:
 
 
 def test_a_restored_twin_and_a_batch_go_on_alike() -> None:
-    """The state contains the motion of the frame, and the anchors of corners that stick."""
-    stick = Friction(0.3, stick_stiffness_n_m=5e7, stick_damping_n_s_m=1e5)
-    scene = replace(pressed(Harmonic("unused", (1.0, 1.0))), initial=Initial(), friction=stick)
+    """The state contains the motion of the frame."""
+    scene = replace(pressed(Harmonic("unused", (1.0, 1.0))), initial=Initial())
     times = np.linspace(0.01, 0.4, 23)
     loads = np.stack([4e4 * np.sin(20.0 * times), -1e4 * np.cos(9.0 * times), 2e4 * np.sin(7.0 * times)], axis=1)
     twin, other = (Twin(scene, excitation="sampled") for _ in range(2))
