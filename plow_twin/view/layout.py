@@ -70,26 +70,12 @@ def blueprint(
     90 % intervals. `title` is appended to the name of the view of the forces.
     """
     half_x, half_y = (float(half) for half in section.half_view)
-    picture = rrb.Spatial2DView(
-        origin="section",
-        name="Cross-section [mm]",
-        visual_bounds=rrb.VisualBounds2D(x_range=(-half_x, half_x), y_range=(-half_y, half_y)),
-        background=(24, 26, 30),
-    )
-    wide = rrb.Spatial2DView(
-        origin="exaggerated",
-        name=f"Clearance {exaggerate:g} times as wide",
-        visual_bounds=rrb.VisualBounds2D(x_range=(-half_x, half_x), y_range=(-half_y, half_y)),
-        background=(24, 26, 30),
-    )
+    bounds = (-half_x, half_x), (-half_y, half_y)
+    picture = _space("section", "Cross-section [mm]", *bounds)
+    wide = _space("exaggerated", f"Clearance {exaggerate:g} times as wide", *bounds)
+    face = _space("face", "Force along the face", (-30.0, WIDTH + 15.0), (-HEIGHT - 12.0, 15.0))
     times = [TimelineColumn(visible=name == RUN_TIME, timeline=name) for name in (RUN_TIME, ROS_TIME, STEP)]
     columns = rrb.TextLogColumns(timeline_columns=times, text_log_columns=["LogLevel", "Body"])
-    face = rrb.Spatial2DView(
-        origin="face",
-        name="Force along the face",
-        visual_bounds=rrb.VisualBounds2D(x_range=(-30.0, WIDTH + 15.0), y_range=(-HEIGHT - 12.0, 15.0)),
-        background=(24, 26, 30),
-    )
     below = rrb.Tabs(
         rrb.TextLogView(origin="events", name="Events", columns=columns),
         face,
@@ -126,6 +112,11 @@ def blueprint(
     )
 
 
+def _space(origin: str, name: str, x: tuple[float, float], y: tuple[float, float]) -> rrb.Spatial2DView:
+    bounds = rrb.VisualBounds2D(x_range=x, y_range=y)
+    return rrb.Spatial2DView(origin=origin, name=name, visual_bounds=bounds, background=(24, 26, 30))
+
+
 def _plot(
     origin: str,
     name: str,
@@ -145,14 +136,13 @@ def style_curves(stream: rr.RecordingStream) -> None:
         _style(stream, entity, name, color)
     for entity in FORCE_BOUNDS:
         _, pair, point = entity.split("/")
-        shade = tuple(round(0.6 * part) for part in PAIR_COLORS[PAIR_NAMES.index(pair)])
-        _style(stream, entity, f"{pair} {point}", shade, 1.0)
-    for entity, measured, name, color in zip(POSE, MEASURED, _RESIDUAL_NAMES, _LOAD_COLORS, strict=True):
-        _style(stream, entity, name, color)
-        shade = tuple(round(0.6 * part) for part in color)
-        _style(stream, measured, f"{name}, measured", shade, 1.0)
-    for entity, name, color in zip(RESIDUAL, _RESIDUAL_NAMES, _LOAD_COLORS, strict=True):
-        _style(stream, entity, name, color)
+        _style(stream, entity, f"{pair} {point}", _darker(PAIR_COLORS[PAIR_NAMES.index(pair)]), 1.0)
+    for pose, measured, residual, name, color in zip(
+        POSE, MEASURED, RESIDUAL, _RESIDUAL_NAMES, _LOAD_COLORS, strict=True
+    ):
+        _style(stream, pose, name, color)
+        _style(stream, measured, f"{name}, measured", _darker(color), 1.0)
+        _style(stream, residual, name, color)
     for entity in BAND:
         _style(stream, entity, "90 % interval", None, _BAND_WIDTH)
     # bounds are drawn thinner and darker than values
@@ -160,8 +150,12 @@ def style_curves(stream: rr.RecordingStream) -> None:
         base, _, bound = entity.partition("/")[2].partition("/")
         base = base.removeprefix("pad_")
         color = _CLEARANCE_COLORS.get(base) or PAIR_COLORS[PAIR_NAMES.index(base)]
-        shade = tuple(round(0.6 * part) for part in color) if bound else color
-        _style(stream, entity, f"{base} {bound}".strip(), shade, 1.0 if bound else 2.5)
+        shade, width = (_darker(color), 1.0) if bound else (color, 2.5)
+        _style(stream, entity, f"{base} {bound}".strip(), shade, width)
+
+
+def _darker(color: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(round(0.6 * part) for part in color)
 
 
 def band_colors(entity: str) -> list[tuple[int, ...]]:

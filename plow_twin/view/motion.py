@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.run.simulate import Result
 from plow_twin.view.figures import legend_beside
-from plow_twin.view.section import PAIR_COLORS
+from plow_twin.view.section import PAIR_RGB
 
 
 class NotebookFigure(Figure):
@@ -57,7 +57,6 @@ def plot_motion(result: Result, title: str = "") -> Figure:
 
 def _forces(axis: Any, result: Result) -> None:
     for pair, name in enumerate(PAIR_NAMES):
-        color = tuple(part / 255 for part in PAIR_COLORS[pair])
-        axis.plot(result.t, result.force[:, pair] / 1e3, lw=0.9, color=color, label=name)
+        axis.plot(result.t, result.force[:, pair] / 1e3, lw=0.9, color=PAIR_RGB[pair], label=name)
     axis.set_ylim(bottom=0.0)
     axis.set_ylabel("contact force [kN]")

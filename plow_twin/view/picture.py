@@ -18,7 +18,7 @@ from plow_twin.stream.alarms import Thresholds
 from plow_twin.view.envelope import Envelope
 from plow_twin.view.figures import legend_beside, scene_and_date, signed, write_png
 from plow_twin.view.run_curves import Instant, RunCurves
-from plow_twin.view.section import PAIR_COLORS, Section
+from plow_twin.view.section import PAIR_RGB, Section
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,9 +61,8 @@ def run_figure(reader: RunReader, curves: RunCurves) -> Figure:
     _draw_instant(figure.add_subplot(grid[:2, 0]), figure.add_subplot(grid[2, 0]), section, curves)
     force = figure.add_subplot(grid[0, 1:])
     load, clearance = (figure.add_subplot(grid[row, 1:], sharex=force) for row in (1, 2))
-    colors = [tuple(part / 255 for part in color) for color in PAIR_COLORS]
     alarms = alarms_of(reader.header.parameters).alarms
-    _curves(force, curves.force, PAIR_NAMES, "largest force [kN]", colors, only_largest=True)
+    _curves(force, curves.force, PAIR_NAMES, "largest force [kN]", PAIR_RGB, only_largest=True)
     _thresholds(force, alarms["force"].thresholds, 1e-3)
     force.set_ylim(bottom=0.0)
     _curves(load, curves.load, _LOAD_NAMES, "load: forces [kN],\nmoment [kN m]", None, gaps=curves.held_s)
@@ -130,7 +129,7 @@ def _draw_section(axis: Any, section: Section, instant: Instant, curves: RunCurv
     if largest > 0.0:
         origins, vectors, pairs = section.arrows(pose, force)
         for origin, vector, pair in zip(origins, vectors, pairs, strict=True):
-            color = tuple(part / 255 for part in PAIR_COLORS[pair])
+            color = PAIR_RGB[pair]
             axis.annotate("", origin + vector, origin, arrowprops={"arrowstyle": "->", "color": color, "lw": 2})
             text = f"{force[pair] / 1e3:.0f} kN"
             sideways = abs(vector[0]) > abs(vector[1])

@@ -34,6 +34,8 @@ LABEL_MM: Final = 16.0
 _HUES: Final = ((0, 114, 178), (230, 159, 0), (213, 94, 0), (0, 158, 115))
 _LIGHTER: Final = ((86, 180, 233), (240, 228, 66), (255, 158, 105), (110, 220, 185))
 PAIR_COLORS: Final = tuple(color for pair in zip(_HUES, _LIGHTER, strict=True) for color in pair)
+#: The same colours for matplotlib.
+PAIR_RGB: Final = tuple(tuple(part / 255 for part in color) for color in PAIR_COLORS)
 LOAD_COLOR: Final = (204, 121, 167)
 
 _SQUARE: Final[Array] = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])

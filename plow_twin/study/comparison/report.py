@@ -15,7 +15,7 @@ from plow_twin.study.comparison.compare import Comparison
 from plow_twin.study.comparison.windows import QUANTITIES
 from plow_twin.study.report import embedded_figure, write_html, write_json
 from plow_twin.view.figures import date_text, legend_beside
-from plow_twin.view.section import PAIR_COLORS
+from plow_twin.view.section import PAIR_RGB
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -72,9 +72,8 @@ def _lines(axis: Any, found: Comparison) -> None:
     places = np.arange(len(peaks))
     median, high = (np.array([np.percentile(values, point, axis=0) for values in peaks]) for point in (50.0, 95.0))
     for pair, name in enumerate(PAIR_NAMES):
-        color = tuple(part / 255 for part in PAIR_COLORS[pair])
-        axis.plot(places, median[:, pair], color=color, label=name)
-        axis.plot(places, high[:, pair], color=color, ls=":", lw=1.0)
+        axis.plot(places, median[:, pair], color=PAIR_RGB[pair], label=name)
+        axis.plot(places, high[:, pair], color=PAIR_RGB[pair], ls=":", lw=1.0)
     shown = places[:: 1 + len(places) // _MOST_LABELS]
     # a line break puts the time of a shift below its date
     names = [list(found.groups)[place].replace(" ", "\n") for place in shown]
