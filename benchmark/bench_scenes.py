@@ -39,7 +39,7 @@ def reference_poses(name: str) -> tuple[Array, float]:
 
 
 def on_grid(name: str, output_dt: float) -> tuple[Array, int]:
-    """Return the reference poses at the times that an output contains too, and the number of output rows per pose."""
+    """Return the reference poses at times of the output, and the number of output rows per pose."""
     q, dt = reference_poses(name)
     if dt <= output_dt:
         return q[:: round(output_dt / dt)], 1

@@ -1,8 +1,7 @@
 """Time and memory of `compare` for a month of runs: `python benchmark/compare_month.py FOLDER`.
 
 With `--hours 0.5 --rate 100 --verb analyse`, the program measures `analyse` for many short runs. It computes ten
-minutes of motion once, and the run of each day repeats them with its own stamps. The memory depends on the number of
-windows, but not on the sampling rate.
+minutes of motion once, and the run of each day repeats them with its own stamps.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 A head works for a month under a broad-band load. On some days, a sensor with noise, bias and delay measures its pose
 over ten load periods. The load that the estimate gets has an error of 5 %. `estimate` estimates the clearances from
-these data, and their growth gives the coefficient. The true wear is computed with shorter steps (a quarter) and with
-means over more periods (four times as many) than the wear of the estimate.
+these data, and their growth gives the coefficient. The true wear is computed with a quarter of the step and means over
+four times as many periods.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@ multiples of real time:
 - upper bounds of the replay: the motion alone, and decompression alone
 - drawing of a long run, and reading of the file with `mcap` and `rosbags`
 
-Times are processor times of one thread, the shortest of several runs. The start of a replay (scene, twin, and loading
-of compiled code) has its own row. The last column of a replay excludes the start.
+Times are processor times of one thread, the shortest of several runs. The last column of a replay excludes its start
+(scene, twin, and loading of compiled code), which has its own row.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@ benchmark/siconos.py FOLDER` compares the `.ref` files in a copy of that folder,
 `benchmark/results/siconos.csv`.
 
 Both models have four corners in a guide. The slider of Siconos is driven by a crank and a rod. Our slider is a free
-body, on which the mechanism acts as a load m a(t). Here a(t) is the acceleration of the slider across the guide without
-contact, in the state of the reference at time t. Our solver computes touches, restitution and rests.
+body, on which the mechanism acts as a load m a(t), where a(t) is the acceleration across the guide without contact, in
+the state of the reference at time t.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ MOST_PROBLEMS: Final = 50
 def validate(raw: Any, schema: Schema, name: str) -> list[Problem]:
     """Return the problems of plain data in the order of the schema. Messages call the data `name`."""
     problems = (problem for error in _validator()(schema).iter_errors(raw) for problem in _explain(error, name))
-    # jsonschema reports one error for each missing key, and `_explain` yields all missing keys for each error
+    # if n keys are missing, `_explain` yields each of them n times
     unique: dict[str, Problem] = {}
     for problem in islice(map(_brief, problems), 2 * MOST_PROBLEMS):
         unique[str(problem)] = problem

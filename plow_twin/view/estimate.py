@@ -17,7 +17,7 @@ def estimate_picture(
 ) -> FittedPicture:
     """Return the picture of an estimate. Without a fitted motion, only the measured `poses` are drawn.
 
-    `prior` and `labels` contain the interval of the prior, and the name with unit, for each name in `QUANTITIES`.
+    For each name in `QUANTITIES`, `prior` contains an interval, and `labels` a name with unit.
     """
     states = {"horizontal": result.horizontal_state, "vertical": result.vertical_state}
     values = result.values()
