@@ -169,15 +169,17 @@ class Fork:
         return code
 
     def communicate(self, timeout: float | None = None) -> tuple[Any, Any]:
-        """Close the input and wait for the end. Return the texts of the two output streams."""
+        """Close the input and wait for the end. Return the texts of the two output streams, which are then closed."""
         if self.stdin is not None:
             self.stdin.close()
         texts: list[Any] = [None, None]
 
         def read(number: int, stream: IO[Any]) -> None:
-            texts[number] = stream.read()
+            with stream:
+                texts[number] = stream.read()
 
-        streams = [(number, found) for number, found in enumerate((self.stdout, self.stderr)) if found is not None]
+        outputs = enumerate((self.stdout, self.stderr))
+        streams = [(number, found) for number, found in outputs if found is not None and not found.closed]
         readers = [Thread(target=read, args=found, daemon=True) for found in streams]
         for reader in readers:
             reader.start()
