@@ -66,9 +66,7 @@ class Following(Driven, Protocol):
     defers: bool
 
     def catch_up(self) -> None:
-        """Finish the deferred computation for the newest row. Each method except this one finishes the computation
-        first.
-        """
+        """Finish the deferred computation for the newest row. Every other method does so first."""
 
     def add_pose(self, t: float, q: ArrayLike, known: float = ...) -> None:
         """Add a pose `q`, shape (3,), measured at model time `t` in s; a component that was not measured is NaN.
@@ -77,9 +75,7 @@ class Following(Driven, Protocol):
         """
 
     def add_estimate(self, text: str, t: float, start: float = ...) -> None:
-        """Add an estimate (JSON) that takes effect at model time `t` in s; its window begins at model time `start` in
-        s.
-        """
+        """Add an estimate (JSON) with effect from model time `t` [s]; its window begins at `start` [s]."""
 
     @property
     def known(self) -> str:

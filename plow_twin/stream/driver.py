@@ -149,8 +149,7 @@ class Driver:
     def series(
         self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], now_ns: int
     ) -> Iterator[Published | Series]:
-        """Use n samples with the same results as `samples`, but faster; `stamps` [ns] has the shape (n,), `wrench` (n,
-        3).
+        """Use n samples like `samples`, but faster; `stamps` [ns] has the shape (n,), and `wrench` (n, 3).
 
         Plausible samples are applied together and yielded as a `Series`. The caller must journal and publish the series
         before it requests the next item. A sample that needs more checks is processed as in `samples`.
@@ -224,9 +223,7 @@ class Driver:
         return self.session.outputs.pop()
 
     def silence(self, now_ns: int) -> Published:
-        """Advance without samples if the last sample is older than `excitation_timeout_s`; the caller calls this at
-        intervals.
-        """
+        """Advance without samples if the last sample is older than `excitation_timeout_s`."""
         if self.newest_ns is None:
             return NOTHING
         timeout_ns = round(self.policy.excitation_timeout_s * NS_PER_S)
@@ -257,8 +254,7 @@ class Driver:
         return max(0, min(left_ns, _LONGEST_QUIET_NS))
 
     def clock_tick(self, stamp_ns: int, now_ns: int) -> Published:
-        """Advance under the scene's own loads to `stamp_ns` (node's clock) minus the time that the node has been
-        inactive.
+        """Advance under the scene's own loads to the node's time `stamp_ns` minus the time without activity.
 
         The first call after `resume` measures how long the node has been inactive. It does not advance the model.
         """
@@ -316,9 +312,7 @@ class Driver:
         return snapshot
 
     def restore(self, stamp_ns: int, snapshot: journal.Snapshot) -> None:
-        """Return to the motion of a snapshot. The stamp of the next sample corresponds to the model time of the
-        snapshot.
-        """
+        """Return to the motion of a snapshot. The next sample is at the model time of the snapshot."""
         self.failed.end()
         self.session.apply(journal.Restore(stamp_ns, snapshot.data))
         self._begin_again()
@@ -326,8 +320,7 @@ class Driver:
         self.clock.restart()
 
     def set_model(self, stamp_ns: int, changes: Mapping[str, float]) -> None:
-        """Continue with changed numbers of the scene. A number without a key in `changes` has the value of the scene
-        file.
+        """Continue with changed numbers of the scene; a number without a key in `changes` is that of the scene file.
 
         Raises
         ------
@@ -339,8 +332,7 @@ class Driver:
             self.session.apply(journal.SetModel(stamp_ns, json.dumps(dict(changes))))
 
     def set_wear(self, stamp_ns: int, depth_m: Sequence[float], reason: str) -> None:
-        """Set the wear depth of each pad [m], for example after a measurement or after pads were replaced; the motion
-        restarts.
+        """Set the wear depth of each pad [m], for example after pads were replaced, and restart the motion.
 
         Raises
         ------
@@ -368,9 +360,7 @@ class Driver:
         self.clock.restart()
 
     def resume(self, now_ns: int) -> None:
-        """Continue after a pause of the node. A silence is measured from `now_ns`, and the model does not advance by
-        the pause.
-        """
+        """Continue after a pause of the node; a silence is measured from `now_ns`."""
         self._received_ns = now_ns
         self._resumed = True
 

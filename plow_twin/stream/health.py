@@ -29,9 +29,7 @@ class DurationHistogram:
         return sum(self._counts)
 
     def add(self, duration_s: float, count: int = 1) -> None:
-        """Count a duration [s] `count` times. A duration outside the range is counted in the nearest bin. A negative
-        duration is ignored.
-        """
+        """Count a duration [s] `count` times. Negative durations are ignored."""
         if not duration_s >= 0.0:
             return
         if duration_s > self.largest_s:

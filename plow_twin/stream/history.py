@@ -80,9 +80,7 @@ class History:
         self._newest_kept_ns, self._due = None, True
 
     def add(self, stamps_ns: NDArray[np.int64], wrench: NDArray[np.float64]) -> None:
-        """Add applied samples: stamps [ns], shape (n,), and wrenches, shape (n, 3). The arrays must not change
-        afterwards.
-        """
+        """Add applied samples: stamps [ns], shape (n,), and wrenches, shape (n, 3). They must not change later."""
         if not self._span_ns:
             return
         self._later.append((stamps_ns, wrench))
@@ -172,9 +170,7 @@ class History:
         return max(self._resumed_ns[place - 1] if place else 0, self.oldest_ns or 0)
 
     def rewind(self, stamp_ns: int) -> tuple[bytes, list[Sample], list[Travel]]:
-        """Go back to the last snapshot before `stamp_ns` and drop all later data. Return the snapshot, and the dropped
-        samples and travel speeds.
-        """
+        """Go back to the last snapshot before `stamp_ns`; return the snapshot and the later samples and speeds."""
         self._make_samples()
         while self._snapshots[-1][0] >= stamp_ns:
             self._snapshots.pop()

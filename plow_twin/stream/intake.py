@@ -122,9 +122,7 @@ class Intake:
 
     @property
     def missing(self) -> int:
-        """Number of missing samples, which is the expected number between the first and the newest stamp minus the
-        received number.
-        """
+        """Number of missing samples, from the expected rate and the time between the first and the newest stamp."""
         if self._newest_ns is None or self.expected_rate_hz <= 0.0:
             return self._missing_before
         asked = round((self._newest_ns - self._first_ns) * self.expected_rate_hz / NS_PER_S) + 1
@@ -189,9 +187,7 @@ class Intake:
         return ahead_ns <= self.jump_forward_s * NS_PER_S and newest_ns - stamp_ns <= self.jump_back_s * NS_PER_S
 
     def goes_on(self, stamp_ns: int, values: Sequence[float], reached_ns: int) -> bool:
-        """Return whether a quick check shows that a sample will be accepted. If it does not, `jumps` and `judge`
-        decide.
-        """
+        """Return whether a quick check accepts a sample; if it does not, `jumps` and `judge` decide."""
         newest_ns = self._newest_ns
         if newest_ns is None or self.limits is None:
             return False

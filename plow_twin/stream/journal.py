@@ -79,9 +79,7 @@ class SetModel:
 
 @dataclass(frozen=True)
 class Restore:
-    """Continue from the motion in the snapshot `data` with the present wear. The next stamp is at the time of the
-    snapshot.
-    """
+    """Continue from the motion in the snapshot `data`, with the present wear, at the next stamp."""
 
     stamp_ns: int
     data: bytes

@@ -151,8 +151,7 @@ def clearances(scene: Scene, wear_depth: Array) -> Array:
 
 
 def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
-    """Return the 5 % and 95 % quantiles of the wear depths under the prior of the wear coefficient, shape (8,) each
-    [m].
+    """Return the 5 % and 95 % quantiles of the wear depths [m] under the prior of the coefficient, shape (8,) each.
 
     Running-in is neglected. The growth of a depth is assumed to be proportional to the wear coefficient k_s, which is
     accurate while the growth is small compared with the clearance. Without wear, both quantiles equal the wear depth.

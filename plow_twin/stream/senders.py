@@ -60,8 +60,7 @@ class Senders:
         return followed
 
     def alive(self, present: Collection[bytes]) -> None:
-        """Update the set of present senders; if the followed sender has disappeared, follow the sender of the next
-        sample.
+        """Update the set of present senders, and stop following a sender that has disappeared.
 
         A sender that was in no earlier set has not disappeared, because the middleware may not have discovered it yet.
         """
@@ -81,9 +80,7 @@ class Senders:
 
 
 class OneSender:
-    """Follow the sender of the first message until it disappears, or until it sends nothing for 10 s while a second
-    sender sends.
-    """
+    """Follow the first sender until it disappears, or until it is silent for 10 s while another sender sends."""
 
     def __init__(self) -> None:
         self.followed: bytes | None = None

@@ -1,5 +1,4 @@
-"""The session, which computes the motion from journal entries. The computation is deterministic, so that a replay
-repeats the motion of the live node.
+"""The session, which computes the motion from journal entries, in a replay exactly as in the live node.
 
 Terms of this module:
 
@@ -188,9 +187,7 @@ class Session:
         self.following = twin if isinstance(twin, Following) else None
 
     def catch_up(self) -> None:
-        """Finish the computation that a following twin has deferred, and add a snapshot to the history if one is
-        due.
-        """
+        """Finish the deferred computation of a following twin, and add a snapshot to the history if it is due."""
         if self.following is not None:
             self.following.catch_up()
             if self.history.is_due and self.stamp_ns is not None and not self.held:
@@ -384,9 +381,7 @@ class Session:
         taken: NDArray[np.int64],
         digest_after: NDArray[np.int64],
     ) -> Applied:
-        """Advance in parts. A part ends at the stamp of a waiting travel speed, or after a sample that follows a held
-        load.
-        """
+        """Advance in parts, which end at a waiting travel speed or after a sample that follows a held load."""
         if not np.isfinite(wrench).all():
             raise ValueError(f"wrench: got {wrench!r}, expected finite numbers")
         resumed, begin, count = self._resume_wear(), 0, len(stamps)

@@ -87,11 +87,7 @@ class Silences:
         return f"{self.total_ns * 1e-9:.3f} s without samples, {where}"
 
     def facts(self) -> dict[str, int | float]:
-        """Return the number of silences, their total length [s], and the start of the longest [s] since the first
-        sample.
-
-        The dictionary is empty without a silence.
-        """
+        """Return the number of silences, their total length [s], and the start of the longest [s], if any."""
         begin_s = (self.longest_ns[0] - (self._first_ns or 0)) * 1e-9
         return {"count": self.count, "total_s": self.total_ns * 1e-9, "longest_from_s": begin_s} if self.count else {}
 

@@ -16,9 +16,7 @@ Timed = tuple[int, tuple[float, float, float], int]
 
 
 class Steps:
-    """Delay a sample with a jump of the stamp until the next sample confirms the jump, so that a stray stamp has no
-    effect.
-    """
+    """Delay a sample with a jump of the stamp until the next sample confirms the jump."""
 
     def __init__(self, intake: Intake) -> None:
         self._intake = intake

@@ -89,9 +89,7 @@ class Topic:
         return SLOW if self.cadence is Cadence.SLOW else ROW
 
     def numbers(self, records: NDArray[np.void]) -> list[NDArray[np.float64]]:
-        """Return the numbers of messages, as one array (n, count) for each of `parts`; fields of floats are not
-        copied.
-        """
+        """Return the numbers of messages, an array (n, count) for each of `parts`; floats are not copied."""
         columns = ((records[name], count) for name, count in self.parts)
         return [np.asarray(one[:, :count] if one.ndim > 1 else one[:, None], np.float64) for one, count in columns]
 
