@@ -276,7 +276,7 @@ def compare(
         found.distance,
         path_deviate(eye.paths(eye.q, _LAGS_S), features[:, 5:], paths, measured[5:]),
         law,
-        # the limit of the odds was tuned for draws without `near`
+        # near an earlier estimate the odds are not tested, because their limit was tuned for searches without one
         odds if near is None else -math.inf,
         *hidden_by_geometry(unknowns, poses, period, measured[:2]),
     )

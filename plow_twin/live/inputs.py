@@ -151,7 +151,7 @@ class Inputs:
     def uses_pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...] = ()) -> bool:
         """Check a measured pose x, y [m], theta [rad] and its standard deviations, and return whether it is used.
 
-        A component that was not measured is NaN. A pose without a measured component is refused.
+        A component that was not measured is NaN. A pose whose components are all NaN is refused.
         """
         if not self._follows("head_pose", stamp_ns, (*pose, *deviation)):
             return False

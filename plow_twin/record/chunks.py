@@ -195,7 +195,7 @@ class ChunkReader:
                 elif opcode in (_SCHEMA, _CHANNEL):
                     self._declare(opcode, os.pread(descriptor, length, begin), schemas)
                 elif opcode == _METADATA:
-                    # messages before a note of damage are yielded before `damaged` is increased
+                    # the messages before the damage are yielded first, then the damage is counted
                     yield from self._scan(waiting.pop_all(), schemas)
                     self._metadata(os.pread(descriptor, length, begin))
                 elif opcode == _FOOTER:

@@ -35,7 +35,7 @@ class Feed:
     intake: Intake = field(default_factory=Intake)
     #: numbers of messages that do not fit their role, by reason
     unfit: Counter[str] = field(default_factory=Counter)
-    #: whether the first walker writes the measured poses to its journal
+    #: whether measured poses are written to the journal of `walkers[0]`, which records the run
     with_poses: bool = False
     #: intervals without samples, in which the twin interpolates the load linearly
     silences: Silences = field(default_factory=lambda: Silences(Policy.excitation_timeout_s))

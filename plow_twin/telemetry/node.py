@@ -1,4 +1,4 @@
-"""Outputs of a ROS node, in a process that subscribes to the topics of the node and calls its services."""
+"""Send the results of a running ROS node to a plant, from another process that subscribes to the node's topics."""
 
 from __future__ import annotations
 

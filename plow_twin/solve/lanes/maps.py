@@ -1,4 +1,4 @@
-"""Choice of each lane's series variable sigma (time or a root of time), for exponents that are not integers.
+"""Choice of the variable sigma of each lane's Taylor series if the exponent of the contact law is not an integer.
 
 The time since the start of a step is t = alpha sigma + beta sigma^2 / 2 (`method.series`). For the exponent 1.5, sigma
 follows from the square root of the time since a touch or until a separation, as in `method.taylor`.

@@ -251,7 +251,7 @@ def load_lane(p, state, power, lanes, lane, member) -> None:
 
 @kernel()
 def join_lanes(lanes, bits) -> None:
-    """Copy the staged numbers of newly loaded lanes to the rows of all lanes, and derive data from the modes."""
+    """Copy scenes from `staged` to the lanes in `bits`, and update what depends on the modes of their pairs."""
     for block in range(_BLOCKS):
         transpose(lanes.turned[block], lanes.staged[block])
     turned = lanes.turned

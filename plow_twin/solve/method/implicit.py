@@ -444,7 +444,7 @@ def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float
     """Write the series of state, penetration, rate and force from the collocation polynomials. Return the error.
 
     The error is the size of the last terms. The polynomials of velocities and forces omit an initial velocity that a
-    damper stops at once. If it is too large, the error is infinite.
+    damper stops at once. If this velocity is too large, the error is infinite.
     """
     s, body, pairs, scratch = implicit.nodes.size, implicit.body, implicit.pairs, w.left
     _bodies(p, support, state, implicit, 0)
