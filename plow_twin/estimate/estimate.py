@@ -493,7 +493,7 @@ def with_gaps(result: Estimate, by_gaps: GapsFit) -> Estimate:
 
 
 def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: int, work: int) -> Estimate:
-    """Return the estimate for a hard contact, which was found by comparing simulated motions with the measured motion."""
+    """Return the estimate for a hard contact. It was found by comparing simulated motions with the measured motion."""
     sensor = judge_sensor(poses)
     found = (
         ("motion", bounced.distance, tuning.MOST_DISTANCE),

@@ -554,7 +554,7 @@ class Follower:
     # -- clearances and forces ---------------------------------------------------------------------------------------
 
     def clearance(self) -> Array:
-        """Return the horizontal and the vertical clearance, each with its 5 % and 95 % quantiles, in m, shape (2, 3)."""
+        """Return the two clearances, each with its 5 % and 95 % quantiles, in m, shape (2, 3)."""
         self.catch_up()
         self._note_clearance()
         found: Array = self._clearance + self._moved(self.wear_depth).reshape(2, 3)
