@@ -24,8 +24,8 @@ from estimate_truths import GROUPS, Truth, draw
 from filterpy.kalman import EnsembleKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 from numpy.typing import NDArray
 
-from plow_twin.estimate.estimate import thinned
 from plow_twin.estimate.result import NORMAL_P95
+from plow_twin.estimate.screening import thinned
 from plow_twin.estimate.unknowns import DAMPING, GX, GY, SIZE, SOFTNESS, Unknowns
 from plow_twin.kernel.compiler import kernel
 from plow_twin.model.geometry import body_states

@@ -22,12 +22,14 @@ from plow_twin.estimate.bouncing import (
     path_deviate,
     regress_near,
 )
-from plow_twin.estimate.estimate import MOST_OTHER_LAW, estimate, summarise_bounced, with_bounced
+from plow_twin.estimate.combined import with_bounced
+from plow_twin.estimate.estimate import estimate
 from plow_twin.estimate.forces import draw_scenes
 from plow_twin.estimate.laws import Draws, log_odds
 from plow_twin.estimate.likely import Seen, likeliest
 from plow_twin.estimate.measurements import Poses
 from plow_twin.estimate.result import Estimate, Interval, State
+from plow_twin.estimate.summary import MOST_OTHER_LAW, summarise_bounced
 from plow_twin.estimate.unknowns import Unknowns
 from plow_twin.model.scene import Mark, Provenance
 

@@ -12,10 +12,10 @@ from scipy.stats import truncnorm
 
 from plow_twin.estimate import search
 from plow_twin.estimate.arrow import Arrow
-from plow_twin.estimate.estimate import summarise
 from plow_twin.estimate.fit import fit, link_weights
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.result import Interval, State
+from plow_twin.estimate.summary import summarise
 from plow_twin.estimate.unknowns import GAIN, GX, LEAST_CLEARANCE, MOVING, SIZE, SOFTNESS, Unknowns
 from plow_twin.estimate.verdict import Verdict
 from plow_twin.kernel.low_pass import lagged

@@ -13,6 +13,7 @@ from scenes import ROOT, preset
 from plow_twin import Contact, simulate
 from plow_twin.cli.estimate import _given
 from plow_twin.estimate import estimate as estimating
+from plow_twin.estimate import summary
 from plow_twin.estimate.contact_forces import ContactForces, ContactForcesError, forces_at
 from plow_twin.estimate.fit import Fit, Problem, Window
 from plow_twin.estimate.measurements import Poses
@@ -83,7 +84,7 @@ def test_a_cell_that_contradicts_the_motion_is_named(
     else:
         force[:, 2] *= 1e-3
     result, problem, fit = fitted
-    found = estimating._with_forces(result, problem, fit, replace(truth.forces, force=force), 1.0)
+    found = summary._with_forces(result, problem, fit, replace(truth.forces, force=force), 1.0)
     assert (found.sensor, found.model, found.horizontal_state) == ("suspect", "ok", State.WITHDRAWN)
     named = {PAIR_NAMES[2], PAIR_NAMES[5]} if fault == "swapped" else {PAIR_NAMES[2]}
     assert {name for name in PAIR_NAMES if any(f" {name}:" in why for why in found.reasons)} == named
@@ -103,7 +104,7 @@ def test_forces_of_another_law_make_the_model_suspect(truth: Truth, fitted: tupl
     contact = Contact(law="kelvin_voigt", stiffness=truth.scene.contact.stiffness, damping=1e5)
     force = forces_at(replace(truth.scene, contact=contact), -point.residual, point.rate)[1]
     force += 1e3 * np.random.default_rng(0).standard_normal(measured.shape)
-    found = estimating._with_forces(result, problem, fit, ContactForces.of(t, force)[0], 1.0)
+    found = summary._with_forces(result, problem, fit, ContactForces.of(t, force)[0], 1.0)
     assert (found.model, found.sensor, found.vertical_state) == ("suspect", "ok", State.WITHDRAWN)
     assert found.stiffness == result.stiffness and "remain unexplained" in found.reasons[-1]
 

@@ -9,7 +9,8 @@ import pytest
 from estimate_support import Truth, draw, known
 from scenes import gaps_at
 
-from plow_twin.estimate.estimate import estimate, with_gaps
+from plow_twin.estimate.combined import with_gaps
+from plow_twin.estimate.estimate import estimate
 from plow_twin.estimate.gaps import Gaps, GapsError, GapsFit, fit_gaps
 from plow_twin.estimate.measurements import Poses
 from plow_twin.estimate.result import State

@@ -13,8 +13,8 @@ from rerun.chunk import RrdReader
 from scenes import preset
 
 from plow_twin import plot_motion, simulate
-from plow_twin.estimate.estimate import priors
 from plow_twin.estimate.result import Motion
+from plow_twin.estimate.summary import priors
 from plow_twin.estimate.unknowns import QUANTITIES
 from plow_twin.view.estimate import estimate_picture
 from plow_twin.view.fitted import FittedPicture, FittedValue

@@ -28,13 +28,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.errors import ArgumentError
 from plow_twin.estimate import tuning
-from plow_twin.estimate.estimate import prior_of
 from plow_twin.estimate.forces import FEWEST, TOLERANCE
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.members import LATEST_S, Ensemble, widening
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.similar import Units
 from plow_twin.estimate.start import noise_level
+from plow_twin.estimate.summary import prior_of
 from plow_twin.estimate.unknowns import DAMPING, GAIN, Unknowns
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
