@@ -44,6 +44,18 @@ def test_the_command_keeps_the_contract(tmp_path: Path) -> None:
     assert facts["forces"]["members"] == 20 and facts["forces"]["pairs"]["top_left_top"]["peak_n"]["p50"] > 0.0
 
 
+def test_a_folder_without_a_load_gives_rough_clearances_whose_intervals_hold(tmp_path: Path) -> None:
+    truth = draw(replace(GROUPS["hard"], periods=5.0), 30100)
+    truth.write(tmp_path)
+    (tmp_path / "load.csv").unlink()
+    done = plow_twin("estimate", tmp_path, "--json")
+    facts = json.loads(done.stdout)
+    assert facts["model"] == "suspect" and facts["reasons"][0].startswith("load: ")
+    for name, true in zip(("horizontal", "vertical"), truth.clearance, strict=True):
+        value = facts[name]
+        assert value["state"] == "rough" and value["p05_m"] < true < value["p95_m"] < value["p05_m"] + 5e-3
+
+
 def test_a_bag_is_read_by_its_mapping(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", motion(), StoragePlugin.SQLITE3)
     done = plow_twin("estimate", bag, "--map", tmp_path / "map.yaml", "--json", "--scene", "paper")

@@ -140,6 +140,14 @@ def test_a_window_begins_behind_a_silence_of_the_load() -> None:
         assert window.end_ns - window.start_ns >= 2_000_000_000
 
 
+def _pose(t: float, q: np.ndarray) -> PoseStamped:
+    message, (x, y, theta) = PoseStamped(), q
+    set_stamp(message.header, START_NS + round(t * 1e9))
+    message.pose.position.x, message.pose.position.y = x, y
+    message.pose.orientation.z, message.pose.orientation.w = np.sin(0.5 * theta), np.cos(0.5 * theta)
+    return message
+
+
 def _play(running: Bench, truth: Truth, late: bool) -> None:
     """Send load and poses of a simulated machine faster than in real time. With `late`, some poses are late by 1 s."""
     probe = running.probe
@@ -155,11 +163,7 @@ def _play(running: Bench, truth: Truth, late: bool) -> None:
         if kind == 0:
             send(START_NS + round(t * 1e9), content)
         else:
-            stamp, (x, y, theta) = content
-            message = PoseStamped()
-            set_stamp(message.header, START_NS + round(stamp * 1e9))
-            message.pose.position.x, message.pose.position.y = x, y
-            message.pose.orientation.z, message.pose.orientation.w = np.sin(0.5 * theta), np.cos(0.5 * theta)
+            stamp, message = content[0], _pose(*content)
             pose.publish(message)
             place = int(np.searchsorted(truth.poses.t, stamp))
             if place % 5 == 0:
@@ -234,6 +238,25 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
     report = replay(run)
     assert (report.exit_code, report.first_divergence) == (0, None)
     assert report.compared["clearance"] > 0
+
+
+def test_without_a_load_the_poses_give_a_rough_clearance_whose_interval_holds(tmp_path: Path) -> None:
+    truth = draw(replace(GROUPS["hard"], periods=5.0, rate_hz=50.0), 30100)
+    settings = {"estimate": "true", "estimate_window": WINDOW_S, "estimate_interval": INTERVAL_S}
+    with bench(tmp_path, **settings, **RELIABLE) as running:
+        probe = running.probe
+        heard: list[JointState] = probe.listen(JointState, "estimate")
+        pose = probe.publisher(PoseStamped, "head_pose")
+        probe.until_figure("estimate", "ready", "1", timeout_s=100.0)
+        for index, (t, q) in enumerate(zip(truth.poses.t, truth.poses.q, strict=True)):
+            pose.publish(_pose(t, q))
+            probe.pace(index)
+        probe.until(lambda: len(heard) >= 1, "an estimate", 100.0)
+        probe.until(lambda: value(probe.status[-1], "horizontal") == "rough", "the flag")
+        assert [value(probe.status[-1], key) for key in ("vertical", "model")] == ["rough", "suspect"]
+    found = dict(zip(heard[-1].name, heard[-1].position, strict=True))
+    for name, true in zip(("horizontal", "vertical"), truth.clearance, strict=True):
+        assert found[f"{name}/p05"] < true < found[f"{name}/p95"] < found[f"{name}/p05"] + 5e-3
 
 
 def _found(horizontal: State, vertical: State) -> Found:
