@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 _INTERVAL = 2e-3
 #: Step of the difference quotients in m/N. A force of 100 kN then moves the frame by 0.1 um.
 _STEP = 1e-12
-#: Largest error of the load g due to linear interpolation, relative to its range.
+#: Upper bound on the error of the load g due to linear interpolation, relative to its range.
 _INTERPOLATED = 1e-3
 
 
