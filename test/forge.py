@@ -171,7 +171,8 @@ class Fork:
     def communicate(self, timeout: float | None = None) -> tuple[Any, Any]:
         """Close the input and wait for the end. Return the texts of the two output streams, which are then closed."""
         if self.stdin is not None:
-            self.stdin.close()
+            with suppress(BrokenPipeError):
+                self.stdin.close()
         texts: list[Any] = [None, None]
 
         def read(number: int, stream: IO[Any]) -> None:
