@@ -6,6 +6,7 @@ import json
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +75,7 @@ def analyse(
     ]
     for task in tasks:  # all tasks are checked before any task removes a file
         task.check(found)
-    results = _run(tasks, workers or os.cpu_count() or 1, dask, quiet) if many else [_alone(tasks[0], quiet)]
+    results = _results(tasks, many, workers, dask, quiet)
     if many and out is not None:
         from plow_twin.study.analysis.report import write_table_of_runs
 
@@ -115,17 +116,13 @@ def _watched(task: Any, every: float, as_json: bool, quiet: bool) -> int:
     return DONE_WITH_LOSS if facts["lossy"] else DONE
 
 
-def _alone(task: Any, quiet: bool) -> dict[str, Any]:
-    with progress("analysing", quiet) as on_progress:
-        facts: dict[str, Any] = task.stored() or task.run(on_progress)
-    return facts
-
-
-def _run(tasks: list[Any], workers: int, dask: str | None, quiet: bool) -> list[dict[str, Any]]:
+def _results(tasks: list[Any], many: bool, workers: int | None, dask: str | None, quiet: bool) -> list[dict[str, Any]]:
     from plow_twin.study.analysis.many import run_many
 
     with progress("analysing", quiet) as on_progress:
-        return run_many(tasks, workers=workers, dask=dask, on_progress=on_progress)
+        if many:
+            return run_many(tasks, workers=workers or os.cpu_count() or 1, dask=dask, on_progress=on_progress)
+        return [tasks[0].stored() or tasks[0].run(on_progress)]
 
 
 def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any]:
@@ -134,7 +131,6 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
     from plow_twin.cli.interruption import interruptible
     from plow_twin.record.follow import Tail
     from plow_twin.record.running import find_run
-    from plow_twin.study.analysis.analyse import analyse as run
     from plow_twin.study.analysis.report import write_report
 
     due = time.monotonic() + every
@@ -158,16 +154,7 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
     with interruptible() as stopped:
         path = find_run(task.path, max(every, 10.0), stopped)
         task.clear([path])
-        found = run(
-            path,
-            scene=task.scene,
-            mapping=task.mapping,
-            units=task.units,
-            others=task.others,
-            out=task.out,
-            tail=Tail(stopped),
-            on_caught_up=report,
-        )
+        found = replace(task, path=path).analyse(tail=Tail(stopped), on_caught_up=report)
         if task.out is not None:
             write_report(found, task.out)
     return {**found.facts(), "lossy": found.lossy}

@@ -19,7 +19,7 @@ from plow_twin.record.chunks import ChunkReader
 from plow_twin.record.durable import write_whole
 from plow_twin.record.reader import read_header
 from plow_twin.scene_file import dump_scene, load_scene
-from plow_twin.study.analysis.analyse import MAPPED_LOAD, OnProgress, analyse
+from plow_twin.study.analysis.analyse import MAPPED_LOAD, Analysis, OnProgress, analyse
 from plow_twin.study.analysis.report import write_report
 
 #: File with the inputs of an analysis. It is written last, so it shows that the analysis is complete.
@@ -123,19 +123,18 @@ class Task:
     def _inputs(self) -> list[Path]:
         return [self.path, *(path for path in (self.scene, self.mapping, *self.others) if path is not None)]
 
+    def analyse(self, **following: Any) -> Analysis:
+        """Do the analysis without its report. The arguments are passed to the function `analyse`."""
+        return analyse(
+            self.path, scene=self.scene, mapping=self.mapping, units=self.units, others=self.others, out=self.out,
+            **following,
+        )  # fmt: skip
+
     def run(self, on_progress: OnProgress = lambda share: None) -> dict[str, Any]:
         """Do the analysis, write its files and return its result, or raise a `PlowTwinError`."""
         self.clear()
         asked = self._asked()  # the files may change during the analysis
-        found = analyse(
-            self.path,
-            scene=self.scene,
-            mapping=self.mapping,
-            units=self.units,
-            others=self.others,
-            out=self.out,
-            on_progress=on_progress,
-        )
+        found = self.analyse(on_progress=on_progress)
         found.left_out = self.left_out
         if self.out is not None:
             write_report(found, self.out)
