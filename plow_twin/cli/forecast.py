@@ -110,21 +110,20 @@ def forecast(
     except LifeError as error:
         raise click.UsageError(str(error)) from error
     with busy("forecasting", quiet or as_json):
+        known = None
         if history is None:
             model, deviation = _now(model, facts_now)
-            _check_limits(limits, model)
-            found = run(model, plan, deviation)
-            facts = found.as_dict()
         else:
             if estimated is not None:
                 model = replace(model, contact=_now(model, facts_now)[0].contact)
             known = coefficient(model, _history(history))
-            low, high = (float(value) for value in known.deviation)
+            deviation = float(known.deviation[0]), float(known.deviation[1])
             model = with_clearances(model, float(known.clearance[0]), float(known.clearance[1]), known.depth)
-            _check_limits(limits, model)
-            found = run(model, plan, (low, high), known)
-            facts = found.as_dict()
-            facts["coefficient_m2_n"] = asdict(known.interval())
+        _check_limits(limits, model)
+        found = run(model, plan, deviation, known)
+    facts = found.as_dict()
+    if known is not None:
+        facts["coefficient_m2_n"] = asdict(known.interval())
     if plot is not None:
         from plow_twin.view.forecast import draw_forecast
 
