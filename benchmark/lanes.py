@@ -15,7 +15,7 @@ from collections.abc import Callable
 from bench_scenes import SPARSE, T_END, bench_scene
 from work_precision import prepare_bare
 
-from plow_twin import Contact, Scene
+from plow_twin import Contact, Friction, Scene
 from plow_twin.run.ensemble import simulate_many
 
 
@@ -31,6 +31,7 @@ def main() -> None:
     scene, tol = bench_scene("kv"), chosen.tol
     linear = Contact("hunt_crossley", scene.contact.stiffness, 1.0, damping=1.0)
     scenes = {"kv": scene, "hc, n = 1": dataclasses.replace(scene, contact=linear), "hc": bench_scene("hc")}
+    scenes |= {f"{name}, friction": dataclasses.replace(scenes[name], friction=Friction(0.1)) for name in ("kv", "hc")}
     for name, one in scenes.items():
         runs = (prepare_bare(one, SPARSE, tol), _in_lanes(one, 1, tol), _in_lanes(one, 8, tol))
         least = [float("inf")] * len(runs)

@@ -43,10 +43,12 @@ def in_lanes() -> dict[str, list[Scene]]:
         "d^1.5": {"law": "hunt_crossley", "damping": 0.7, "exponent": 1.5, "stiffness": 1e8},
         "d^2": {"law": "hertz", "damping": None, "exponent": 2.0, "stiffness": 1e9},
     }
-    return {
+    found = {
         name: [dataclasses.replace(one, contact=dataclasses.replace(one.contact, **law)) for one in members()]
         for name, law in laws.items()
     }
+    rubbing = zip(found["d^1.5"], np.linspace(0.05, 0.5, 9), strict=True)
+    return found | {"friction": [dataclasses.replace(one, friction=Friction(mu, 0.02)) for one, mu in rubbing]}
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -67,7 +69,7 @@ def test_a_member_beside_the_lanes_is_its_single_run_bit_for_bit(workers: int) -
 @pytest.mark.parametrize(
     "law",
     [
-        pytest.param(law, marks=() if law in ("C d'", "lambda d'", "d^1.5") else pytest.mark.stress)
+        pytest.param(law, marks=() if law in ("C d'", "lambda d'", "d^1.5", "friction") else pytest.mark.stress)
         for law in in_lanes()
     ],
 )

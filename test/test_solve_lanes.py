@@ -99,16 +99,21 @@ SOME = {
     False: {(0, 1, None, None, None), (1, 1, None, None, None)},
     True: {(1, None, 1, None, 1), (2, None, 1, 1, None)},
 }
+#: The combination of scenes with friction.
+RUBBING = {(1, 1, None, None, None)}
 
 
-def drawn(seed: int, count: int, some: bool = True, powers: bool = False) -> list[Scene]:
+def drawn(seed: int, count: int, some: bool = True, powers: bool = False, friction: bool = False) -> list[Scene]:
     rng, found = np.random.default_rng(seed), list[Scene]()
     while len(found) < count:
-        compiled = compile_scene(scene := draw(rng, powers), 1e-6)
+        scene = draw(rng, powers)
+        if friction:
+            scene = dataclasses.replace(scene, friction=Friction(rng.uniform(0.05, 0.5), 10 ** rng.uniform(-2.5, -1.0)))
+        compiled = compile_scene(scene, 1e-6)
         terms = compiled.parts.terms
         directions = (terms.harmonics or 0) + (terms.second or 0)
         kind = directions, terms.viscous, terms.hysteretic, terms.integer, terms.fraction
-        if fits_lanes(compiled) and (not some or kind in SOME[powers]):
+        if fits_lanes(compiled) and (not some or kind in (RUBBING if friction else SOME[powers])):
             found.append(scene)
     return found
 
@@ -117,9 +122,9 @@ def same(one: Ensemble, i: int, other: Ensemble, k: int) -> bool:
     return all(np.array_equal(getattr(one, name)[i], getattr(other, name)[k], equal_nan=True) for name in FIELDS)
 
 
-@pytest.mark.parametrize(("powers", "seed"), [(False, 1), (True, 2)])
-def test_a_scene_has_the_same_bits_alone_and_in_any_company(powers: bool, seed: int) -> None:
-    scenes = drawn(seed, 19, powers=powers)
+@pytest.mark.parametrize(("powers", "friction", "seed"), [(False, False, 1), (True, False, 2), (False, True, 4)])
+def test_a_scene_has_the_same_bits_alone_and_in_any_company(powers: bool, friction: bool, seed: int) -> None:
+    scenes = drawn(seed, 19, powers=powers, friction=friction)
     together = simulate_many(scenes, 1.0, 0.05, 1e-7, workers=1)
     # the lanes end at very different times and are filled again
     assert together.events.min() < together.events.max() // 10
@@ -139,8 +144,8 @@ def test_rows_and_limits_on_the_time_between_two_looks_move_no_bit(monkeypatch: 
     assert np.array_equal(finer.steps, whole.steps)
 
 
-def _check_beside_the_loop(seed: int, count: int, some: bool, powers: bool) -> None:
-    scenes = drawn(seed, count, some, powers)
+def _check_beside_the_loop(seed: int, count: int, some: bool, powers: bool, friction: bool) -> None:
+    scenes = drawn(seed, count, some, powers, friction)
     many = simulate_many(scenes, 0.7, 0.02, 1e-12)
     close = 0
     for index, scene in enumerate(scenes):
@@ -167,16 +172,16 @@ def _check_beside_the_loop(seed: int, count: int, some: bool, powers: bool) -> N
     assert close >= count // 4
 
 
-@pytest.mark.parametrize("powers", [False, True])
-def test_random_scenes_move_as_in_the_loop_of_a_single_scene(powers: bool) -> None:
-    _check_beside_the_loop(3, 16, True, powers)
+@pytest.mark.parametrize(("powers", "friction"), [(False, False), (True, False), (False, True)])
+def test_random_scenes_move_as_in_the_loop_of_a_single_scene(powers: bool, friction: bool) -> None:
+    _check_beside_the_loop(3, 16, True, powers, friction)
 
 
 @pytest.mark.stress
 @settings(max_examples=10)
-@given(st.integers(0, 2**32 - 1), st.booleans())
-def test_many_random_scenes_move_as_in_the_loop_of_a_single_scene(seed: int, powers: bool) -> None:
-    _check_beside_the_loop(seed, 40, False, powers)
+@given(st.integers(0, 2**32 - 1), st.booleans(), st.booleans())
+def test_many_random_scenes_move_as_in_the_loop_of_a_single_scene(seed: int, powers: bool, friction: bool) -> None:
+    _check_beside_the_loop(seed, 40, False, powers, friction)
 
 
 @pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-9])
@@ -211,7 +216,7 @@ def test_scenes_that_lanes_do_not_cover_run_one_by_one() -> None:
     others = [
         dataclasses.replace(scene, contact=Contact("ramped_damping", 2e7, 1.5, damping=6e4, ramp_m=1e-3)),
         dataclasses.replace(scene, contact=dataclasses.replace(scene.contact, damping=1e9)),
-        dataclasses.replace(scene, friction=Friction(0.2, 0.02)),
+        dataclasses.replace(scene, friction=Friction(0.2, stick_stiffness_n_m=5e7)),
         dataclasses.replace(scene, wear=Wear(1e-11, 0.015, 2.0)),
         dataclasses.replace(scene, locked=("theta",)),
         dataclasses.replace(scene, loads=(Table("push", np.array([0.0, 1.0]), np.zeros((2, 3))),)),
@@ -226,4 +231,5 @@ def test_terms_that_a_scene_lacks_are_not_compiled() -> None:
     names = loop.run_lanes.py_func.__code__.co_varnames  # type: ignore[attr-defined]
     signatures = loop.run_lanes.signatures  # type: ignore[attr-defined]
     compiled = [dict(zip(names, map(str, signature), strict=False)) for signature in signatures]
-    assert any(all(one[name] == "none" for name in ("waves", "second", "hysteretic", "flight")) for one in compiled)
+    absent = "waves", "second", "hysteretic", "slip", "flight"
+    assert any(all(one[name] == "none" for name in absent) for one in compiled)

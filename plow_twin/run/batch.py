@@ -86,9 +86,10 @@ class TwinBatch:
     A call raises `LimitError` after `max_wall_s`, and `RunInterrupted` after Ctrl-C. After such an error, all twins
     have the state before the call.
 
-    Each SIMD vector advances eight twins if no scene has a ramp, wear, friction, a support, locks, an offset centre of
-    mass or overdamped contact. The results agree with those of a `Twin` within the tolerance, and do not depend on the
-    other twins of the batch. In all other batches, the results are bit-identical to a `Twin` with the same terms.
+    Each SIMD vector advances eight twins if no scene has a ramp, wear, friction with stick, a support, locks, an offset
+    centre of mass or overdamped contact. The results agree with those of a `Twin` within the tolerance, and do not
+    depend on the other twins of the batch if all have the same terms. In all other batches, the results are
+    bit-identical to a `Twin` with the same terms.
     """
 
     def __init__(

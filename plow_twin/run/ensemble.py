@@ -1,7 +1,7 @@
 """Runs of many scenes on all cores.
 
-Scenes whose only terms are their contact law and harmonic loads share SIMD vectors (`solve.lanes`). All other scenes
-run one by one.
+Scenes whose only terms are their contact law, regularised friction and harmonic loads share SIMD vectors
+(`solve.lanes`). All other scenes run one by one.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ def simulate_many(
     """Simulate every scene from t = 0 to `t_end`. The bits of a result do not depend on the other scenes.
 
     Scenes run eight at a time in the lanes of a SIMD vector if they have constant or harmonic loads, a contact law
-    without a ramp, and no further terms. The results of these scenes agree with `simulate` within the tolerance. For
-    all other scenes the results are bit-identical to `simulate`.
+    without a ramp, perhaps regularised friction, and no further terms. The results of these scenes agree with
+    `simulate` within the tolerance. For all other scenes the results are bit-identical to `simulate`.
 
     Parameters
     ----------

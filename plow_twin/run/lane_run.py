@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from plow_twin.run.motion import Motion, next_slice, run_events
 from plow_twin.solve.compiled_scene import CompiledScene
 from plow_twin.solve.lanes.loop import OTHER_METHOD, Members, run_lanes
-from plow_twin.solve.lanes.record import powers
+from plow_twin.solve.lanes.record import forces
 from plow_twin.solve.modes import settle_many
 from plow_twin.solve.state import EVENT, HARMONIC, STATE, TOTALS, Status, Work, new_records
 
@@ -71,7 +71,7 @@ class LaneRun:
         one, begin = self._compiled[waiting[0]], _time.perf_counter()
         terms = one.parts.terms
         run_lanes(
-            self._members, terms.harmonics, terms.second, terms.viscous, terms.hysteretic, *powers(terms),
+            self._members, terms.harmonics, terms.second, terms.viscous, terms.hysteretic, *forces(terms),
             terms.flight, terms.rest, int(one.params.order), lanes, work, waiting, self._t_end, self._max_steps,
             self._size, self._times,
         )  # fmt: skip

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from plow_twin.kernel.compiler import for_arguments
 from plow_twin.run.pace import Pace
 from plow_twin.solve.lanes.advance import OTHERS, Load, Samples, advance_lanes
-from plow_twin.solve.lanes.record import BLOCK, WIDTH, new_lanes, powers
+from plow_twin.solve.lanes.record import BLOCK, WIDTH, forces, new_lanes
 from plow_twin.solve.state import TOTALS, Terms, new_records
 
 #: Total number of steps of all lanes in a slice of work, which takes about a millisecond.
@@ -83,7 +83,7 @@ class LaneTwins:
                 self._progress, self._other,
             )  # fmt: skip
             arguments = (
-                samples, terms.viscous, terms.hysteretic, *powers(terms), terms.rest, self._order, self._lanes,
+                samples, terms.viscous, terms.hysteretic, *forces(terms), terms.rest, self._order, self._lanes,
                 self._work, self._max_steps, _SLICE,
             )  # fmt: skip
             if self._kernel is None:

@@ -45,7 +45,7 @@ from plow_twin.solve.lanes.record import (
     write_block,
     write_place,
 )
-from plow_twin.solve.lanes.series import accurate_steps, expand, raised
+from plow_twin.solve.lanes.series import accurate_steps, before_sticking, expand, raised
 from plow_twin.solve.lanes.totals import add_step, sum_step
 from plow_twin.solve.method.rest import slow_enough
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, Status, X, Y
@@ -173,11 +173,11 @@ def _steps_since(lanes, lane) -> int:
 
 
 @kernel()
-def _next_block(s, hysteretic, power, lanes) -> bool:
+def _next_block(s, hysteretic, power, slip, lanes) -> bool:
     """Load the next block with a twin that has not passed all samples. Return whether there is such a block."""
     progress = s.progress
     if progress[LOADED] != 0:
-        _store_block(s, hysteretic, power, lanes)
+        _store_block(s, hysteretic, power, slip, lanes)
     while progress[BLOCK_NOW] < s.blocks.size:
         first, live, count = progress[FIRST] + WIDTH * progress[BLOCK_NOW], 0, 0
         for lane in range(WIDTH):
@@ -185,19 +185,19 @@ def _next_block(s, hysteretic, power, lanes) -> bool:
                 count += 1
                 live |= 1 << lane if s.place[first + lane] < s.times.size else 0
         if live != 0:
-            _load_block(s, power, lanes, first, count, live)
+            _load_block(s, power, slip, lanes, first, count, live)
             return True
         progress[BLOCK_NOW] += 1
     return False
 
 
 @kernel()
-def _load_block(s, power, lanes, first, count, live) -> None:
+def _load_block(s, power, slip, lanes, first, count, live) -> None:
     """Load `count` twins into the lanes, beginning with `first`, and start the advances of the twins in `live`."""
     block = s.progress[BLOCK_NOW]
     if s.noted[block] < 0:
         for lane in range(count):
-            _load_record(s, power, lanes, lane, first + lane)
+            _load_record(s, power, slip, lanes, lane, first + lane)
         join_lanes(lanes, (1 << count) - 1)
     else:
         read_block(lanes, s.blocks[block])
@@ -221,21 +221,21 @@ def _load_block(s, power, lanes, first, count, live) -> None:
 
 
 @kernel()
-def _load_record(s, power, lanes, lane, member) -> None:
+def _load_record(s, power, slip, lanes, lane, member) -> None:
     """Load a twin into a lane from its record. The caller has to call `join_lanes` afterwards."""
     p = s.params[member]
-    load_lane(p, s.states[member], power, lanes, lane, member)
+    load_lane(p, s.states[member], power, slip, lanes, lane, member)
     lanes.small[lane] = _VANISHED * p.threshold[p.order]
     for j in range(3):
         lanes.mass[j, lane] = s.load.masses[member, j]
 
 
 @kernel()
-def _store_block(s, hysteretic, power, lanes) -> None:
+def _store_block(s, hysteretic, power, slip, lanes) -> None:
     """Write the lanes to their block, which must be loaded from records if a twin has left the lanes."""
     block = s.progress[BLOCK_NOW]
     if s.progress[LOADED] == _LOADED:
-        refresh(lanes, hysteretic, power)
+        refresh(lanes, hysteretic, power, slip)
         write_block(s.blocks[block], lanes, s.noted[block] < 0)
         if lanes.noted[0] >= 0:
             s.noted[block] = lanes.noted[0]
@@ -405,10 +405,10 @@ def _look(s, rest, lanes, lane, budget, in_range, ahead) -> int:
 
 
 @kernel()
-def _get_ready(s, viscous, hysteretic, power, fraction, rest, lanes, budget) -> bool:
+def _get_ready(s, viscous, hysteretic, power, fraction, slip, rest, lanes, budget) -> bool:
     """Write the rows of samples that were reached, and load blocks. Return whether any lane has a step to take."""
     while True:
-        if lanes.live[0] == 0 and not _next_block(s, hysteretic, power, lanes):
+        if lanes.live[0] == 0 and not _next_block(s, hysteretic, power, slip, lanes):
             return False
         in_range, ahead, reached, failed, left = bits_in_range(lanes), _limit_steps(lanes), 0, 0, 0
         for lane in range(WIDTH):
@@ -453,20 +453,22 @@ def _leave(s, lanes, lane) -> None:
 
 
 @kernel()
-def _step(s, viscous, hysteretic, power, fraction, order, lanes, w) -> None:
+def _step(s, viscous, hysteretic, power, fraction, slip, order, lanes, w) -> None:
     time = exact_row(lanes.time, 0) - exact_row(lanes.knot, 0)
     for j in range(3):
         sampled = fused(exact_row(lanes.slope, j), time, exact_row(lanes.sample, j))
         set_row(lanes.held, j, exact_row(lanes.constant, j) + sampled)
-    refresh(lanes, hysteretic, power)
+    refresh(lanes, hysteretic, power, slip)
     if fraction is not None:
-        choose_maps(None, None, None, None, hysteretic, fraction, 1, lanes, w)
-    used = expand(lanes, w, order, None, None, viscous, hysteretic, power, fraction, 1)
+        choose_maps(None, None, None, None, hysteretic, fraction, slip, 1, lanes, w)
+    used = expand(lanes, w, order, None, None, viscous, hysteretic, power, fraction, slip, 1)
     infinite = accurate_steps(lanes, w, order, power, fraction)
     lanes.failed[0] = infinite
     if infinite != 0:
         lanes.live[0] &= ~infinite
         note_modes(lanes)
+    if slip is not None:
+        before_sticking(lanes, w, used)
     first_events(lanes, w, used, order, hysteretic, power, fraction)
     go_past_an_instant(s.params, lanes)
     note_switches(lanes, used, viscous, fraction)
@@ -485,7 +487,7 @@ def _step(s, viscous, hysteretic, power, fraction, order, lanes, w) -> None:
 
 @kernel(entry=True)
 def advance_lanes(
-    s, viscous, hysteretic, power, fraction, rest, order, eight, work, budget, iterations
+    s, viscous, hysteretic, power, fraction, slip, rest, order, eight, work, budget, iterations
 ) -> bool:  # fmt: skip
     """Advance the twins of all blocks through all samples. Return False if `iterations` iterations were not sufficient.
 
@@ -495,7 +497,7 @@ def advance_lanes(
     """
     s, lanes, w = _unowned_samples(s), eight[0], work[0]
     for _ in range(iterations):
-        if not _get_ready(s, viscous, hysteretic, power, fraction, rest, lanes, budget):
+        if not _get_ready(s, viscous, hysteretic, power, fraction, slip, rest, lanes, budget):
             return True
-        _step(s, viscous, hysteretic, power, fraction, order, lanes, w)
+        _step(s, viscous, hysteretic, power, fraction, slip, order, lanes, w)
     return False

@@ -31,7 +31,7 @@ from plow_twin.solve.lanes.record import (
     save_lanes,
     write_place,
 )
-from plow_twin.solve.lanes.series import accurate_steps, expand, expand_loads
+from plow_twin.solve.lanes.series import accurate_steps, before_sticking, expand, expand_loads
 from plow_twin.solve.lanes.totals import add_step, find_peaks, sum_step
 from plow_twin.solve.lanes.waves import turn_lanes
 from plow_twin.solve.method.flight import safe_time
@@ -320,9 +320,9 @@ def _unowned_members(members):
 
 
 @kernel()
-def _load(members, power, lanes, lane, member) -> None:
+def _load(members, power, slip, lanes, lane, member) -> None:
     totals = members.totals[member]
-    load_lane(members.params[member], members.states[member], power, lanes, lane, member)
+    load_lane(members.params[member], members.states[member], power, slip, lanes, lane, member)
     join_lanes(lanes, 1 << lane)
     for pair in range(PAIR_COUNT):
         lanes.peak[pair, lane], lanes.impulse[pair, lane] = totals.peak[pair], totals.impulse[pair]
@@ -331,15 +331,15 @@ def _load(members, power, lanes, lane, member) -> None:
 
 @kernel(entry=True)
 def run_lanes(
-    members, waves, second, viscous, hysteretic, power, fraction, flight, rest, order, lanes, w, queue, t_end, budget,
-    iterations, t,
+    members, waves, second, viscous, hysteretic, power, fraction, slip, flight, rest, order, lanes, w, queue, t_end,
+    budget, iterations, t,
 ) -> bool:  # fmt: skip
     """Advance the members with the indices `queue` to `t_end`, eight at a time.
 
-    `power` and `fraction` are those of `record.powers`, `order` is the order of the series, `budget` the largest number
-    of steps of a scene, and `t` contains the times of the output rows. A scene leaves its lane with a `Status` or with
-    `OTHER_METHOD`. If `iterations` iterations are not sufficient, all scenes leave with `PAUSED`, and the result is
-    False.
+    `power`, `fraction` and `slip` are those of `record.forces`, `order` is the order of the series, `budget` the
+    largest number of steps of a scene, and `t` contains the times of the output rows. A scene leaves its lane with a
+    `Status` or with `OTHER_METHOD`. If `iterations` iterations are not sufficient, all scenes leave with `PAUSED`, and
+    the result is False.
     """
     members, queue, t = _unowned_members(members), unowned(queue), unowned(t)
     waiting = 0
@@ -353,7 +353,7 @@ def run_lanes(
                         break
                     member = queue[waiting]
                     waiting += 1
-                    _load(members, power, lanes, lane, member)
+                    _load(members, power, slip, lanes, lane, member)
                     sure = False
                 code = _look(members, flight, rest, lanes, lane, w, t_end, budget, sure)
                 if code == _OK:
@@ -362,8 +362,8 @@ def run_lanes(
                 _leave(members, lanes, w, order, lane, code, t)
         if live == 0:
             return True
-        refresh(lanes, hysteretic, power)
-        _step(members, waves, second, viscous, hysteretic, power, fraction, order, lanes, w, t)
+        refresh(lanes, hysteretic, power, slip)
+        _step(members, waves, second, viscous, hysteretic, power, fraction, slip, order, lanes, w, t)
     for lane in range(WIDTH):
         if lanes.member[lane] >= 0:
             _leave(members, lanes, w, order, lane, _PAUSED, t)
@@ -371,17 +371,19 @@ def run_lanes(
 
 
 @kernel()
-def _step(members, waves, second, viscous, hysteretic, power, fraction, order, lanes, w, t) -> None:
+def _step(members, waves, second, viscous, hysteretic, power, fraction, slip, order, lanes, w, t) -> None:
     if fraction is not None:
-        choose_maps(members.harmonics, members.extent, waves, second, hysteretic, fraction, None, lanes, w)
+        choose_maps(members.harmonics, members.extent, waves, second, hysteretic, fraction, slip, None, lanes, w)
     if waves is not None:
         expand_loads(members.harmonics, members.extent, second, fraction, lanes, w, order)
-    expand(lanes, w, order, waves, second, viscous, hysteretic, power, fraction, None)
+    expand(lanes, w, order, waves, second, viscous, hysteretic, power, fraction, slip, None)
     infinite = accurate_steps(lanes, w, order, power, fraction)
     if infinite != 0:
         for lane in range(WIDTH):
             if infinite >> lane & 1:
                 _leave(members, lanes, w, order, lane, _NON_FINITE, t)
+    if slip is not None:
+        before_sticking(lanes, w, order)
     first_events(lanes, w, order, order, hysteretic, power, fraction)
     go_past_an_instant(members.params, lanes)
     note_switches(lanes, order, viscous, fraction)

@@ -49,7 +49,7 @@ def sigma_of(lanes, lane, used, fraction) -> float:
 
 
 @kernel()
-def choose_maps(harmonics, extent, waves, second, hysteretic, fraction, segments, lanes, w) -> None:
+def choose_maps(harmonics, extent, waves, second, hysteretic, fraction, slip, segments, lanes, w) -> None:
     """Choose the series variable of each lane, convert `lanes.whole` to it, and release pairs that are too shallow."""
     shallow, near = _look_at_pairs(lanes)
     if shallow != 0:
@@ -64,7 +64,7 @@ def choose_maps(harmonics, extent, waves, second, hysteretic, fraction, segments
     if near != 0:
         if waves is not None:
             expand_loads(harmonics, extent, second, fraction, lanes, w, PARTING_ORDER)
-        order = expand(lanes, w, PARTING_ORDER, waves, second, None, hysteretic, 1, fraction, segments)
+        order = expand(lanes, w, PARTING_ORDER, waves, second, None, hysteretic, 1, fraction, slip, segments)
     for lane in range(WIDTH):
         if lanes.member[lane] >= 0:
             _choose_map(lanes, w, lane, order, near >> lane & 1 == 1)

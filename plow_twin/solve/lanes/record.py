@@ -61,6 +61,10 @@ _BLOCK_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("small", "f8", _LANES_OF),  # size of a term, over the longest admissible step, below which it is treated as zero
     ("threshold", "f8", (MOST_LACUNA, WIDTH)),  # admissible sizes of the last orders, as velocities
     ("stretch", "f8", _LANES_OF),  # log2 of velocity tolerance / (position tolerance (order + 1))
+    # the following fields are used only for friction
+    ("friction", "f8", _LANES_OF),  # mu
+    ("per_slip_speed", "f8", _LANES_OF),  # 1 / v_s
+    ("steepness", "f8", _LANES_OF),  # log2 of the admissible size of the last term over that of the first term
     # the following fields are used only for exponents other than 1
     ("exponent", "f8", _LANES_OF),
     ("release", "f8", _LANES_OF),  # penetration below which the force is negligible
@@ -165,6 +169,10 @@ LANES: Final = np.dtype(
         ("base", "f8", (PAIR_COUNT, _ROWS, WIDTH)),
         ("rate", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d' of the pair in each slot
         ("per_base", "f8", _PAIRS),  # 1 / base at the start of the step
+        # the following fields are used only for friction, for the pair in each slot; r = s' / v_s
+        ("slip", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # k r_k, and r_0 in row 0
+        ("tanh", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # tanh r
+        ("rest", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # 1 - tanh^2 r
         # the following fields are used only for exponents that are not integers
         ("rates", "f8", (4, _ROWS, WIDTH)),  # rates of cosine, sine, X and Y
         ("alpha", "f8", _LANES_OF),  # the time since the start of the step is alpha sigma + beta sigma^2 / 2
@@ -185,9 +193,9 @@ LANES: Final = np.dtype(
 )
 
 
-#: Terms that lanes support: a contact law without a ramp, and harmonic loads. A scene leaves its lane for flight and
-#: rest.
-_COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "fraction", "flight", "rest"}
+#: Terms that lanes support: a contact law without a ramp, regularised friction, and harmonic loads. A scene leaves its
+#: lane for flight and rest.
+_COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "fraction", "slip", "flight", "rest"}
 
 
 def fits_lanes(compiled: CompiledScene, *, sampled: bool = False) -> bool:
@@ -197,9 +205,9 @@ def fits_lanes(compiled: CompiledScene, *, sampled: bool = False) -> bool:
     return parts.implicit is None and _COVERED.issuperset(there) and not any(options(compiled.scene))
 
 
-def powers(terms: Terms) -> tuple[int | None, int | None]:
-    """Return two flags, 1 or None, for exponents other than 1 and for exponents that are not integers."""
-    return 1 if terms.integer or terms.fraction else None, terms.fraction
+def forces(terms: Terms) -> tuple[int | None, int | None, int | None]:
+    """Return flags, 1 or None: for exponents other than 1, for exponents that are not integers, and for friction."""
+    return 1 if terms.integer or terms.fraction else None, terms.fraction, terms.slip
 
 
 def new_lanes() -> NDArray[np.void]:
@@ -212,7 +220,7 @@ def new_lanes() -> NDArray[np.void]:
 
 
 @kernel()
-def load_lane(p, state, power, lanes, lane, member) -> None:
+def load_lane(p, state, power, slip, lanes, lane, member) -> None:
     """Load a scene into a lane. The caller has to call `join_lanes` afterwards."""
     lanes.member[lane], lanes.time[lane] = member, state.step_start
     lanes.live[0] |= 1 << lane
@@ -238,6 +246,9 @@ def load_lane(p, state, power, lanes, lane, member) -> None:
     lanes.half_cavity[lane] = p.half_cavity
     if power is not None:
         lanes.exponent[lane], lanes.release[lane] = p.exponent, p.release
+    if slip is not None:
+        lanes.friction[lane], lanes.per_slip_speed[lane] = p.friction, 1.0 / p.slip_speed
+        lanes.steepness[lane] = math.log2(p.threshold[p.order] / p.threshold[0])
     for i in range(MOST_LACUNA):
         lanes.threshold[i, lane] = p.threshold[p.order - i] if i < p.lacuna else np.inf
     lanes.stretch[lane] = math.log2(p.velocity_tolerance / (p.position_tolerance * (p.order + 1)))
@@ -347,10 +358,10 @@ def _take_slot(lanes, lane, pair, slot) -> None:
 
 
 @kernel()
-def refresh(lanes, hysteretic, power) -> None:
+def refresh(lanes, hysteretic, power, slip) -> None:
     """Update the linear maps of `_weigh_lanes` if modes or scenes have changed."""
     if lanes.stale[0] == 1:
-        if hysteretic is None and power is None:
+        if hysteretic is None and power is None and slip is None:
             _weigh_lanes(lanes)
         lanes.stale[0] = 0
 

@@ -2,10 +2,13 @@
 
 If the contact force is linear in penetration and rate, the sum over a scene's acting pairs is one affine map of the
 state, and an order needs twelve Cauchy products. For each slot of acting pairs (`record`), the force K d (1 + lambda
-d') = K (d + lambda / 2 (d^2)') adds half a product, and the force K d^n (1 + lambda d') adds three.
+d') = K (d + lambda / 2 (d^2)') adds half a product, the force K d^n (1 + lambda d') adds three, and friction three
+more.
 """
 
 from __future__ import annotations
+
+import math
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, magnitude, set_row, square_root
@@ -80,7 +83,7 @@ def expand_loads(harmonics, extent, second, fraction, lanes, w, order) -> None:
 
 
 @kernel()
-def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction, segments) -> int:
+def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction, slip, segments) -> int:
     """Write the series of the state, and return the order.
 
     Under sampled loads, the series of a lane ends at the order from which its terms are negligible over the longest
@@ -193,12 +196,12 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction,
             if fraction is not None:
                 _set_rates(lanes, k, dx, dy, dc, ds)
             fx, fy, gc, gs = _push_by_power(
-                lanes, w, k, acts, hysteretic, fraction, c, s, x, y, dc, ds, dx, dy, alpha, beta
+                lanes, w, k, acts, hysteretic, fraction, slip, c, s, x, y, dc, ds, dx, dy, alpha, beta
             )
-        elif hysteretic is not None:
-            fx, fy, gc, gs = _push(lanes, w, k, acts, c, s, x, y, dc, ds, dx, dy)
-        elif k == 0:
-            fx, fy, gc, gs = _start(lanes, viscous, c, s, x, y, dc, ds, dx, dy)
+        elif hysteretic is not None or slip is not None or k == 0:
+            # the first forces are computed from the same penetrations as the guard functions; the summed maps
+            # (`record._weigh_lanes`) have different rounding, so the force would begin 1e-17 m away from the event
+            fx, fy, gc, gs = _push(lanes, w, k, acts, viscous, hysteretic, slip, c, s, x, y, dc, ds, dx, dy)
         else:
             fx = _force(along[0], viscous, c, s, x, dc, ds, dx)
             fy = _force(along[1], viscous, c, s, y, dc, ds, dy)
@@ -296,27 +299,6 @@ def _add_ends(load, k, c0, s0, c, s, share, wc, ws):
     return fused(newest, c0, fused(first, c, wc)), fused(newest, s0, fused(first, s, ws))
 
 
-@kernel()
-def _start(lanes, viscous, c, s, x, y, dc, ds, dx, dy):
-    """Return coefficient 0 of the forces along X and Y, and of the factors of cosine and sine in the contacts' moment.
-
-    They are computed from the same penetrations as the guard functions. By the rounding of the summed maps
-    (`record._weigh_lanes`), the force would begin 1e-17 m away from the event.
-    """
-    fx = fy = gc = gs = exact_splat(0.0)
-    for slot in range(PAIR_COUNT):
-        taken, gear = lanes.taken[slot], lanes.gear[slot]
-        if taken == 0:
-            break
-        push = penetration_at(gear, c, s, x, y)
-        if viscous is not None:
-            push = fused(
-                exact_row(lanes.viscous, 0) / exact_row(lanes.stiffness, 0), linear_at(gear, dc, ds, dx, dy), push
-            )
-        fx, fy, gc, gs = _add_force(lanes, gear, choose(taken, push, exact_splat(0.0)), fx, fy, gc, gs)
-    return fx, fy, gc, gs
-
-
 @kernel(inline="code")
 def _add_force(lanes, gear, push, fx, fy, gc, gs):
     """Return the forces along X and Y and the factors of c and s in the moment, plus those of a slot's F = K `push`."""
@@ -328,11 +310,11 @@ def _add_force(lanes, gear, push, fx, fy, gc, gs):
 
 
 @kernel(inline="code")
-def _push(lanes, w, k, acts, c, s, x, y, dc, ds, dx, dy):
+def _push(lanes, w, k, acts, viscous, hysteretic, slip, c, s, x, y, dc, ds, dx, dy):
     """Return coefficient k of the forces along X and Y, and of the factors of cosine and sine in the contacts' moment.
 
-    They are sums over the slots for F = K d (1 + lambda d'). The next order of the penetrations and order k of F / K
-    are written to `lanes`.
+    They are sums over the slots for F = K d + C d' or F = K d (1 + lambda d'). The next order of the penetrations and
+    order k of F / K are written to `lanes`.
     """
     fx = fy = gc = gs = exact_splat(0.0)
     for slot in range(PAIR_COUNT):
@@ -341,23 +323,29 @@ def _push(lanes, w, k, acts, c, s, x, y, dc, ds, dx, dy):
             break
         if k == 0:
             set_row(depth, 0, penetration_at(gear, c, s, x, y))
-        deeper = linear_at(gear, dc, ds, dx, dy) * w.inverse[k + 1]
+        rate, push = linear_at(gear, dc, ds, dx, dy), exact_row(depth, k)
+        deeper = rate * w.inverse[k + 1]
         set_row(depth, k + 1, deeper)
-        half = exact_row(depth, 0) * deeper
-        for j in range(1, k // 2 + 1):
-            half = fused(exact_row(depth, j), exact_row(depth, k + 1 - j), half)
-        if k % 2 == 1:
-            middle = exact_row(depth, k // 2 + 1)
-            half = fused(middle * 0.5, middle, half)
-        damped = half * (k + 1.0)
-        push = choose(taken, fused(exact_row(gear, 7), damped, exact_row(depth, k)), exact_splat(0.0))
+        if hysteretic is not None:
+            half = exact_row(depth, 0) * deeper
+            for j in range(1, k // 2 + 1):
+                half = fused(exact_row(depth, j), exact_row(depth, k + 1 - j), half)
+            if k % 2 == 1:
+                middle = exact_row(depth, k // 2 + 1)
+                half = fused(middle * 0.5, middle, half)
+            push = fused(exact_row(gear, 7), half * (k + 1.0), push)
+        elif viscous is not None:
+            push = fused(exact_row(lanes.viscous, 0) / exact_row(lanes.stiffness, 0), rate, push)
+        push = choose(taken, push, exact_splat(0.0))
         set_row(lanes.push[slot], k, push)
         fx, fy, gc, gs = _add_force(lanes, gear, push, fx, fy, gc, gs)
+        if slip is not None:
+            fx, fy, gc, gs = _add_friction(lanes, w, slot, k, taken, push, dc, ds, dx, dy, fx, fy, gc, gs)
     return fx, fy, gc, gs
 
 
 @kernel(inline="code")
-def _push_by_power(lanes, w, k, acts, hysteretic, fraction, c, s, x, y, dc, ds, dx, dy, alpha, beta):
+def _push_by_power(lanes, w, k, acts, hysteretic, fraction, slip, c, s, x, y, dc, ds, dx, dy, alpha, beta):
     """Return the results of `_push` for F = K d^n (1 + lambda d') with exponents n other than 1."""
     fx = fy = gc = gs = zero = exact_splat(0.0)
     for slot in range(PAIR_COUNT):
@@ -390,7 +378,46 @@ def _push_by_power(lanes, w, k, acts, hysteretic, fraction, c, s, x, y, dc, ds, 
             push = fused(exact_row(gear, 7), damped, push)
         set_row(lanes.push[slot], k, push)
         fx, fy, gc, gs = _add_force(lanes, gear, push, fx, fy, gc, gs)
+        if slip is not None:
+            taken = lanes.taken[slot] & acts
+            fx, fy, gc, gs = _add_friction(lanes, w, slot, k, taken, push, dc, ds, dx, dy, fx, fy, gc, gs)
     return fx, fy, gc, gs
+
+
+@kernel(inline="code")
+def _add_friction(lanes, w, slot, k, taken, push, dc, ds, dx, dy, fx, fy, gc, gs):
+    """Return forces and factors after adding coefficient k of a slot's friction T = mu F tanh r (`method.series`).
+
+    For a head that carries walls, the position of a corner along its wall has the coefficients of the arm of F with the
+    opposite sign, and the arm of T has the coefficients of the penetration (`model.geometry`).
+    """
+    gear, slip, tau, rest = lanes.gear[slot], lanes.slip[slot], lanes.tanh[slot], lanes.rest[slot]
+    rate = fused(exact_row(gear, 5), dc, fused(exact_row(gear, 6), ds, exact_row(gear, 3) * dx))
+    rate = fused(exact_row(gear, 2), dy, rate * -1.0) * exact_row(lanes.per_slip_speed, 0)
+    if k == 0:
+        set_row(slip, 0, rate)
+        for lane in range(WIDTH):
+            tau[0, lane] = math.tanh(slip[0, lane])
+        newest = exact_row(tau, 0)
+        drag, square = push * newest, newest * newest - 1.0
+    else:
+        weighted, newest, drag, square = rate * (1.0 * k), exact_splat(0.0), exact_splat(0.0), exact_splat(0.0)
+        set_row(slip, k, weighted)
+        for j in range(1, k):
+            newest = fused(exact_row(slip, j), exact_row(rest, k - j), newest)
+            drag = fused(exact_row(lanes.push[slot], j), exact_row(tau, k - j), drag)
+            square = fused(exact_row(tau, j), exact_row(tau, k - j), square)
+        first = exact_row(tau, 0)
+        newest = fused(weighted, exact_row(rest, 0), newest) * w.inverse[k]
+        drag = fused(push, first, fused(exact_row(lanes.push[slot], 0), newest, drag))
+        square = fused(first * 2.0, newest, square)
+        set_row(tau, k, newest)
+    set_row(rest, k, square * -1.0)
+    force = choose(taken, exact_row(lanes.friction, 0) * exact_row(lanes.stiffness, 0) * drag, exact_splat(0.0))
+    return (
+        fused(exact_row(gear, 3), force, fx), fused(exact_row(gear, 2) * -1.0, force, fy),
+        fused(exact_row(gear, 0), force, gc), fused(exact_row(gear, 1), force, gs),
+    )  # fmt: skip
 
 
 @kernel(inline="code")
@@ -524,14 +551,18 @@ def _size(lanes, vx, vy, om, c, s):
 
 
 @kernel()
+def _end_before_stop(lanes, bits) -> None:
+    for lane in range(WIDTH):
+        lanes.ends_at_stop[lane] &= 1 - (bits >> lane & 1)
+
+
+@kernel()
 def _not_too_far(lanes, step):
     """Limit the steps where the variable is the square root of the time since a touch (`method.taylor`)."""
     zero, alpha, beta = exact_splat(0.0), exact_row(lanes.alpha, 0), exact_row(lanes.beta, 0)
     furthest = alpha / beta * FURTHEST
     far = below(zero, alpha) & below(zero, beta) & below(furthest, step)
-    if far != 0:
-        for lane in range(WIDTH):
-            lanes.ends_at_stop[lane] &= 1 - (far >> lane & 1)
+    _end_before_stop(lanes, far)
     return choose(far, furthest, step)
 
 
@@ -569,3 +600,26 @@ def accurate_steps(lanes, w, order, power, fraction) -> int:
     set_row(lanes.step, 0, step)
     set_row(lanes.accurate, 0, step)
     return infinite & live
+
+
+@kernel()
+def before_sticking(lanes, w, order) -> None:
+    """Shorten the steps where tanh r converges too slowly (`method.step_size.before_sticking`)."""
+    for lane in range(WIDTH):
+        lanes.root[lane] = w.inverse[lanes.orders[lane]]
+    theta = coarse_exp2(exact_row(lanes.steepness, 0) * exact_row(lanes.root, 0))
+    step, shorter = exact_row(lanes.step, 0), 0
+    for slot in range(PAIR_COUNT):
+        slip, change = lanes.slip[slot], exact_splat(0.0)
+        if lanes.taken[slot] == 0:
+            break
+        for k in range(order - 1, 0, -1):
+            change = fused(magnitude(exact_row(slip, k)), exact_splat(w.inverse[k]), change) * step
+        first = exact_row(slip, 0)
+        limit = theta * square_root(fused(first, first, exact_splat(0.25 * math.pi**2)))
+        far = below(limit, change) & lanes.taken[slot]
+        step = choose(far, step * (limit / change), step)
+        shorter |= far
+    _end_before_stop(lanes, shorter)
+    set_row(lanes.step, 0, step)
+    set_row(lanes.accurate, 0, step)
