@@ -56,8 +56,7 @@ MEMBERS = 128
 _FIRST = 6
 #: Process noise of x, y [m], theta [rad] and their rates per step. The values were set by trials on seeds 200 and 201.
 _STATE_NOISE = np.array([1e-5, 1e-5, 4e-5, 3e-3, 3e-3, 1e-2])
-#: Process noise of the unknowns per step, as a share of the standard deviation of the prior. It was set by the same
-#: trials on seeds 200 and 201.
+#: Process noise of the unknowns per step, as a share of the standard deviation of the prior, set by the same trials.
 _UNKNOWN_NOISE = 3e-4
 
 

@@ -17,8 +17,7 @@ import numpy as np
 from bench_scenes import T_END
 from cases import Array, Sample, timed
 
-#: Time [s] after an event in which heyoka ignores the same event. The default time is so long that heyoka would miss
-#: the next touch.
+#: Time [s] after an event in which heyoka ignores the same event. With its default, it would miss the next touch.
 _COOLDOWN = 1e-7
 #: Indices of the clearances in the parameters of heyoka, after the modes of the pairs.
 _GX, _GY = 8, 9

@@ -25,8 +25,7 @@ PEERS: dict[str, Member] = {
     "our RK4": lambda solver: solver == OURS_RK4,
 }
 OWN: dict[str, Member] = {name: name.__eq__ for name in (OURS_BARE, OURS, OURS_CALL)}
-#: Ratio of times. A solver is not measured again if it is slower than the fastest of its group by this ratio, and a
-#: setting if it is slower than the fastest of its solver by this ratio.
+#: Solvers and settings that are slower than the fastest of their group or solver by this ratio are not measured again.
 _NEAR = 1.4
 
 

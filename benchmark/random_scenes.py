@@ -30,8 +30,7 @@ T_END, OUTPUT_DT = 1.0, 0.02
 #: Tolerance of a step, and longest step in contact, of the two reference runs in each arithmetic.
 LONG_DOUBLE = (1e-16, 0.6), (1e-15, 1.0)
 QUAD = (1e-21, 0.6), (1e-19, 1.0)
-#: Largest difference between the two runs, relative to the clearance. If it is larger, both runs are repeated in
-#: 113-bit arithmetic.
+#: Largest difference between the two runs, relative to the clearance, without a repetition in 113-bit arithmetic.
 AGREED = 1e-11
 PERTURBATION = 1e-12
 _KINDS = {"kelvin_voigt": 0, "hunt_crossley": 1, "exact_restitution": 2}

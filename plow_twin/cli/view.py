@@ -199,8 +199,8 @@ def _serve(file: Path, port: int) -> int:
     command = [program, str(file), "--serve-web", "--bind", LOOPBACK, "--port", str(data_port)]
     click.echo(f"serving until interrupted: {page_address(port, data_port)}")
     sys.stdout.flush()
-    # The program replaces this process and so receives its signals. Its log would print an address of the page with
-    # the light theme, in which labels cannot be read.
+    # The program replaces this process, to receive its signals. Its log is off, because the address in it selects the
+    # light theme.
     os.execve(program, [*command, "--web-viewer-port", str(port)], {"RUST_LOG": "error", **os.environ})
 
 

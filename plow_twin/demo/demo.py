@@ -35,8 +35,7 @@ _STOP_TIMEOUT_S: Final = 10.0
 _RATE_HZ: Final = 1000.0
 #: Clearance of the synthetic machine minus the clearance of the scene [mm].
 _SENSOR_MM: Final = 1.5
-#: Times of the estimate [s]. They are the duration of the shortest demo with an estimate, the length of the window of
-#: measurements, and the time between two windows.
+#: Shortest demo with an estimate, length of its window, and time between two windows [s].
 _ESTIMATED_S, _WINDOW_S, _INTERVAL_S = 15.0, 14.0, 3.0
 _STUCK_S: Final = 30.0
 

@@ -12,8 +12,7 @@ from plow_twin.record.reader import RunReader
 from plow_twin.view.drawing import Drawing, Sink
 from plow_twin.view.rrd import ViewSummary
 
-#: Rate of spans [Hz]; two values of each curve are drawn per span. At this rate, one hour of all curves takes some 200
-#: MB in the viewer.
+#: Rate of spans [Hz]. One hour of all curves takes some 200 MB in the viewer.
 CURVE_HZ: Final = 25.0
 SECTION_HZ: Final = 20.0
 #: Rate of the cross-section [Hz] in the part of the run before the view started.

@@ -29,8 +29,7 @@ _PAD_MM: Final = 60.0
 #: Distance of a label below its point [mm].
 LABEL_MM: Final = 16.0
 
-#: Hues of the corners. At each corner, the pair at the vertical wall has a lighter colour than the pair at the
-#: horizontal wall (palette of Okabe and Ito).
+#: Hues of the corners (palette of Okabe and Ito). The pair at the vertical wall has the lighter colour.
 _HUES: Final = ((0, 114, 178), (230, 159, 0), (213, 94, 0), (0, 158, 115))
 _LIGHTER: Final = ((86, 180, 233), (240, 228, 66), (255, 158, 105), (110, 220, 185))
 PAIR_COLORS: Final = tuple(color for pair in zip(_HUES, _LIGHTER, strict=True) for color in pair)

@@ -15,13 +15,12 @@ Array = NDArray[np.float64]
 #: Number of bootstrap draws. With 1000 draws, the share of draws below the 2.5 % point has a standard error of 0.5 %.
 _DRAWS: Final = 1000
 FEWEST: Final = 8
-#: Smallest standard deviation of the load within the groups, relative to the mean load. Below this value, the effect of
-#: the load is not estimated.
+#: Standard deviation of the load within the groups, relative to its mean, below which its effect is not estimated.
 _LEAST_VARIATION: Final = 0.01
 #: Relative difference below which two mean loads are treated as equal.
 _EQUAL_LOAD: Final = 0.01
-#: Percentiles [%] between which the loads of two groups must overlap. The estimated effect of the load is valid only
-#: near the loads from which it was estimated.
+#: Percentiles [%] between which the loads of two groups must overlap, so that the effect of the load is not
+#: extrapolated.
 _USUAL: Final = (5.0, 95.0)
 _LEVEL: Final = 0.05
 #: Number of windows drawn at once, which limits the memory.

@@ -32,8 +32,7 @@ QUANTITIES: Final[Mapping[str, str]] = {
 #: Length [s] of the part at the start of a run in which the period of the load is searched.
 _PERIOD_SPAN_S: Final = 60.0
 _NO_PERIOD_S: Final = 10.0
-#: Smallest number of messages in a window, relative to a full window. Windows with fewer messages, at the end of a run
-#: or at a gap, are left out. Two sample rates are treated as equal if their ratio is at least this number.
+#: Smallest ratio of the messages in a window to those of a full window, and of two sample rates that count as equal.
 FULL: Final = 0.9
 _PADS: Final = np.array([CLEARANCE_NAMES.index(name) for name in PAD_NAMES])
 _TOTALS: Final = np.array([CLEARANCE_NAMES.index(name) for name in ("horizontal", "vertical")])

@@ -21,8 +21,7 @@ Array = NDArray[np.float64]
 #: Semi-axes of the ellipse [m], and its radius of gyration [m].
 SEMI_AXES: Final = (0.035, 0.025)
 GYRATION: Final = 0.0192
-#: Contact stiffness per mass [1/s^2]. It determines the duration of an impact but not its result, because position and
-#: arms are constant during the impact.
+#: Contact stiffness per mass [1/s^2]. It determines the duration of an impact, but not its result.
 _STIFFNESS: Final = 1e9
 #: Speed of approach [m/s] at which the restitution has its nominal value: the middle of the measured speeds.
 USUAL_SPEED: Final = 2.5
