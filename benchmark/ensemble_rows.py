@@ -78,8 +78,8 @@ def ensemble_rows(columns: int, rows: int, lean_steps: Sequence[float], repeats:
 def lanes_rows(columns: int, rows: int, repeats: int, notify: Notify) -> Iterator[Row]:
     """Yield rows of pairs with the HC scene on one core, computed in SIMD lanes and one by one in alternating order.
 
-    The tolerance is the first tolerance from 1e-4 on at which all pairs have an error below `LISTED`. The value of a
-    row is the ratio of the times.
+    The tolerance is the first from 1e-4 on at which all pairs have an error below `LISTED`. The value of a row is its
+    time relative to that of the lanes.
     """
     scenes = clearance_pairs(columns, rows, "hc")
     name = f"hc, {len(scenes)} clearance pairs"

@@ -66,7 +66,7 @@ EXTRA_OF_MODULE: Final = {
     "distributed": "dask",
 }
 
-#: Largest length of an error message [characters]. A message may list names in a file, and a file may have many names.
+#: Largest length of an error message [characters]. A message may list all names in a file.
 _LONGEST: Final = 16_000
 
 

@@ -199,7 +199,7 @@ def _serve(file: Path, port: int) -> int:
     command = [program, str(file), "--serve-web", "--bind", LOOPBACK, "--port", str(data_port)]
     click.echo(f"serving until interrupted: {page_address(port, data_port)}")
     sys.stdout.flush()
-    # The program replaces this process, to receive its signals. Its log is off, because the address in it selects the
+    # The program replaces this process, to receive its signals. The address in its log, which is off, would select the
     # light theme.
     os.execve(program, [*command, "--web-viewer-port", str(port)], {"RUST_LOG": "error", **os.environ})
 

@@ -107,7 +107,7 @@ class RecordingObjective:
     """Difference from a recorded motion: (q - recorded q) / clearance for every row and coordinate.
 
     Differences of the angle are multiplied by half the diagonal. Residuals are divided by the square root of their
-    number. The objective is therefore a mean square error of x, y and theta in units of the clearance before the fit.
+    number, so that the objective is a mean square error in units of the clearance before the fit.
     """
 
     scene: Scene
