@@ -19,6 +19,7 @@ from plow_twin.errors import ArgumentError
 from plow_twin.estimate.follow import LATEST_S, Follower
 from plow_twin.estimate.followed import Stretch, follow, table
 from plow_twin.estimate.forces import TOLERANCE
+from plow_twin.estimate.harmonics import Harmonics
 from plow_twin.estimate.learned import biases_of
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.result import Estimate, Interval, State
@@ -26,7 +27,7 @@ from plow_twin.estimate.window import Windows
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.run.batch import TwinBatch
 from plow_twin.solve.state import ROW
-from plow_twin.stream.journal import Estimated, Sample, SetModel
+from plow_twin.stream.journal import Estimated, Restore, Sample, SetModel
 from plow_twin.stream.session import Session
 
 sys.path.insert(0, str(ROOT / "benchmark"))
@@ -205,6 +206,34 @@ def test_another_machine_is_followed_from_its_own_prior(truth: Truth) -> None:
     assert isinstance(other, Follower) and other.estimate is None and other.time == 1.0
     value, low, high = other.clearance().T
     assert (low < [0.010, 0.012]).all() and (high > [0.010, 0.012]).all() and (value < 0.02).all()
+
+
+def test_a_restored_motion_keeps_the_harmonics_of_the_load_in_phase(truth: Truth) -> None:
+    def applied(session: Session, rows: slice, later_s: float = 0.0) -> None:
+        for t, wrench in zip(truth.load.t[rows].tolist(), truth.load.wrench[rows].tolist(), strict=True):
+            session.apply(Sample(round((t + later_s) * 1e9), tuple(wrench)))
+
+    session = Session(Follower(truth.nominal, MEMBERS), 0)
+    applied(session, slice(51))
+    wave = Harmonics(2.0, (2,), np.ones(3), np.array([[0.0] * 3, [1e3] * 3, [0.0] * 3]), np.zeros((3, 3)))
+    found = json.dumps(replace(_known(truth), load_harmonics=wave).as_dict())
+    session.apply(Estimated(200_000_000, 500_000_000, 1, 1, (), (0.0,) * 6, found))
+    following, saved = session.following, session.snapshot().data
+    assert isinstance(following, Follower) and following.estimate is not None
+    before = following.estimate.load_harmonics
+    applied(session, slice(51, 101))
+    session.apply(Restore(10**9, saved))
+    assert following.estimate.load_harmonics is None and following.time == 0.5
+    again = Session(Follower(truth.nominal, MEMBERS))
+    again.apply(session.snapshot())
+    for one in (session, again):
+        applied(one, slice(101, 103), 0.02)
+        assert isinstance(one.following, Follower) and one.following.estimate is not None
+        after = one.following.estimate.load_harmonics
+        assert before is not None and after is not None and one.origin_ns is not None
+        stamps = np.array([1.03, 1.4])
+        assert after.at(stamps - 1e-9 * one.origin_ns) == pytest.approx(before.at(stamps), rel=1e-6)
+    assert session.twin.digest() == again.twin.digest()
 
 
 def test_late_poses_correct_too_and_later_poses_have_no_effect(truth: Truth, forces: Array) -> None:

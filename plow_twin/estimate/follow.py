@@ -69,6 +69,8 @@ _NO_POSES: Final = Poses(np.zeros(0), np.zeros((0, 3)))
 _LENGTH: Final = struct.Struct("<q")
 #: Key of the harmonics of the load in the JSON of an estimate.
 _HARMONICS: Final = "load_harmonics"
+#: Key of harmonics that wait for the origin of the model time, and key of the stamp [ns] from which their phases count.
+_WAITING, _BEGIN_NS = "waiting_harmonics", "begin_ns"
 
 
 @dataclass(frozen=True, eq=False)
@@ -493,15 +495,24 @@ class Follower:
         """The followed estimate (JSON); empty for the prior."""
         return self._text
 
-    def follow_estimate(self, known: str) -> None:
-        """Follow the estimate `known` (JSON) of another follower, without the harmonics of the load.
+    def follow_estimate(self, known: str, origin_ns: int | None) -> None:
+        """Follow the estimate `known` (JSON), whose model time began at the stamp `origin_ns` [ns].
 
-        The phases of the harmonics are unknown, because the origins of the followers' times may differ.
+        The harmonics of the load wait for `begin_at`, because their phases depend on the new origin.
         """
-        known = _harmonics_from(known, None)
+        known = _waiting(known, origin_ns)
         if known != self._text:
             self.catch_up()
             self._begin_anew(known)
+
+    def begin_at(self, origin_ns: int) -> None:
+        """Set the stamp [ns] of model time 0, and use harmonics of the load that wait for it."""
+        if _WAITING in self._text:
+            found = json.loads(self._text)
+            harmonics = found.pop(_WAITING)
+            found[_HARMONICS] = harmonics | {"begin_s": (harmonics.pop(_BEGIN_NS) - origin_ns) * 1e-9}
+            self.catch_up()
+            self._begin_anew(json.dumps(found))
 
     def _begin_anew(self, text: str) -> None:
         before = self._ensemble
@@ -585,15 +596,23 @@ def follower(scene: Scene, follow: str, members: int, tol: float) -> Follower:
     return Follower(scene, members) if follow == "full" else Follower(scene, 1, tol=tol)
 
 
-def _harmonics_from(text: str, start: float | None) -> str:
-    """Return an estimate (JSON) with the harmonics' phases counted from `start` [s], or without harmonics for None."""
+def _harmonics_from(text: str, start: float) -> str:
+    """Return an estimate (JSON) with the harmonics' phases counted from `start` [s]."""
     if _HARMONICS not in text:
         return text
     found = json.loads(text)
-    if start is None:
-        del found[_HARMONICS]
-    else:
-        found[_HARMONICS]["begin_s"] = start
+    found[_HARMONICS]["begin_s"] = start
+    return json.dumps(found)
+
+
+def _waiting(text: str, origin_ns: int | None) -> str:
+    """Return an estimate (JSON) whose harmonics wait for `begin_at`; without an origin, they are dropped."""
+    if _HARMONICS not in text:
+        return text
+    found = json.loads(text)
+    harmonics = found.pop(_HARMONICS)
+    if origin_ns is not None:
+        found[_WAITING] = harmonics | {_BEGIN_NS: origin_ns + round(harmonics.pop("begin_s") * 1e9)}
     return json.dumps(found)
 
 

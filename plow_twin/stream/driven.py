@@ -81,8 +81,11 @@ class Following(Driven, Protocol):
     def known(self) -> str:
         """The estimate (JSON) that the twin follows; empty while it follows the prior."""
 
-    def follow_estimate(self, known: str) -> None:
-        """Continue from the present state with the estimate `known` (JSON)."""
+    def follow_estimate(self, known: str, origin_ns: int | None) -> None:
+        """Continue from the present state with the estimate `known` (JSON), whose model time began at `origin_ns`."""
+
+    def begin_at(self, origin_ns: int) -> None:
+        """Set the stamp [ns] of model time 0."""
 
     def follow_parameters(self) -> None:
         """Continue as a single twin from the state of the median twin, without corrections by poses."""

@@ -686,7 +686,10 @@ class Session:
         self.origin_ns = self.stamp_ns = None
 
     def _begin(self, stamp_ns: int) -> int:
-        return stamp_ns - round(self.twin.time * 1e9)
+        origin_ns = stamp_ns - round(self.twin.time * 1e9)
+        if self.following is not None:
+            self.following.begin_at(origin_ns)
+        return origin_ns
 
     def _change_model(self, changes: dict[str, float]) -> None:
         before, speed = self.twin, 0.0 if self.held else self._speed
@@ -724,8 +727,8 @@ class Session:
         end = _HEADER.size + travels * _TRAVEL.size
         depth = np.frombuffer(data, np.float64, PAIR_COUNT, offset=end)
         twin_data, changes = self._split_twin(data[end + _WEAR_SIZE + STATE_BYTES :])
+        known, origin_ns = "" if self.following is None else self.following.known, self.origin_ns
         self._end_motion()
-        known = "" if self.following is None else self.following.known
         if changes == self.changes and (depth == self.wear_depth).all():
             self.twin.restore(twin_data)
         else:
@@ -733,7 +736,7 @@ class Session:
             saved.restore(twin_data)
             self._carry(saved)
         if self.following is not None:
-            self.following.follow_estimate(known)
+            self.following.follow_estimate(known, origin_ns)
         if self._wears:
             self.twin.set_travel_speed(self._speed)
 
