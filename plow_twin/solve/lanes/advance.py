@@ -468,7 +468,7 @@ def _step(s, viscous, hysteretic, power, fraction, slip, order, lanes, w) -> Non
         lanes.live[0] &= ~infinite
         note_modes(lanes)
     if slip is not None:
-        before_sticking(lanes, w, used)
+        before_sticking(lanes, w, used, fraction)
     first_events(lanes, w, used, order, hysteretic, power, fraction)
     go_past_an_instant(s.params, lanes)
     note_switches(lanes, used, viscous, fraction)

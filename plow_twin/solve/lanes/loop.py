@@ -383,7 +383,7 @@ def _step(members, waves, second, viscous, hysteretic, power, fraction, slip, or
             if infinite >> lane & 1:
                 _leave(members, lanes, w, order, lane, _NON_FINITE, t)
     if slip is not None:
-        before_sticking(lanes, w, order)
+        before_sticking(lanes, w, order, fraction)
     first_events(lanes, w, order, order, hysteretic, power, fraction)
     go_past_an_instant(members.params, lanes)
     note_switches(lanes, order, viscous, fraction)

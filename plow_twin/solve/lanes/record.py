@@ -64,7 +64,6 @@ _BLOCK_FIELDS: Final[list[tuple[Any, ...]]] = [
     # the following fields are used only for friction
     ("friction", "f8", _LANES_OF),  # mu
     ("per_slip_speed", "f8", _LANES_OF),  # 1 / v_s
-    ("steepness", "f8", _LANES_OF),  # log2 of the admissible size of the last term over that of the first term
     # the following fields are used only for exponents other than 1
     ("exponent", "f8", _LANES_OF),
     ("release", "f8", _LANES_OF),  # penetration below which the force is negligible
@@ -248,7 +247,6 @@ def load_lane(p, state, power, slip, lanes, lane, member) -> None:
         lanes.exponent[lane], lanes.release[lane] = p.exponent, p.release
     if slip is not None:
         lanes.friction[lane], lanes.per_slip_speed[lane] = p.friction, 1.0 / p.slip_speed
-        lanes.steepness[lane] = math.log2(p.threshold[p.order] / p.threshold[0])
     for i in range(MOST_LACUNA):
         lanes.threshold[i, lane] = p.threshold[p.order - i] if i < p.lacuna else np.inf
     lanes.stretch[lane] = math.log2(p.velocity_tolerance / (p.position_tolerance * (p.order + 1)))

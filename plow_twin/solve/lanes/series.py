@@ -15,6 +15,7 @@ from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, 
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.lanes.record import DC, DS, DX, DY, MOST_LACUNA, WIDTH, linear_at, penetration_at
 from plow_twin.solve.lanes.waves import coarse_exp2, coarse_log2, turn_lanes
+from plow_twin.solve.method.step_size import FARTHEST_TO_POLE
 from plow_twin.solve.method.taylor import FURTHEST
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
@@ -603,21 +604,28 @@ def accurate_steps(lanes, w, order, power, fraction) -> int:
 
 
 @kernel()
-def before_sticking(lanes, w, order) -> None:
+def before_sticking(lanes, w, order, fraction) -> None:
     """Shorten the steps where tanh r converges too slowly (`method.step_size.before_sticking`)."""
     for lane in range(WIDTH):
         lanes.root[lane] = w.inverse[lanes.orders[lane]]
-    theta = coarse_exp2(exact_row(lanes.steepness, 0) * exact_row(lanes.root, 0))
-    step, shorter = exact_row(lanes.step, 0), 0
+    radius, step, zero, shorter = exact_row(lanes.radius, 0), exact_row(lanes.step, 0), exact_splat(0.0), 0
+    mobility = fused(radius * radius, exact_row(lanes.inverse_inertia, 0), exact_row(lanes.inverse_mass, 0))
+    per_push = exact_row(lanes.friction, 0) * exact_row(lanes.stiffness, 0) * mobility
     for slot in range(PAIR_COUNT):
-        slip, change = lanes.slip[slot], exact_splat(0.0)
+        slip, push, change, normal = lanes.slip[slot], lanes.push[slot], zero, zero
         if lanes.taken[slot] == 0:
             break
         for k in range(order - 1, 0, -1):
             change = fused(magnitude(exact_row(slip, k)), exact_splat(w.inverse[k]), change) * step
-        first = exact_row(slip, 0)
+            normal = (normal + magnitude(exact_row(push, k))) * step
+        time, first = step, exact_row(slip, 0)
+        if fraction is not None:
+            time = step * fused(magnitude(exact_row(lanes.beta, 0)), step, exact_row(lanes.alpha, 0))
+        gained = per_push * (normal + magnitude(exact_row(push, 0))) * time
+        theta = coarse_exp2(coarse_log2(exact_row(lanes.threshold, 0) / gained) * exact_row(lanes.root, 0))
+        theta = choose(below(theta, exact_splat(FARTHEST_TO_POLE)), theta, exact_splat(FARTHEST_TO_POLE))
         limit = theta * square_root(fused(first, first, exact_splat(0.25 * math.pi**2)))
-        far = below(limit, change) & lanes.taken[slot]
+        far = below(limit, change) & below(zero, gained) & lanes.taken[slot]
         step = choose(far, step * (limit / change), step)
         shorter |= far
     _end_before_stop(lanes, shorter)

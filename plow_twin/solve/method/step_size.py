@@ -20,6 +20,9 @@ PARTING_REACH, PARTING_ORDER = 1.3, 6
 _PARTING_REACH_STICK = 8.0
 #: Largest number of Newton iterations for the separation, and relative change at which they end.
 _NEWTON_STEPS, _ROOT_FOUND = 6, 1e-9
+#: Largest theta in `before_sticking`. The two poles nearest to r_0 then give the series of tanh r a remainder of at most
+#: 4 / pi theta^order.
+FARTHEST_TO_POLE = 0.5
 #: Largest usable term of a series, whose products are finite.
 _FINITE = 1e300
 #: Largest number of times that a step is shortened, and ratio of successive sizes above which this ends. The largest
@@ -55,16 +58,20 @@ def before_sticking(p, state, w, order, sigma) -> float:
 
     r is the slip rate divided by the regularisation speed. During fast slip, tanh r is constant up to rounding and does
     not show its poles at r = +-i pi/2. If |r - r_0| is at most theta times the distance of r_0 from the poles, the
-    remainder of the series is less than theta^order.
+    remainder of the series is about theta^order. This share of the change of velocity by friction must be admissible.
     """
-    theta = (p.threshold[p.order] / p.threshold[0]) ** (1.0 / order)
-    within = sigma
+    mobility, within = p.inverse_mass + p.radius * p.radius * p.inverse_inertia, sigma
     for pair in range(PAIR_COUNT):
         if state.mode[pair] != ON:
             continue
-        change = 0.0
+        change = normal = 0.0
         for k in range(order - 1, 0, -1):
             change = (change + abs(w.slip[0, k, pair])) * within
+            normal = (normal + abs(w.force[k, pair])) * within
+        time = within * (state.alpha + abs(state.beta) * within)
+        gained, theta = p.friction * (normal + abs(w.force[0, pair])) * mobility * time, FARTHEST_TO_POLE
+        if gained * theta**order > p.threshold[p.order]:
+            theta = (p.threshold[p.order] / gained) ** (1.0 / order)
         limit = theta * math.hypot(w.slip[0, 0, pair], 0.5 * math.pi)
         if change > limit:
             # the change is convex in sigma
