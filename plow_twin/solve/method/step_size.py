@@ -20,8 +20,8 @@ PARTING_REACH, PARTING_ORDER = 1.3, 6
 _PARTING_REACH_STICK = 8.0
 #: Largest number of Newton iterations for the separation, and relative change at which they end.
 _NEWTON_STEPS, _ROOT_FOUND = 6, 1e-9
-#: Largest theta in `before_sticking`. The two poles nearest to r_0 then give the series of tanh r a remainder of at most
-#: 4 / pi theta^order.
+#: Largest theta in `before_sticking`. The two poles nearest to r_0 then give the series of tanh r a remainder of at
+#: most 4 / pi theta^order.
 FARTHEST_TO_POLE = 0.5
 #: Largest usable term of a series, whose products are finite.
 _FINITE = 1e300
