@@ -347,9 +347,11 @@ DIFFERS: Annotated[
         "1, 1",
         "prior probability that a quantity differs from the scene if a fit passes all checks, and if it fails one",
         "52 clearances of 13 kinds of machines, seeds 84001 to 84003: with 0.05, 0.2, 0.5 intervals of right models "
-        "are 1.3, 1.9, 2.8 times as wide as without differences; those of other machines hold in 0.92, 0.95, 0.97",
+        "are 1.3, 1.9, 2.8 times as wide as without differences; those of other machines hold in 0.92, 0.95, 0.97; "
+        "with one-sided priors and 0.05, 0.1, 0.2, clearances of frames wrong by 2 mm (seeds 30100 to 30107) hold in "
+        "0.57, 0.79, 0.86, and right models are 1.0, 1.1, 1.2 times as wide",
     ),
-] = (0.05, 0.5)
+] = (0.1, 0.5)
 BENT: Annotated[float, Tuned("1", "error of a linearised step, relative to the step")] = 0.3
 BENT_BY_EXPONENT: Annotated[
     float,
