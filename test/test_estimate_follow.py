@@ -14,17 +14,19 @@ from commands import plow_twin_here
 from numpy.typing import NDArray
 from scenes import ROOT
 
-from plow_twin import Clearance, Contact, simulate
+from plow_twin import Clearance, Contact, Friction, simulate
 from plow_twin.errors import ArgumentError
 from plow_twin.estimate.follow import LATEST_S, Follower
 from plow_twin.estimate.followed import Stretch, follow, table
-from plow_twin.estimate.forces import TOLERANCE
+from plow_twin.estimate.forces import FEWEST, TOLERANCE
 from plow_twin.estimate.harmonics import Harmonics
 from plow_twin.estimate.learned import biases_of
 from plow_twin.estimate.measurements import Load, Poses
+from plow_twin.estimate.members import Ensemble, rubs
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.window import Windows
-from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
+from plow_twin.model.scene import Scene, Wear
 from plow_twin.run.batch import TwinBatch
 from plow_twin.solve.state import ROW
 from plow_twin.stream.journal import Estimated, Restore, Sample, SetModel
@@ -190,6 +192,39 @@ def test_a_rough_estimate_of_the_same_motion_does_not_replace_one_that_is_not_ro
         assert not _take(one, rough)  # the estimate is refused, because only 0.1 s of its window of 1 s is new
         _run(one, truth, 0.8, 0.6)
         assert _take(one, rough)
+
+
+def test_twins_have_the_friction_that_an_estimate_finds(truth: Truth) -> None:
+    known = replace(_known(truth), differs={"friction.coefficient": (0.9, 0.1, 0.02)})
+    members = Ensemble(truth.nominal, known, FEWEST, np.random.default_rng(0), 0.0, TOLERANCE, np.zeros(PAIR_COUNT))
+    assert members.first.scene.friction == Friction(0.1)
+    assert members.others is not None
+    drawn = [one.friction.coefficient for one in members.others.scenes if one.friction is not None]
+    assert len(drawn) == FEWEST - 1 and 0.01 < np.std(drawn) < 0.03
+    follower = Follower(truth.nominal, FEWEST)
+    without = follower.signature
+    _run(follower, truth, 0.2)
+    assert _take(follower, known) and follower.signature != without
+    restored = Follower(truth.nominal, FEWEST)
+    restored.restore(follower.snapshot())
+    assert np.array_equal(_run(restored, truth, 0.4, 0.2), _run(follower, truth, 0.4, 0.2))
+    assert restored.digest() == follower.digest()
+    # kernels with friction are compiled only for a friction that is more probable than not
+    assert _take(follower, replace(known, differs={"friction.coefficient": (0.4, 0.1, 0.02)}))
+    assert follower.signature == without
+    assert not rubs(replace(truth.nominal, wear=Wear(1e-14, pad_area_m2=0.02, travel_speed_m_s=0.5)), known)
+
+
+def test_kernels_with_friction_are_compiled_at_the_start_only_if_no_cache_can_pass_them_on(
+    truth: Truth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled: list[Scene] = []
+    monkeypatch.setattr("plow_twin.estimate.follow.compile_friction", lambda scene, tol: compiled.append(scene))
+    follower = Follower(truth.nominal, FEWEST)
+    for kept, expected in ((True, []), (False, [truth.nominal])):
+        monkeypatch.setattr("plow_twin.estimate.follow.kept_on_disk", lambda kept=kept: kept)
+        follower.warm_up()
+        assert compiled == expected
 
 
 def test_another_machine_is_followed_from_its_own_prior(truth: Truth) -> None:

@@ -30,11 +30,13 @@ class Asked:
     members : number of twins from which the intervals of the forces are computed; 0 if no forces are requested
     span_s : duration at the end of the window for which forces are computed [s]
     plan : limits of the clearances; None if no forecast is requested
+    follows : whether twins will follow the estimate
     """
 
     members: int = 0
     span_s: float = 0.0
     plan: Plan | None = None
+    follows: bool = False
 
 
 @dataclass(frozen=True, eq=False)

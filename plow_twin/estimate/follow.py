@@ -30,12 +30,13 @@ from plow_twin.errors import ArgumentError
 from plow_twin.estimate import tuning
 from plow_twin.estimate.forces import FEWEST, TOLERANCE
 from plow_twin.estimate.measurements import Load, Poses
-from plow_twin.estimate.members import LATEST_S, Ensemble, widening
+from plow_twin.estimate.members import LATEST_S, Ensemble, compile_friction, may_rub, widening
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.similar import Units
 from plow_twin.estimate.start import noise_level
 from plow_twin.estimate.summary import prior_of
 from plow_twin.estimate.unknowns import DAMPING, GAIN, Unknowns
+from plow_twin.kernel.compiler import kept_on_disk
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
 from plow_twin.run.advance import Advance
@@ -251,6 +252,8 @@ class Follower:
         self.advance(self.time + 1e-6)
         self._ensemble.stand_like(self._ensemble, self._wrench)
         self.restore(before)
+        if may_rub(self.scene) and not kept_on_disk():  # the estimating process could not pass on its kernels later
+            compile_friction(self.scene, self.tol)
         return _time.perf_counter() - begin
 
     def advance(self, t: float, wrench: ArrayLike | None = None) -> Advance:

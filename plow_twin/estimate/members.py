@@ -27,7 +27,7 @@ from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.unknowns import QUANTITIES
 from plow_twin.model.geometry import penetration_rows, states_of
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.model.scene import DOF_NAMES, Clearance, Gravity, Scene, fastest_travel
+from plow_twin.model.scene import DOF_NAMES, Clearance, Friction, Gravity, Scene, fastest_travel
 from plow_twin.run.batch import TwinBatch
 from plow_twin.run.twin import Twin
 from plow_twin.solve.state import ADVANCE, FOLLOWED, WITH_INTERVALS
@@ -45,6 +45,12 @@ _MOST_OUTLYING: Final = 5
 #: Lower bound on the number of members that adopt parameters in one call, which costs as much as three members.
 _AT_ONCE: Final = 8
 _ALL: Final = slice(None)
+#: Name of the friction coefficient in `Estimate.differs`.
+_FRICTION: Final = "friction.coefficient"
+#: Probability of a difference from which members have it, by definition of the median probability model.
+_PROBABLE: Final = 0.5
+#: Lower bound on the friction coefficient of a member, because all members must have the same terms.
+_LEAST_FRICTION: Final = 1e-3
 _THETA: Final = DOF_NAMES.index("theta")
 #: Indices of cos(theta), sin(theta), X and Y in the state of the solver, derived from its layout.
 _PLACES: Final = (5, 6, 0, 1)
@@ -79,6 +85,8 @@ class Ensemble:
     ) -> None:  # fmt: skip
         scenes, gain = draw_scenes(scene, known, members, rng) if members > 1 else ([scene], np.ones((1, 3)))
         scenes[0], gain[0] = middle_of(scene, known)
+        if rubs(scene, known):
+            scenes = _with_friction(scenes, scene, known, rng)
         #: whether poses move the first member; under the prior, they move the second member, a copy of the first member
         self._steers_first = known.horizontal_state is not State.PRIOR
         if not self._steers_first and members > 1:
@@ -536,6 +544,37 @@ def widening(scene: Scene, worn: Array) -> Array:
     own = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
     found: Array = clearances(scene, worn)[..., :2] - own
     return found
+
+
+def may_rub(scene: Scene) -> bool:
+    """Return whether members of a scene can differ in friction.
+
+    Members with wear or with friction that sticks cannot, because they do not share vectors (`solve.lanes`) and would
+    take too long.
+    """
+    return scene.wear is None and (scene.friction is None or scene.friction.stick_stiffness_n_m is None)
+
+
+def rubs(scene: Scene, known: Estimate) -> bool:
+    """Return whether members differ in friction, because the machine's friction probably differs from the scene's."""
+    return may_rub(scene) and known.differs.get(_FRICTION, (0.0,))[0] >= _PROBABLE
+
+
+def compile_friction(scene: Scene, tol: float) -> None:
+    """Compile the kernels of members that differ in friction, or load them from the cache on disk."""
+    scenes = [replace(scene, friction=Friction(_LEAST_FRICTION), loads=(), wear=None)] * 2
+    TwinBatch(scenes, tol=tol).advance(1e-6)
+    Twin(scenes[0], tol=tol, excitation="sampled").warm_up()
+
+
+def _with_friction(scenes: list[Scene], scene: Scene, known: Estimate, rng: np.random.Generator) -> list[Scene]:
+    _, by, deviation = known.differs[_FRICTION]
+    nominal = scene.friction or Friction(0.0)
+    drawn = nominal.coefficient + by + deviation * np.append(0.0, rng.standard_normal(len(scenes) - 1))
+    return [
+        replace(one, friction=replace(nominal, coefficient=max(coefficient, _LEAST_FRICTION)))
+        for one, coefficient in zip(scenes, drawn.tolist(), strict=True)
+    ]
 
 
 def middle_of(scene: Scene, known: Estimate) -> tuple[Scene, Array]:

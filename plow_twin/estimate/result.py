@@ -258,6 +258,9 @@ class Estimate:
             if quantity.name in data and quantity.name not in ("horizontal", "vertical")
         }
         correlation, apparent, harmonics = data["correlation"], data.get("apparent"), data.get("load_harmonics")
+        others["differs"] = {
+            name: (one["probability"], one["by"], one["deviation"]) for name, one in data["differs"].items()
+        }
         if apparent is not None:
             others["apparent"] = tuple(Interval(**apparent[name]) for name in ("horizontal", "vertical"))
         if harmonics is not None:

@@ -175,6 +175,11 @@ def share(cache_file: Any) -> None:
     cache_file.save = save
 
 
+def kept_on_disk() -> bool:
+    """Return whether all kernels compiled so far could be stored in the cache."""
+    return not _said
+
+
 def _save_or_warn(cache: Any) -> None:
     save = cache.save_overload
 

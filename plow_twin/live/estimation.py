@@ -212,7 +212,7 @@ def asked_of(settings: Settings) -> Asked:
     if horizontal or vertical:
         stop_h = settings.forecast_stop / HOUR_S or None
         plan = Plan(horizontal, vertical, settings.forecast_horizon / HOUR_S, stop_h, scenarios=scenarios_of(settings))
-    return Asked(settings.estimate_forces, settings.estimate_interval, plan)
+    return Asked(settings.estimate_forces, settings.estimate_interval, plan, settings.follows != "off")
 
 
 def scenarios_of(settings: Settings) -> tuple[Scenario, ...]:
