@@ -513,12 +513,19 @@ def test_twins_that_do_not_keep_up_leave_one_that_the_parameters_follow(truth: T
     assert _again(live.journal, truth.nominal).twin.digest() == live.twin.digest()
 
 
-def _play(probe: Probe, send: Any, poses: Any, truth: Truth, begin: float, end: float) -> None:
-    """Send load and poses of a part of a simulated machine's data faster than in real time."""
+def _play(
+    probe: Probe, send: Any, poses: Any, truth: Truth, begin: float, end: float, forces: list[JointState]
+) -> None:
+    """Send load and poses of a part of a simulated machine's data as fast as the node publishes `forces`.
+
+    Poses that wait for longer than `rollback_span` in the node are too late.
+    """
     for index, entry in enumerate(_in_turn(truth, begin, end)):
+        if index % 20 == 0 and entry.stamp_ns > _stamp(begin + 0.2):
+            reached = 1e-9 * (entry.stamp_ns - T0) - 0.2
+            probe.until(lambda reached=reached: forces and _seconds(forces[-1]) > reached, "forces at the samples")
         if isinstance(entry, Sample):
             send(entry.stamp_ns, entry.wrench)
-            probe.pace(index)
         elif isinstance(entry, Pose):
             message = PoseStamped()
             set_stamp(message.header, entry.stamp_ns)
@@ -542,9 +549,9 @@ def test_a_real_node_publishes_the_forces_of_its_machine(tmp_path: Path) -> None
             topic: probe.listen(JointState, topic) for topic in ("contact_forces", "force_intervals", "clearance")
         }
         assert value(probe.status[-1], "follow") == "prior"
-        _play(probe, send, poses, truth, 0.0, 13.0)
+        _play(probe, send, poses, truth, 0.0, 13.0, heard["contact_forces"])
         probe.until(lambda: value(probe.status[-1], "follow") == "estimate", "an estimate that is taken over", 100.0)
-        _play(probe, send, poses, truth, 13.0, 17.0)
+        _play(probe, send, poses, truth, 13.0, 17.0, heard["contact_forces"])
         probe.until(lambda: _seconds(heard["force_intervals"][-1]) > 16.98, "the last forces")
         assert probe.figures("follow")["members"] == str(MEMBERS)
         assert running.twin.stop() == 0
