@@ -232,11 +232,11 @@ def serve(connection: Connection) -> None:
         assert due is not None
         begin = time.perf_counter()
         found = answer(scene, due, guess, asked)
+        wall_s = time.perf_counter() - begin
         if asked.follows and not compiled and rubs(scene, found.estimate):
             # the process of the twin then loads these kernels from the cache
             compile_friction(scene, TOLERANCE)
             compiled = True
-        wall_s = time.perf_counter() - begin
         bounds = (due.start_ns, due.end_ns, due.samples, due.poses)
         connection.send(Found(*bounds, guess, found.estimate, wall_s, skipped, restarts, found.text, found.also))
         guess, skipped = found.following, 0
