@@ -296,7 +296,7 @@ def _of_mass(scene: Scene, q: Array) -> Array:
 
 def _load_and_weight(scene: Scene, load: Load, t: Array) -> Array:
     """Return the sum of load and weight at the times `t`, shape (n, 3), in N, N, N m."""
-    wrench = np.stack([np.interp(t, load.t, column) for column in load.wrench.T], axis=1)
+    wrench = load.at(t)
     weight = scene.head.mass_kg * scene.gravity.acceleration_m_s2
     return wrench - weight * np.array([0.0, 1.0, scene.gravity.arm_m])
 

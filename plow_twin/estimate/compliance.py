@@ -44,9 +44,9 @@ def by_compliance(problem: Problem, point: Point) -> Array | None:
         return None
     load = problem.forward.load
     t = np.union1d(load.t, change.t)
-    felt, moved = (np.stack([np.interp(t, one.t, column) for column in one.wrench.T], axis=1) for one in (load, change))
     here, there = (
-        problem.evaluate(point.shared, point.states, load=Load(t, felt + step * moved)) for step in (0.0, _STEP)
+        problem.evaluate(point.shared, point.states, load=Load(t, load.at(t) + step * change.at(t)))
+        for step in (0.0, _STEP)
     )
     return None if here is None or there is None else np.nan_to_num((there.predicted - here.predicted) / _STEP)
 

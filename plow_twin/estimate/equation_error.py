@@ -110,7 +110,7 @@ class EquationError:
         self._rows, self._arms = geometry.penetration_rows(scene)[:4], geometry.arm_rows(scene)
         self._inertia = np.asarray(inertias(scene))
         self._half_size = np.where(NORMAL_X != 0.0, scene.frame.width_m, scene.frame.height_m) / 2.0
-        wrench = np.stack([np.interp(self._grid, load.t, column) for column in load.wrench.T], axis=1)
+        wrench = load.at(self._grid)
         self._load = self._weighed(wrench, self._value) / self._inertia
 
     def search(self, q: Array, span: Array) -> Walls:

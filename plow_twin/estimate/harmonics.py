@@ -88,7 +88,7 @@ class Harmonics:
         """Return the sum of a load and the harmonics, with additional knots that resolve the harmonics."""
         step = 2.0 * math.pi / (self.omega * max(self.multiples) * _KNOTS)
         t = np.union1d(load.t, np.arange(load.t[0], load.t[-1], step))
-        wrench = np.stack([np.interp(t, load.t, column) for column in load.wrench.T], axis=1)
+        wrench = load.at(t)
         return replace(load, t=t, wrench=wrench + self.at(t))
 
     def moved(self, by: Array, variance: Array | None = None) -> Harmonics:
@@ -121,7 +121,7 @@ def frequency(load: Load) -> float | None:
         return None
     omega = 2.0 * math.pi / period
     t = np.linspace(load.t[0], load.t[-1], 2 * len(load.t))
-    wrench = np.stack([np.interp(t, load.t, column) for column in load.wrench.T], axis=1)
+    wrench = load.at(t)
     wrench = wrench / np.maximum(wrench.std(axis=0), 1e-12 * np.abs(wrench).max())
     halves = slice(len(t) // 2), slice(len(t) // 2, None)
     for _ in range(_CORRECTIONS):

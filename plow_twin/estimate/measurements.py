@@ -192,6 +192,10 @@ class Load:
         """Whether all samples are equal, as without a measurement or behind a failed sensor."""
         return not np.ptp(self.wrench, axis=0).any()
 
+    def at(self, t: Array) -> Array:
+        """Return the linearly interpolated load at the times `t`, shape (n, 3)."""
+        return np.stack([np.interp(t, self.t, column) for column in self.wrench.T], axis=1)
+
     def between(self, start: float, end: float) -> Load:
         """Return the samples that determine the load in the closed interval [start, end]."""
         first = max(int(np.searchsorted(self.t, start, side="right")) - 1, 0)
@@ -340,7 +344,7 @@ class Load:
         if not rare.any():
             return replace(self, unknown=(fx, fy, moment))
         t = np.linspace(self.t[0], self.t[-1], len(self.t))
-        wrench = np.stack([np.interp(t, self.t, column) for column in self.wrench.T], axis=1)
+        wrench = self.at(t)
         mean = wrench.mean(axis=0)
         lines = np.fft.rfft(wrench - mean, axis=0)
         power = np.abs(lines) ** 2 * float(t[1] - t[0]) / len(t)
