@@ -50,7 +50,8 @@ STATED: Final = {
     "contact.exponent": 0.02,
     "friction.coefficient": 0.01,
 }
-_FRICTION: Final = "friction.coefficient"
+#: Path of the friction coefficient.
+FRICTION: Final = "friction.coefficient"
 #: Steps of the difference quotients with respect to the relative stiffness of a wall and to a constant load, in units
 #: of half the load's range.
 _WALL_STEP, _PUSH_STEP = 0.02, 5e-3
@@ -181,7 +182,7 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
         change = partial(_moved, path=path, step=step, depth=depth)
         column = by(step, change=change) if deviation > 0.0 else None
         if column is not None:
-            least = -(scene.friction.coefficient if scene.friction else 0.0) if path == _FRICTION else -math.inf
+            least = -(scene.friction.coefficient if scene.friction else 0.0) if path == FRICTION else -math.inf
             out[path] = _Column(deviation, column, least=least)
     sides = [out[path].derivative for path in ("frame.width_m", "frame.height_m") if path in out]
     if len(sides) == 2 and scene.frame.corner_radius_m is None:

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
+from plow_twin.estimate.discrepancy import FRICTION
 from plow_twin.estimate.forces import FEWEST, amplitudes_of, draw_biases, draw_scenes, loads_of, quantiles
 from plow_twin.estimate.learned import Learner, biases_of, numbers_of, with_numbers
 from plow_twin.estimate.result import Estimate, Interval, State
@@ -45,8 +46,6 @@ _MOST_OUTLYING: Final = 5
 #: Lower bound on the number of members that adopt parameters in one call, which costs as much as three members.
 _AT_ONCE: Final = 8
 _ALL: Final = slice(None)
-#: Name of the friction coefficient in `Estimate.differs`.
-_FRICTION: Final = "friction.coefficient"
 #: Probability of a difference from which members have it, by definition of the median probability model.
 _PROBABLE: Final = 0.5
 #: Lower bound on the friction coefficient of a member, because all members must have the same terms.
@@ -557,7 +556,7 @@ def may_rub(scene: Scene) -> bool:
 
 def rubs(scene: Scene, known: Estimate) -> bool:
     """Return whether members differ in friction, because the machine's friction probably differs from the scene's."""
-    return may_rub(scene) and known.differs.get(_FRICTION, (0.0,))[0] >= _PROBABLE
+    return may_rub(scene) and known.differs.get(FRICTION, (0.0,))[0] >= _PROBABLE
 
 
 def compile_friction(scene: Scene, tol: float) -> None:
@@ -568,7 +567,7 @@ def compile_friction(scene: Scene, tol: float) -> None:
 
 
 def _with_friction(scenes: list[Scene], scene: Scene, known: Estimate, rng: np.random.Generator) -> list[Scene]:
-    _, by, deviation = known.differs[_FRICTION]
+    _, by, deviation = known.differs[FRICTION]
     nominal = scene.friction or Friction(0.0)
     drawn = nominal.coefficient + by + deviation * np.append(0.0, rng.standard_normal(len(scenes) - 1))
     return [
