@@ -138,6 +138,11 @@ class Live:
             else:
                 self.session.apply(entry)
 
+    def poses(self) -> Array:
+        """Return the present pose of each member, shape (m, 3)."""
+        self.session.catch_up()
+        return self.twin._ensemble.pose.copy()
+
     def column(self, name: str) -> Array:
         return np.concatenate([one.rows[name] for one in self.published])
 
@@ -430,7 +435,7 @@ def test_a_locked_degree_of_freedom_is_not_moved_by_measurements(truth: Truth) -
     live.take([*_in_turn(truth, 0.0, 0.5), _known(truth), *_in_turn(truth, 0.5, 0.7)])
     assert live.twin.poses_used > 10 and live.twin.drawn == 1
     live.take([change, *_in_turn(truth, 0.7, 0.8)])
-    q = live.twin.poses_of_all()
+    q = live.poses()
     assert q[:, [0, 2]] == pytest.approx(np.tile([0.004, 0.01], (MEMBERS, 1)), abs=1e-12) and np.ptp(q[:, 1]) > 0.0
 
 
@@ -458,12 +463,12 @@ def test_a_jump_of_the_head_is_followed_and_angles_are_equal_up_to_full_turns(tr
     assert live.twin.poses_outlying == 0
     assert live.column("force")[-1] == pytest.approx(other.column("force")[-1], rel=1e-3, abs=1e3)
     used = live.twin.poses_used
-    side = -0.012 * np.sign(live.twin.poses_of_all()[0, 0])
+    side = -0.012 * np.sign(live.poses()[0, 0])
     for index in range(20):
         begin = 1.0 + 0.01 * index
         live.take([Pose(_stamp(begin), (side, 0.0, 0.0)), *_samples(truth, begin, begin + 0.01)])
     assert live.twin.poses_outlying >= 1 and live.twin.poses_used >= used + 10
-    assert np.median(live.twin.poses_of_all()[:, 0]) == pytest.approx(side, abs=3e-3)
+    assert np.median(live.poses()[:, 0]) == pytest.approx(side, abs=3e-3)
 
 
 def test_twins_that_leave_the_range_of_the_model_come_back_with_the_next_pose(truth: Truth) -> None:

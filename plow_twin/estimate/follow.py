@@ -228,12 +228,6 @@ class Follower:
         self.catch_up()
         return int((~self._ensemble.good).sum())
 
-    def poses_of_all(self) -> Array:
-        """Return the present pose of each member, x, y [m] and theta [rad], shape (m, 3)."""
-        self.catch_up()
-        found: Array = self._ensemble.pose.copy()
-        return found
-
     def failure(self, status: int) -> str:
         """Return the reason of the latest failed advance as text."""
         return self._ensemble.first.failure(status)
