@@ -204,6 +204,8 @@ def _imported_names(path: Path) -> set[str]:
             "from plow_twin import Twin, load_scene; Twin(load_scene('paper')).advance(0.01)",
             {*SCIPY, "click", "rich", "mcap", "rosbags", "rerun", "rclpy"},
         ),
+        # a help text needs no solver
+        ("import plow_twin.cli\ntry: plow_twin.cli.main(['-h'])\nexcept SystemExit: pass", {"numba"}),
         ("import plow_twin.cli.app, plow_twin.record.replay", {*SCIPY, "mcap", "rosbags", "rerun", "rclpy"}),
         (
             "import plow_twin.cli.live, plow_twin.live.front",

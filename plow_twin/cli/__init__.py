@@ -23,7 +23,8 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     with _ending_at_once():
         # if an ImportError has a cause, the cause is reported, because it is more precise
         try:
-            import plow_twin.run.twin  # noqa: F401
+            if not {"-h", "--help", "-V", "--version"} & {*(sys.argv[1:] if arguments is None else arguments)}:
+                import plow_twin.run.twin  # noqa: F401
             from plow_twin.cli.app import main as run
         except (ImportError, OSError, MemoryError) as error:
             newer = (

@@ -13,7 +13,6 @@ import click
 
 from plow_twin.cli.console import DONE, DONE_WITH_LOSS, FAILED, busy, counts, output_console, say_error, table
 from plow_twin.cli.options import EXISTING, FOLDER, NEW_FILE, PLACE, json_option, map_option, quiet_option
-from plow_twin.cli.scene_facts import damping_unit
 from plow_twin.errors import UnitError
 
 if TYPE_CHECKING:
@@ -285,6 +284,7 @@ def _plot(task: _Task, result: Estimate, path: Path, title: str) -> None:
 
 
 def _labels(scene: Scene) -> dict[str, str]:
+    from plow_twin.cli.scene_facts import damping_unit
     from plow_twin.estimate.unknowns import QUANTITIES
 
     labels = {one.name: one.label for one in QUANTITIES}
