@@ -81,6 +81,8 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
             2,
             "known key; did you mean excitation?",
         ),
+        (["estimate", "own.csv", *MAP, "--follow-dt", "inf"], 2, "got 'inf', expected a finite number > 0"),
+        (["estimate", "own.csv", *MAP, "--follow-dt", "nan"], 2, "got 'nan', expected a finite number > 0"),
         (["analyse", "kilonewtons.csv", "--scene", "paper"], 2, "look like kN: state the unit: --unit fx=kN"),
         (["analyse", "headless.csv", "--scene", "paper"], 1, "(no header row?)"),
         (["analyse", "bars.csv", "--scene", "paper"], 1, "(expected commas, semicolons or tabs between them)"),

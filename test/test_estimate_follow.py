@@ -453,3 +453,6 @@ def test_the_command_writes_a_row_for_each_sample(truth: Truth, tmp_path: Path) 
     assert np.allclose(np.array(rows, dtype=float), table(told.rows)[1], rtol=1e-6)
     refused = plow_twin_here("estimate", tmp_path / "in", "--follow")
     assert refused.returncode == 2 and "expected the folder for followed.csv" in refused.stderr
+    dense = ("--follow", "--follow-dt", "1e-9", "--out", tmp_path / "dense")
+    refused = plow_twin_here("estimate", tmp_path / "in", *dense)
+    assert refused.returncode == 2 and "rows, expected at most 10000000 rows" in refused.stderr

@@ -12,7 +12,17 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from plow_twin.cli.console import DONE, DONE_WITH_LOSS, FAILED, busy, counts, output_console, say_error, table
-from plow_twin.cli.options import EXISTING, FOLDER, NEW_FILE, PLACE, json_option, map_option, quiet_option
+from plow_twin.cli.options import (
+    EXISTING,
+    FOLDER,
+    NEW_FILE,
+    PLACE,
+    POSITIVE,
+    check_rows,
+    json_option,
+    map_option,
+    quiet_option,
+)
 from plow_twin.errors import UnitError
 
 if TYPE_CHECKING:
@@ -50,7 +60,7 @@ if TYPE_CHECKING:
 @click.option(
     "--follow-dt",
     metavar="S",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=POSITIVE,
     help="Time between the rows of followed.csv [s]; by default one row for each sample of the load.",
 )
 @click.option(
@@ -217,6 +227,7 @@ def _followed(given: _Given, members: int, dt: float | None) -> tuple[list[str],
 
     if not len(given.measured.load):
         raise click.UsageError("--follow: got no load, expected its samples")
+    check_rows(float(given.load.t[-1] - given.load.t[0]), dt, "--follow-dt")
     stretch = offline.follow(given.measured.scene, given.load, given.poses, members, dt, gaps=given.gaps)
     return offline.table(stretch.rows)
 

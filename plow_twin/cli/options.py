@@ -16,6 +16,8 @@ FILE: Final = click.Path(path_type=Path, exists=True, dir_okay=False)
 FOLDER: Final = click.Path(path_type=Path, file_okay=False)
 NEW_FILE: Final = click.Path(path_type=Path, dir_okay=False)
 PLACE: Final = click.Path(path_type=Path)
+#: Largest number of output rows. A row takes about 200 B.
+MOST_ROWS: Final = 10_000_000
 
 quiet_option = click.option(
     "--quiet", "-q", is_flag=True, help="Show no progress and no tables; write files and errors only."
@@ -92,3 +94,11 @@ class PositiveNumber(click.ParamType):  # type: ignore[type-arg]  # generic from
 
 
 POSITIVE: Final = PositiveNumber()
+
+
+def check_rows(duration: float, step: float | None, option: str) -> None:
+    """Refuse the step of an option [s] if a row at each step of the duration [s] would be more than `MOST_ROWS`."""
+    rows = 0.0 if step is None else duration / step
+    if rows > MOST_ROWS:
+        expected = f"at most {MOST_ROWS} rows: {duration / MOST_ROWS:g} s"
+        raise click.BadParameter(f"got {step:g} s, {rows:.4g} rows, expected {expected}", param_hint=option)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Final
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import click
 
 from plow_twin.cli.console import DONE, output_console, progress, table
-from plow_twin.cli.options import NEW_FILE, POSITIVE, json_option, quiet_option
+from plow_twin.cli.options import NEW_FILE, POSITIVE, check_rows, json_option, quiet_option
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from plow_twin.run.energy_balance import EnergyBalance
     from plow_twin.run.sensitivity import Sensitivity
     from plow_twin.run.simulate import Result
-
-#: Largest number of output rows. A row takes about 200 B.
-MOST_ROWS: Final = 10_000_000
 
 
 @click.command(short_help="Simulate a scene.", epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene.")
@@ -76,7 +73,7 @@ def simulate(
     After Ctrl-C or at a limit, files and JSON contain the results up to this time, and the exit code is 1.
     """
     _check_usage(out, method, dt)
-    _check_rows(t_end, output_dt)
+    check_rows(t_end, output_dt, "--output-dt")
     result, stopped = _run(
         scene,
         quiet,
@@ -135,13 +132,6 @@ def _check_usage(out: Path | None, method: str, dt: float | None) -> None:
         raise click.BadParameter("got a step with method events, expected rk4 or euler", param_hint="--dt")
     if method != "events" and dt is None:
         raise click.BadParameter(f"got nothing, expected the step of {method} [s]", param_hint="--dt")
-
-
-def _check_rows(t_end: float, output_dt: float | None) -> None:
-    rows = 0.0 if output_dt is None else t_end / output_dt
-    if rows > MOST_ROWS:
-        message = f"got {output_dt:g} s, {rows:.4g} rows, expected at most {MOST_ROWS} rows: {t_end / MOST_ROWS:g} s"
-        raise click.BadParameter(message, param_hint="--output-dt")
 
 
 def write_samples(result: Result, path: Path) -> None:
