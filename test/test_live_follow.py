@@ -510,11 +510,13 @@ def test_without_measurements_the_median_twin_is_the_nominal_one_and_no_twin_is_
 def test_twins_that_do_not_keep_up_leave_one_that_the_parameters_follow(truth: Truth) -> None:
     live = Live(truth.nominal)
     live.take([*_in_turn(truth, 0.0, 0.5), _known(truth), *_in_turn(truth, 0.5, 1.0)])
-    force = live.column("force")[-1]
+    force, steered = live.column("force")[-1], live.session.snapshot()
     live.take([Parameter("follow", "parameters"), *_in_turn(truth, 1.0, 1.1)])
     assert live.twin.members == 1 and live.twin.estimate is not None
     assert live.column("force")[100] == pytest.approx(force, rel=0.2, abs=1e4)
     assert live.column("followed")[-1] == FOLLOWED
+    live.take([Restore(_stamp(1.1), steered.data), *_in_turn(truth, 1.1, 1.2)])
+    assert live.twin.members == 1 and live.twin.estimate is not None
     assert _again(live.journal, truth.nominal).twin.digest() == live.twin.digest()
 
 

@@ -81,6 +81,10 @@ class Following(Driven, Protocol):
     def known(self) -> str:
         """The estimate (JSON) that the twin follows; empty while it follows the prior."""
 
+    @property
+    def steered(self) -> bool:
+        """Whether poses move the twins."""
+
     def follow_estimate(self, known: str, origin_ns: int | None) -> None:
         """Continue from the present state with the estimate `known` (JSON), whose model time began at `origin_ns`."""
 

@@ -727,7 +727,9 @@ class Session:
         end = _HEADER.size + travels * _TRAVEL.size
         depth = np.frombuffer(data, np.float64, PAIR_COUNT, offset=end)
         twin_data, changes = self._split_twin(data[end + _WEAR_SIZE + STATE_BYTES :])
-        known, origin_ns = "" if self.following is None else self.following.known, self.origin_ns
+        known, steered, origin_ns = "", False, self.origin_ns
+        if self.following is not None:
+            known, steered = self.following.known, self.following.steered
         self._end_motion()
         if changes == self.changes and (depth == self.wear_depth).all():
             self.twin.restore(twin_data)
@@ -736,6 +738,8 @@ class Session:
             saved.restore(twin_data)
             self._carry(saved)
         if self.following is not None:
+            if self.following.steered and not steered:  # too many twins for this computer
+                self.following.follow_parameters()
             self.following.follow_estimate(known, origin_ns)
         if self._wears:
             self.twin.set_travel_speed(self._speed)
