@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from scenes import preset
 
-from plow_twin import Mark, Provenance
+from plow_twin import Contact, Friction, Mark, Provenance
+from plow_twin.estimate.discrepancy import variants
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.similar import Units
+from plow_twin.estimate.uncertain_load import _with_exponent
 from plow_twin.estimate.unknowns import OF_SCENE, SIZE, Unknowns
 from plow_twin.model.loads import compile_loads
 
@@ -54,3 +56,20 @@ def test_the_scene_of_a_vector_depends_only_on_the_quantities_that_are_declared_
         moved[place] += 1e-3
         depends = unknowns.scene_of(moved) != unknowns.scene_of(nominal)
         assert depends == (place in range(SIZE)[OF_SCENE])
+
+
+@pytest.mark.parametrize(
+    ("contact", "exponents"),
+    [(Contact("kelvin_voigt", 1e7, damping=4e4), set()), (Contact("hertz", 1e7, 4.0), set()),
+     (Contact("hertz", 1e7, 1.5), {1.52})],
+)  # fmt: skip
+def test_the_estimate_changes_a_scene_only_as_its_contact_law_and_friction_admit(
+    contact: Contact, exponents: set[float]
+) -> None:
+    stuck = Friction(0.2, stick_stiffness_n_m=1e7, static_coefficient=0.2)
+    scene = replace(preset("paper"), contact=contact, friction=stuck)
+    changed = variants(scene)
+    assert {one.contact.exponent for one in changed} - {contact.exponent} == exponents
+    assert max(one.friction.coefficient for one in changed if one.friction) == pytest.approx(0.21)
+    drawn = [_with_exponent(Unknowns(scene), np.random.default_rng(seed)).scene.contact.exponent for seed in range(9)]
+    assert (max(drawn) > contact.exponent) == bool(exponents)

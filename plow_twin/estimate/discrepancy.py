@@ -37,7 +37,7 @@ from plow_twin.estimate.pads import deviations
 from plow_twin.estimate.priors import ROUNDING, UNSTATED, deviation_of
 from plow_twin.estimate.unknowns import GX, GY, MOVING, SIZE, SOFTNESS
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.model.scene import Friction, Scene
+from plow_twin.model.scene import Friction, Scene, largest_exponent
 
 Array = NDArray[np.float64]
 
@@ -167,7 +167,8 @@ class _Column:
 def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
     """Return the further quantities, and the derivatives, (n, 3, 3), of the measurements with respect to a load.
 
-    A quantity is left out if its prior deviation is zero, or if its change cannot be simulated.
+    A quantity is left out if its prior deviation is zero, if the contact law fixes it, or if its change cannot be
+    simulated.
     """
     point = found.point
 
@@ -178,7 +179,7 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
     scene, depth = problem.unknowns.scene, problem.unknowns.penetration_of(float(found.shared[SOFTNESS]))
     out: dict[str, _Column] = {}
     for path, coarse in STATED.items():
-        deviation, step = deviation_of(scene, path), problem.steps * coarse
+        deviation, step = deviation_of(scene, path) if _can_move(scene, path) else 0.0, problem.steps * coarse
         change = partial(_moved, path=path, step=step, depth=depth)
         column = by(step, change=change) if deviation > 0.0 else None
         if column is not None:
@@ -226,7 +227,14 @@ def _of_sensor(problem: Problem, point: Point) -> Iterator[tuple[str, Array]]:
 
 def variants(scene: Scene) -> tuple[Scene, ...]:
     """Return the scenes with a different exponent and with friction, which need kernels of their own."""
-    return tuple(_moved(scene, path, STATED[path], 1.0) for path in ("contact.exponent", "friction.coefficient"))
+    paths = (path for path in ("contact.exponent", FRICTION) if _can_move(scene, path))
+    return tuple(_moved(scene, path, STATED[path], 1.0) for path in paths)
+
+
+def _can_move(scene: Scene, path: str) -> bool:
+    if path != "contact.exponent":
+        return True
+    return scene.contact.exponent + STATED[path] <= largest_exponent(scene.contact)
 
 
 def _moved(scene: Scene, path: str, step: float, depth: float) -> Scene:
@@ -237,7 +245,13 @@ def _moved(scene: Scene, path: str, step: float, depth: float) -> Scene:
     part, name = path.split(".")
     if part == "friction":
         rubbing = scene.friction or Friction(0.0)
-        return replace(scene, friction=replace(rubbing, coefficient=rubbing.coefficient + step))
+        static = rubbing.static_coefficient
+        moved = replace(
+            rubbing,
+            coefficient=rubbing.coefficient + step,
+            static_coefficient=None if static is None else static + step,
+        )
+        return replace(scene, friction=moved)
     if part == "head":
         return replace(scene, head=replace(scene.head, **{name: getattr(scene.head, name) * (1.0 + step)}))
     if part == "frame":

@@ -26,6 +26,7 @@ from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.start import noise_level, range_of_motion
 from plow_twin.estimate.unknowns import DAMPING, LEAST_CLEARANCE, Unknowns
 from plow_twin.model import geometry
+from plow_twin.model.scene import largest_exponent
 
 Array = NDArray[np.float64]
 
@@ -267,13 +268,14 @@ def _draw(spread: _Spread, rng: np.random.Generator) -> tuple[Array, Array, floa
 
 
 def _with_exponent(unknowns: Unknowns, rng: np.random.Generator) -> Unknowns:
-    """Increase the exponent of the scene at random in half of the cases.
+    """Increase the exponent of the scene at random in half of the cases, as far as the contact law admits.
 
     With a smaller exponent, a wall would be stiffest at its surface.
     """
     step = tuning.UNCERTAIN_EXPONENT * max(0.0, rng.standard_normal())
     contact = unknowns.scene.contact
-    return replace(unknowns, scene=replace(unknowns.scene, contact=replace(contact, exponent=contact.exponent + step)))
+    exponent = min(contact.exponent + step, largest_exponent(contact))
+    return replace(unknowns, scene=replace(unknowns.scene, contact=replace(contact, exponent=exponent)))
 
 
 def _with_error(load: Load, share: float, rng: np.random.Generator) -> Load:

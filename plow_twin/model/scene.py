@@ -23,6 +23,8 @@ from plow_twin.model.pairs import CORNER_NAMES, PAIR_NAMES
 SCENE_VERSION: Final = 1
 DOF_NAMES: Final = ("x", "y", "theta")
 
+_LARGEST_EXPONENT: Final = 4.0
+
 
 class Mark(Enum):
     """Origin of a number.
@@ -148,7 +150,7 @@ class Contact:
     law: str = _choice("contact law", LAWS, "exact_restitution")
     # the dataclass needs a default; NaN is not admissible, so every scene has to give the stiffness
     stiffness: float = _quantity("N/m^exponent", "K in F = K d^n (...)", math.nan, gt=0.0)
-    exponent: float = _quantity("1", "n in F = K d^n (...)", 1.0, ge=1.0, le=4.0)
+    exponent: float = _quantity("1", "n in F = K d^n (...)", 1.0, ge=1.0, le=_LARGEST_EXPONENT)
     damping: float | None = _quantity(
         "N s/m or s/m",
         "kelvin_voigt, ramped_damping: C in N s/m; others: constant factor lambda of (1 + lambda d') in s/m",
@@ -172,6 +174,11 @@ class Contact:
     restitution_fall_along_s_m: float | None = _quantity(
         "s/m", "fall of the restitution per speed of the centre of mass along the wall, 0 unless given", None, ge=0.0
     )
+
+
+def largest_exponent(contact: Contact) -> float:
+    """Return the largest exponent that the contact law admits."""
+    return LAWS[contact.law].exponent or _LARGEST_EXPONENT
 
 
 #: Fields of `Contact` that make the restitution depend on the impact.
