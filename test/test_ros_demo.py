@@ -96,14 +96,16 @@ def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> No
         assert sum(shares.values()) == pytest.approx(1.0)
 
 
-def test_the_demo_takes_no_sample_before_the_estimator_is_compiled(
+def test_the_demo_starts_with_the_compiled_estimator_and_ends_when_each_sample_is_accounted_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The processes are simulated: each read of the diagnostics returns the next report."""
     watch, seen = Watch(), list[str]()
     reports = iter([
         {"state": {"lifecycle": "active"}, "estimate": {"ready": "0"}}, {"estimate": {"ready": "0"}},
-        {"estimate": {"ready": "1"}}, {"estimate": {"ready": "1", "estimates": "1"}},
+        {"estimate": {"ready": "1"}}, {"estimate": {"ready": "1", "estimates": "1"}, "input": {"samples_used": "9000"}},
+        {"input": {"samples_used": "12000"}},
+        {"input": {"samples_used": "14990", "dropped_late": "3", "dropped_stray": "1", "samples_lost": "6"}},
     ])  # fmt: skip
 
     def look() -> None:
@@ -114,7 +116,8 @@ def test_the_demo_takes_no_sample_before_the_estimator_is_compiled(
     @contextmanager
     def process(arguments: list[str], log: Path) -> Iterator[Mock]:
         seen.append(arguments[0].rpartition(".")[2])
-        yield Mock(running=False, output=lambda: '{"sent": 15000}')
+        stop = Mock(side_effect=lambda: seen.append(f"stop after {watch.accounted} samples"))
+        yield Mock(running=False, output=lambda: '{"sent": 15000}', stop=stop)
 
     @contextmanager
     def watching() -> Iterator[tuple[Watch, Callable[[], None]]]:
@@ -124,6 +127,7 @@ def test_the_demo_takes_no_sample_before_the_estimator_is_compiled(
     monkeypatch.setattr("plow_twin.demo.demo._watching", watching)
     assert _run("real", 15.0, tmp_path, Console(quiet=True), True, None) == (watch, 15000)
     assert seen[:5] == ["main", "ready 0", "ready 0", "ready 1", "excitation_publisher"]
+    assert seen[-1] == "stop after 15000 samples"
 
 
 def test_forces_are_compared_with_the_machine_s_and_the_time_of_each_estimate_is_named(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -65,6 +65,18 @@ class Watch:
     def number(self, part: str, key: str) -> float:
         """Return a value as a number, or 0 if the value is missing."""
         return float(self.text(part, key) or 0.0)
+
+    @property
+    def dropped(self) -> int:
+        """The number of samples that arrived and were not used."""
+        values = self.parts.get("input", {}).items()
+        return sum(int(value) for key, value in values if key.startswith("dropped_"))
+
+    @property
+    def accounted(self) -> int:
+        """The number of samples that were used or dropped, or that never arrived."""
+        used, lost = self.number("input", "samples_used"), self.number("input", "samples_lost")
+        return int(used + lost) + self.dropped
 
 
 def run_demo(speed: str, seconds: float, out: Path, quiet: bool, screen: list[str] | None = None) -> int:
@@ -161,6 +173,8 @@ def _run(
         with _process([*publisher, "--rate", repr(_RATE_HZ)], folder / "publisher.log") as source:
             _follow(source, twin, watch, spin, bar, task)
             sent = int(json.loads(source.output().splitlines()[-1])["sent"])
+        bar.update(task, description="using the last samples", total=None)
+        _catch_up(watch, sent, spin, twin)
         if estimating:
             bar.update(task, description="estimating", total=None)
             _until(
@@ -187,6 +201,19 @@ def _follow(source: Child, twin: Child, watch: Watch, spin: Any, bar: Progress, 
             raise DemoError(f"no progress for {patience:g} s at model time {reached:g} s\n{twin.output()}")
         bar.update(task, completed=reached)
     source.check(allowed=(0, 3))
+
+
+def _catch_up(watch: Watch, sent: int, spin: Callable[[], object], twin: Child) -> None:
+    """Wait until the node has used all samples, because it falls behind on a busy machine.
+
+    If samples at the end never arrived, the wait ends after `_STUCK_S` without progress.
+    """
+    moved, before = time.monotonic(), watch.accounted
+    while watch.accounted < sent and time.monotonic() - moved < _STUCK_S:
+        spin()
+        twin.check()
+        if watch.accounted > before:
+            moved, before = time.monotonic(), watch.accounted
 
 
 def _until(name: str, reached: Any, spin: Any, twin: Child, timeout_s: float) -> None:
@@ -297,10 +324,11 @@ def _view(folder: Path) -> Path | None:
 
 
 def _losses(watch: Watch, sent: int, summary: RunSummary) -> dict[str, int]:
-    published, missed = int(watch.number("output", "published")), int(watch.number("input", "messages_lost"))
+    published, used = int(watch.number("output", "published")), int(watch.number("input", "samples_used"))
     return {
-        "lost by the middleware": missed,
-        "received, not used": sent - missed - int(watch.number("input", "samples_used")),
+        "samples that never arrived": sent - used - watch.dropped,
+        "poses that never arrived": int(watch.number("input", "messages_lost") - watch.number("input", "samples_lost")),
+        "samples received, not used": watch.dropped,
         "not published": int(watch.number("output", "withheld")),
         "published, not recorded": published - summary.frames,
         "failed advances": int(watch.number("state", "solver_failures")),
