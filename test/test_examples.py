@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pyarrow.parquet
 import pytest
 from scenes import ROOT
 
@@ -34,6 +35,15 @@ def test_every_example_is_listed_and_has_a_short_readme() -> None:
             assert (folder / target).exists(), target
 
 
+def test_the_extras_named_for_the_examples_install_what_they_import() -> None:
+    extra_of = {"matplotlib": "study", "rosbags": "record", "rerun": "view"}
+    named = re.search(r"pip install '\.\[([\w,]+)\]'", (ROOT / "examples" / "README.md").read_text())
+    for script in (ROOT / "examples").glob("*/run.py"):
+        modules = set(re.findall(r"^(?:import|from) (\w+)", script.read_text(), re.MULTILINE))
+        modules -= {*sys.stdlib_module_names, "numpy", "plow_twin"}
+        assert {extra_of[module] for module in modules} <= set(named[1].split(",")), script
+
+
 #: Examples that compile additional kernels or take minutes.
 LONG = ("a_year", "calibration", "measured_drop")
 
@@ -51,3 +61,16 @@ def test_the_example_runs(folder: Path, tmp_path: Path) -> None:
     assert re.search(SAID[folder.name], done.stdout), done.stdout
     if folder.name == "first_scene":
         assert (tmp_path / "motion.png").read_bytes().startswith(b"\x89PNG")
+    if folder.name == "sweep":
+        table = [float(number) for row in re.findall(r" mm(.+)", done.stdout) for number in row.split()]
+        assert table == pytest.approx(table_of_the_command(folder, tmp_path), abs=0.051)
+
+
+def table_of_the_command(folder: Path, out: Path) -> list[float]:
+    """Return the largest forces [kN] that the command in the README of the sweep computes."""
+    readme = (folder / "README.md").read_text()
+    command = re.search(r"`plow-twin (study sweep [^`]+) --out runs/sweep`", readme)[1].split()
+    subprocess.run(
+        [sys.executable, "-m", "plow_twin.cli", *command, "--out", str(out)], check=True, capture_output=True
+    )
+    return [float(force) / 1e3 for force in pyarrow.parquet.read_table(out / "sweep.parquet")["max"].to_pylist()]

@@ -19,7 +19,7 @@ members = [
     for clearance in clearances_mm
     for stiffness in stiffnesses
 ]
-ensemble = simulate_many(members, t_end=10.0, output_dt=10.0, tol=1e-6)
+ensemble = simulate_many(members, t_end=10.0, output_dt=10.0)
 assert (ensemble.status == Status.OK).all()
 largest = ensemble.peak.max(axis=1).reshape(len(clearances_mm), len(stiffnesses)) / 1e3
 
