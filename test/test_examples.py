@@ -70,7 +70,5 @@ def table_of_the_command(folder: Path, out: Path) -> list[float]:
     """Return the largest forces [kN] that the command in the README of the sweep computes."""
     readme = (folder / "README.md").read_text()
     command = re.search(r"`plow-twin (study sweep [^`]+) --out runs/sweep`", readme)[1].split()
-    subprocess.run(
-        [sys.executable, "-m", "plow_twin.cli", *command, "--out", str(out)], check=True, capture_output=True
-    )
+    subprocess.run([sys.executable, "-m", "plow_twin", *command, "--out", str(out)], check=True, capture_output=True)
     return [float(force) / 1e3 for force in pyarrow.parquet.read_table(out / "sweep.parquet")["max"].to_pylist()]
