@@ -70,7 +70,7 @@ class Case:
 
 
 #: A case is repeated until the sum of its run times reaches this value [s].
-TIME_PER_CASE_S = 0.5
+TIME_PER_CASE_S = 0.3
 #: A first run that is shorter than this [s] is a warm-up and is not counted.
 WARM_UP_BELOW_S = 0.05
 #: Cases with a first run shorter than this [s] are repeated even if they were not chosen.
