@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +118,23 @@ def load_rows(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
 
 
+def completed(
+    path: Path, keys: Sequence[str], cases: Iterable[tuple[Any, ...]], run: Callable[..., dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Run the cases that a JSON lines file lacks, append each row as soon as it is computed, and return all rows.
+
+    A case contains the arguments of `run`, which are the values of its row at `keys`.
+    """
+    rows = load_rows(path)
+    done = {tuple(row[key] for key in keys) for row in rows}
+    for case in cases:
+        if case not in done:
+            rows.append(run(*case))
+            with path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(rows[-1]) + "\n")
+    return rows
+
+
 @click.command()
 @click.option("--group", "groups", multiple=True, type=click.Choice(list(GROUPS)))
 @click.option("--truths", default=50, show_default=True)
@@ -125,17 +143,11 @@ def load_rows(path: Path) -> list[dict[str, Any]]:
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "estimate.jsonl", show_default=True)
 def main(groups: tuple[str, ...], truths: int, seed: int, periods: float | None, out: Path) -> None:
     warm_up(draw(type(GROUPS["plain"])("start", periods=1.0), 0).nominal)
-    rows = load_rows(out)
-    done = {(row["group"], row["seed"]) for row in rows}
     names = groups or tuple(GROUPS)
     seeds = range(seed, seed + truths)
     # the groups alternate, so that a run that is stopped early has groups of equal size
-    for number in seeds:
-        for name in names:
-            if (name, number) not in done:
-                rows.append(run_one(name, number, periods))
-                with out.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(rows[-1]) + "\n")
+    cases = ((name, number) for number in seeds for name in names)
+    rows = completed(out, ("group", "seed"), cases, partial(run_one, periods=periods))
     asked = [row for row in rows if row["seed"] in seeds and "not_drawn" not in row]
     click.echo(as_markdown([summary(name, [row for row in asked if row["group"] == name]) for name in names]))
 

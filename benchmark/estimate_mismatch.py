@@ -10,7 +10,6 @@ as soon as it is computed, and truths that are in the file are skipped.
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Sequence
@@ -22,7 +21,7 @@ os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")  #
 
 import click
 import numpy as np
-from estimate import RESULTS, load_rows
+from estimate import RESULTS, completed
 from estimate_truths import PERIOD, ROOT, cutting
 from mismatched_machine import Machine, poses_of
 from numpy.typing import NDArray
@@ -381,15 +380,8 @@ def as_markdown(groups: dict[str, dict[str, float]]) -> str:
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "estimate_mismatch.jsonl", show_default=True)
 def main(kinds: tuple[str, ...], truths: int, seed: int, out: Path) -> None:
     warm_up(load_scene(ROOT / "config" / "paper.yaml"))
-    rows = load_rows(out)
-    done = {(row["kind"], row["seed"]) for row in rows}
     names, seeds = kinds or tuple(KINDS), range(seed, seed + truths)
-    for number in seeds:
-        for name in names:
-            if (name, number) not in done:
-                rows.append(run_one(name, number))
-                with out.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(rows[-1]) + "\n")
+    rows = completed(out, ("kind", "seed"), ((name, number) for number in seeds for name in names), run_one)
     asked = [row for row in rows if row["seed"] in seeds and row["kind"] in names]
     groups = {KINDS[name].title: summary([row for row in asked if row["kind"] == name]) for name in names}
     click.echo(as_markdown(groups | {"all": summary(asked)}))

@@ -10,7 +10,6 @@ to `results/filter_peers.jsonl`, and truths that are in the file are skipped.
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import Any
 
 import click
 import numpy as np
-from estimate import load_rows
+from estimate import completed
 from estimate_pages import filter_table
 from estimate_truths import GROUPS, Truth, draw
 from filterpy.kalman import EnsembleKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
@@ -210,15 +209,8 @@ def run_one(name: str, method: str, seed: int) -> dict[str, Any]:
 @click.option("--seed", default=5000, show_default=True)
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "filter_peers.jsonl", show_default=True)
 def main(groups: tuple[str, ...], truths: int, seed: int, out: Path) -> None:
-    rows = load_rows(out)
-    done = {(row["group"], row["method"], row["seed"]) for row in rows}
-    for number in range(seed, seed + truths):
-        for name in groups:
-            for method in ("ukf", "enkf"):
-                if (name, method, number) not in done:
-                    rows.append(run_one(name, method, number))
-                    with out.open("a", encoding="utf-8") as file:
-                        file.write(json.dumps(rows[-1]) + "\n")
+    cases = ((name, method, seed + i) for i in range(truths) for name in groups for method in ("ukf", "enkf"))
+    rows = completed(out, ("group", "method", "seed"), cases, run_one)
     click.echo(filter_table([row for row in rows if row["group"] in groups]))
 
 

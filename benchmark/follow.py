@@ -10,15 +10,16 @@ are in the file are skipped.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
+from estimate import completed
 from estimate_truths import PERIOD, Group, Truth, draw
 from numpy.typing import NDArray
 
@@ -160,16 +161,9 @@ def as_markdown(rows: Sequence[dict[str, Any]]) -> str:
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS, show_default=True)
 @click.option("--table", "alone", is_flag=True, help="Only print the table of the stored results.")
 def main(groups: tuple[str, ...], truths: int, seed: int, members: int, out: Path, alone: bool) -> None:
-    rows = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
-    done = {(row["group"], row["seed"]) for row in rows}
     warm_up(draw(Group("start", periods=1.0), 0).nominal)
-    for number in range(seed, seed + (0 if alone else truths)):
-        for name in groups or tuple(GROUPS):
-            if (name, number) not in done:
-                rows.append(run_one(name, number, members))
-                with out.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(rows[-1]) + "\n")
-    click.echo(as_markdown(rows))
+    cases = ((name, seed + i) for i in range(0 if alone else truths) for name in groups or tuple(GROUPS))
+    click.echo(as_markdown(completed(out, ("group", "seed"), cases, partial(run_one, members=members))))
 
 
 if __name__ == "__main__":

@@ -8,14 +8,13 @@ four times as many periods.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
-from estimate import RESULTS, load_rows
+from estimate import RESULTS, completed
 from estimate_truths import PERIOD, cutting
 from numpy.typing import NDArray
 
@@ -147,14 +146,9 @@ def summary(rows: list[dict[str, Any]]) -> str:
 @click.option("--day-km", default=75.0, show_default=True, help="Travel along the face in a day: 300 passes of 250 m.")
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "month.jsonl", show_default=True)
 def main(truths: int, seed: int, day_km: float, out: Path) -> None:
-    rows = [row for row in load_rows(out) if row["day_m"] == 1e3 * day_km]
-    for number in range(seed, seed + truths):
-        if any(row["seed"] == number for row in rows):
-            continue
-        rows.append(one_month(number, 1e3 * day_km))
-        with out.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(rows[-1]) + "\n")
-    click.echo(summary([row for row in rows if row["seed"] in range(seed, seed + truths)]))
+    cases = [(number, 1e3 * day_km) for number in range(seed, seed + truths)]
+    rows = completed(out, ("seed", "day_m"), cases, one_month)
+    click.echo(summary([row for row in rows if (row["seed"], row["day_m"]) in cases]))
 
 
 if __name__ == "__main__":

@@ -133,6 +133,19 @@ def test_a_peer_that_is_missing_is_named() -> None:
     assert status.startswith("not run: ") and "sksundae" in status
 
 
+def test_a_stopped_benchmark_goes_on_where_it_ended(tmp_path: Path) -> None:
+    code = (
+        "from pathlib import Path; from estimate import completed\n"
+        "def one(name, seed): print('run', name, seed); return {'seed': seed, 'name': name, 'twice': 2 * seed}\n"
+        "for seeds in ((1,), (1, 2)):\n"
+        "    cases = ((name, seed) for seed in seeds for name in 'ab')\n"
+        "    rows = completed(Path(sys.argv[1]), ('name', 'seed'), cases, one)\n"
+        "print(*(row['twice'] for row in rows))\n"
+    )
+    ran = ["run a 1", "run b 1", "run a 2", "run b 2"]
+    assert run(f"exec({code!r})", str(tmp_path / "rows.jsonl")).splitlines() == [*ran, "2 2 4 4"]
+
+
 def test_the_independent_reference_agrees_with_the_shipped_one(tmp_path: Path) -> None:
     """For both bench scenes, `reference.c` agrees with trajectories that another program has computed."""
     code = (
