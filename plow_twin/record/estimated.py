@@ -12,7 +12,7 @@ from plow_twin.model.scene import Scene
 from plow_twin.record.reader import RunReader
 from plow_twin.stream import journal
 from plow_twin.stream.model_changes import changed_scene, read_changes
-from plow_twin.stream.session import wear_in
+from plow_twin.stream.snapshot import SessionState
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ def left_by(reader: RunReader) -> tuple[Scene, journal.Estimated | None]:
                 case journal.SetModel(_, text):
                     changes = read_changes(text)
                 case journal.Snapshot(_, data):
-                    depth = wear_in(data)
+                    depth = tuple(SessionState.unpack(data).wear_depth.tolist())
     scene = changed_scene(scene, changes)
     if depth is not None and scene.wear is not None:
         scene = replace(scene, wear=replace(scene.wear, initial_depth_m=depth))

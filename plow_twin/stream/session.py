@@ -10,9 +10,7 @@ Terms of this module:
 
 from __future__ import annotations
 
-import json
 import math
-import struct
 from bisect import insort
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,25 +26,14 @@ from plow_twin.stream import journal
 from plow_twin.stream.driven import MOST_MEASURED, Driven, Following
 from plow_twin.stream.history import History
 from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
-from plow_twin.stream.outputs import NONE, NOTHING, STATE_BYTES, THE_ONE, Outputs, Published, Rows, Stock
+from plow_twin.stream.outputs import NONE, NOTHING, THE_ONE, Outputs, Published, Rows, Stock
+from plow_twin.stream.snapshot import SessionState, split_changes, with_changes
 
 #: Number of advances from one digest to the next.
 DIGEST_INTERVAL: Final = 100
-#: Header of a snapshot, with these fields:
-#:
-#: - whether a stamp has been reached
-#: - stamp of model time 0 [ns]
-#: - stamp reached [ns]
-#: - number of advances
-#: - whether the load is held
-#: - travel speed [m/s]
-#: - number of travel speeds that wait for their stamps
-_HEADER: Final = struct.Struct("<?qqq?dq")
-_TRAVEL: Final = struct.Struct("<qd")
 #: Largest time [ns] by which a pose may be ahead of the model, as when a bag is played fast. A pose beyond the limit
 #: must come from a different clock.
 _AHEAD_NS: Final = 3_600_000_000_000
-_WEAR_SIZE: Final = 8 * PAIR_COUNT
 _NO_LOAD: Final = np.zeros((1, 3))
 _NO_ROWS: Final = NOTHING.rows
 
@@ -430,22 +417,12 @@ class Session:
 
     def snapshot(self) -> journal.Snapshot:
         """Return the exact state of the twin, the outputs and the session."""
-        known = self.stamp_ns is not None
-        header = _HEADER.pack(
-            known,
-            self.origin_ns or 0,
-            self.stamp_ns or 0,
-            self._advances,
-            self.held,
-            self._speed,
-            len(self._travels),
-        )
-        travels = b"".join(_TRAVEL.pack(travel.stamp_ns, travel.speed_m_s) for travel in self._travels)
+        state = SessionState(
+            self.origin_ns, self.stamp_ns, self._advances, self.held, self._speed, self._travels, self.wear_depth,
+            self.outputs.state(), with_changes(self.twin.snapshot(), self.changes),
+        )  # fmt: skip
         stamp_ns = self.stamp_ns if self.stamp_ns is not None else self.origin_ns or 0
-        # changes of the scene are appended last, because `_split_twin` finds the changes after the data of the twin
-        changes = json.dumps(self.changes).encode() if self.changes else b""
-        data = header + travels + self.wear_depth.tobytes() + self.outputs.state() + self.twin.snapshot() + changes
-        return journal.Snapshot(stamp_ns, data)
+        return journal.Snapshot(stamp_ns, state.pack())
 
     def _run(self, samples: Sequence[journal.Sample], taken: NDArray[np.int64] = NONE) -> Applied:
         stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
@@ -723,15 +700,13 @@ class Session:
 
     def _restore_motion(self, data: bytes) -> None:
         """Restore the motion from a snapshot, but neither the wear nor changed numbers of the scene."""
-        travels = _HEADER.unpack_from(data)[-1]
-        end = _HEADER.size + travels * _TRAVEL.size
-        depth = np.frombuffer(data, np.float64, PAIR_COUNT, offset=end)
-        twin_data, changes = self._split_twin(data[end + _WEAR_SIZE + STATE_BYTES :])
+        state = SessionState.unpack(data)
+        twin_data, changes = self._split_changes(state.twin)
         known, steered, origin_ns = "", False, self.origin_ns
         if self.following is not None:
             known, steered = self.following.known, self.following.steered
         self._end_motion()
-        if changes == self.changes and (depth == self.wear_depth).all():
+        if changes == self.changes and (state.wear_depth == self.wear_depth).all():
             self.twin.restore(twin_data)
         else:
             saved = self.twin.like(changed_scene(self._scene, changes))
@@ -744,34 +719,25 @@ class Session:
         if self._wears:
             self.twin.set_travel_speed(self._speed)
 
-    def _split_twin(self, data: bytes) -> tuple[bytes, dict[str, float]]:
+    def _split_changes(self, data: bytes) -> tuple[bytes, dict[str, float]]:
         size = len(self.twin.snapshot()) if self.following is None else self.following.snapshot_size(data)
-        return data[:size], read_changes(data[size:].decode()) if len(data) > size else {}
+        return split_changes(data, size)
 
     def _restore(self, data: bytes) -> None:
-        known, origin_ns, stamp_ns, advances, held, speed, travels = _HEADER.unpack_from(data)
-        end = _HEADER.size + travels * _TRAVEL.size
-        split = end + _WEAR_SIZE + STATE_BYTES
-        twin_data, changes = self._split_twin(data[split:])
+        state = SessionState.unpack(data)
+        twin_data, changes = self._split_changes(state.twin)
         if changes != self.changes:
             self._use(changed_twin(self.twin, self._scene, changes))
             self.changes = changes
             self.outputs.scene = self.twin.scene
         self.twin.restore(twin_data)
-        self.outputs.set_state(data[end + _WEAR_SIZE : split])
-        self.wear_depth = np.frombuffer(data, np.float64, PAIR_COUNT, offset=end).copy()
-        self._travels = [journal.Travel(*found) for found in _TRAVEL.iter_unpack(data[_HEADER.size : end])]
-        self.origin_ns = origin_ns if known else self.origin_ns
-        self.stamp_ns = stamp_ns if known else None
-        self._advances, self.held, self._speed = advances, held, speed
+        self.outputs.set_state(state.outputs)
+        self.wear_depth, self._travels = state.wear_depth, state.travels
+        if state.origin_ns is not None:
+            self.origin_ns = state.origin_ns
+        self.stamp_ns, self._advances = state.stamp_ns, state.advances
+        self.held, self._speed = state.held, state.travel_speed_m_s
 
 
 def _all_finite(rows: Rows | None) -> bool:
     return rows is None or (Published(rows, NOTHING.slow).finite and bool(np.isfinite(rows["wear_depth"]).all()))
-
-
-def wear_in(snapshot: bytes) -> tuple[float, ...]:
-    """Return the wear depths [m] of the eight pads in a session's snapshot."""
-    travels = _HEADER.unpack_from(snapshot)[-1]
-    depth: list[float] = np.frombuffer(snapshot, np.float64, PAIR_COUNT, _HEADER.size + travels * _TRAVEL.size).tolist()
-    return tuple(depth)
