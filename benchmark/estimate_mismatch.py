@@ -102,6 +102,26 @@ class Kind:
     late_s: float = 0.0
     #: Drift of the bias of x and y over the window [m].
     drift_m: float = 0.0
+    #: Change of the bias of x and y [m] by a temperature that rises and falls within the window.
+    warm_m: float = 0.0
+    #: Relative difference of the damping of each wall from the damping of the contact.
+    damping_walls: float = 0.0
+    #: Depth [m] of a recess in one wall.
+    recess_m: float = 0.0
+    #: Distance [m] of the centre of mass from its assumed place.
+    off_centre_m: float = 0.0
+    #: Angle [rad] between gravity and the assumed direction.
+    inclination: float = 0.0
+    #: Viscous drag on the head [N s/m].
+    drag: float = 0.0
+    #: Degrees of freedom of Student's distribution of the noise; 0 for normal noise.
+    tails: int = 0
+    #: Steps of theta [rad].
+    theta_steps: float = 0.0
+    #: Steps of the load, as a share of the range of each component.
+    load_steps: float = 0.0
+    #: Duration [s] of a burst without poses.
+    burst_s: float = 0.3
 
 
 _HARD = (1e9, 1e11)
@@ -148,6 +168,17 @@ KINDS = {
     "arm": Kind("arm of gravity 10 mm", arm_m=0.01),
     "late_load": Kind("load 20 ms late", late_s=0.02),
     "drift": Kind("bias drifts by 1 mm", drift_m=1e-3),
+    "warm": Kind("bias of 0.3 mm rises and falls", warm_m=3e-4),
+    "damping_walls": Kind("walls' damping +-40 %", damping_walls=0.4),
+    "recess": Kind("recess of 1 mm in one wall", recess_m=1e-3),
+    "off_centre": Kind("centre of mass 3 mm off", off_centre_m=3e-3),
+    "inclined": Kind("gravity inclined by 1 degree", inclination=np.radians(1.0)),
+    "drag": Kind("viscous drag of 2 kN s/m", drag=2e3),
+    "tails": Kind("noise with 3 degrees of freedom", tails=3),
+    "theta_steps": Kind("theta in steps of 4 mrad", theta_steps=4e-3),
+    "load_steps": Kind("load in steps of 2 %", load_steps=0.02),
+    "dropouts": Kind("six gaps of 0.5 s in the poses", bursts=6, burst_s=0.5),
+    "clock_200": Kind("clock drift 2e-4", clock=2e-4),
     "hard": Kind("hard: nothing", stiffness=_HARD),
     "hard_no_load": Kind("hard: load missing", stiffness=_HARD, load_missing=True),
     "hard_corners": Kind("hard: corners rounded 5 mm", stiffness=_HARD, radius_m=5e-3),
@@ -195,12 +226,28 @@ def _draw(kind: Kind, rng: np.random.Generator) -> Mismatch:
         kind.radius_m,
         kind.friction,
         kind.spring,
+        **_further(kind, rng),
     )
     wrench = _true_load(kind, rng, fine, believed)
     t = np.arange(0.0, end, 1.0 / kind.rate_hz)
     poses, _ = Poses.of(*_measured(kind, rng, t, fine, poses_of(scene, machine, fine, wrench, fine)))
     load, _ = Load.of(*_telemetry(kind, fine, (not kind.load_missing) * believed))
     return Mismatch(scene, nominal, load, poses)
+
+
+def _further(kind: Kind, rng: np.random.Generator) -> dict[str, Any]:
+    """Return the differences for which random numbers are drawn only in the kinds of machines that have them."""
+    found: dict[str, Any] = {"drag": kind.drag}
+    if kind.damping_walls:
+        found["damping_share"] = 1.0 + kind.damping_walls * _by_wall(rng)
+    if kind.recess_m:
+        found["recess"] = kind.recess_m * (np.arange(8) == rng.integers(8))
+    if kind.off_centre_m:
+        angle = rng.uniform(0.0, 2.0 * np.pi)
+        found["off_centre"] = kind.off_centre_m * np.cos(angle), kind.off_centre_m * np.sin(angle)
+    if kind.inclination:
+        found["inclination"] = kind.inclination * rng.choice([-1.0, 1.0])
+    return found
 
 
 def _believed(kind: Kind, nominal: Scene, rng: np.random.Generator, t: Array) -> Array:
@@ -286,22 +333,29 @@ def _measured(kind: Kind, rng: np.random.Generator, t: Array, fine: Array, motio
             turned[index] = keep * turned[index - 1] + (1.0 - keep) * turned[index]
     q = np.stack([np.interp(t, fine, column) for column in turned.T], axis=1)
     q[:, 2] *= 1.0 + kind.theta_scale * rng.choice([-1.0, 1.0])
-    q += kind.noise_m * np.array([1.0, 1.0, 4.0]) * rng.standard_normal(q.shape)
+    white = rng.standard_t(kind.tails, q.shape) if kind.tails else rng.standard_normal(q.shape)
+    q += kind.noise_m * np.array([1.0, 1.0, 4.0]) * white
     if kind.steps_m:
         step = kind.steps_m * np.array([1.0, 1.0, 4.0])
         q = np.round(q / step) * step
+    if kind.theta_steps:
+        q[:, 2] = np.round(q[:, 2] / kind.theta_steps) * kind.theta_steps
     if kind.saturated:
         most = kind.saturated * np.abs(motion[:, :2]).max(axis=0)
         q[:, :2] = np.clip(q[:, :2], -most, most)
     q[:, :2] += kind.drift_m * (t / t[-1] - 0.5)[:, None]
+    q[:, :2] += kind.warm_m * np.sin(np.pi * t / t[-1])[:, None]
     for start in rng.uniform(0.0, t[-1], kind.bursts):
-        q[(t >= start) & (t < start + 0.3)] = np.nan
+        q[(t >= start) & (t < start + kind.burst_s)] = np.nan
     if kind.theta_missing:
         q[:, 2] = np.nan
     return t * (1.0 + kind.clock), q
 
 
 def _telemetry(kind: Kind, fine: Array, believed: Array) -> tuple[Array, Array]:
+    if kind.load_steps:
+        step = kind.load_steps * np.ptp(believed, axis=0)
+        believed = np.round(believed / step) * step
     if not kind.averaged_s:
         knots = np.arange(0.0, fine[-1] + kind.sampled_s, kind.sampled_s)
         return knots + kind.late_s, np.stack([np.interp(knots, fine, column) for column in believed.T], axis=1)

@@ -1,13 +1,14 @@
 """A machine with properties that a scene does not have, integrated by fixed Runge-Kutta steps.
 
-The equations are independent of the solver. Walls may differ in stiffness, corners may be rounded and have friction,
-pads may be displaced, and the frame may be on a spring. The rotation of the head is that of `rotation: paper`.
+The equations are independent of the solver. Walls may differ in stiffness and damping and have a recess, corners may be
+rounded and have friction, pads may be displaced, and the frame may be on a spring. The centre of mass may be displaced,
+gravity inclined and the motion damped. The rotation of the head is that of `rotation: paper`.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numba
 import numpy as np
@@ -24,6 +25,8 @@ _STEPS_A_PERIOD, _LONGEST_STEP = 60.0, 1e-4
 _FRAME_MASS, _FRAME_DAMPING = 500.0, 0.1
 #: Speed [m/s] below which friction is viscous.
 _CREEP = 0.005
+#: Half width [m] of a recess, at which its depth falls to 1/e.
+_HALF_RECESS = 0.01
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,16 @@ class Machine:
     friction: float = 0.0
     #: Stiffness of the spring under the frame along x and y [N/m]; 0 for a fixed frame.
     spring: float = 0.0
+    #: Damping of each pair, relative to the damping of the contact, shape (8,).
+    damping_share: Array = field(default_factory=lambda: np.ones(8))
+    #: Depth [m] of a recess in the wall of each pair, in front of the pad at rest, shape (8,).
+    recess: Array = field(default_factory=lambda: np.zeros(8))
+    #: Centre of mass relative to the cavity's centre, in the axes of the head [m].
+    off_centre: tuple[float, float] = (0.0, 0.0)
+    #: Angle [rad] between gravity and -y.
+    inclination: float = 0.0
+    #: Viscous drag on the head [N s/m].
+    drag: float = 0.0
 
 
 def poses_of(scene: Scene, machine: Machine, t: Array, wrench: Array, asked: Array) -> Array:
@@ -56,55 +69,65 @@ def poses_of(scene: Scene, machine: Machine, t: Array, wrench: Array, asked: Arr
     )
     gravity = scene.gravity.acceleration_m_s2
     numbers = np.array([
-        scene.head.mass_kg, scene.head.inertia_kg_m2, contact.exponent, contact.damping or 0.0, machine.friction,
-        gravity, scene.gravity.arm_m, machine.spring, _FRAME_MASS,
-        2.0 * _FRAME_DAMPING * math.sqrt(machine.spring * _FRAME_MASS),
+        scene.head.mass_kg, scene.head.inertia_kg_m2, contact.exponent, machine.friction,
+        gravity * math.sin(machine.inclination), gravity * math.cos(machine.inclination), scene.gravity.arm_m,
+        machine.spring, _FRAME_MASS, 2.0 * _FRAME_DAMPING * math.sqrt(machine.spring * _FRAME_MASS),
+        *machine.off_centre, machine.drag,
     ])  # fmt: skip
     corners = np.stack([half[0] * CORNER_X, half[1] * CORNER_Y])
     normals = np.stack([NORMAL_X, NORMAL_Y]).astype(np.float64)
     stiffness = contact.stiffness * machine.stiffness_share
-    out: Array = _run(numbers, corners, normals, walls, stiffness, t, wrench, asked, step)
+    pads = np.stack([walls, stiffness, (contact.damping or 0.0) * machine.damping_share, machine.recess])
+    out: Array = _run(numbers, corners, normals, pads, t, wrench, asked, step)
     return out
 
 
 @numba.njit(cache=True)
-def _run(numbers, corners, normals, walls, stiffness, t, wrench, asked, step):  # type: ignore[no-untyped-def]
+def _run(numbers, corners, normals, pads, t, wrench, asked, step):  # type: ignore[no-untyped-def]
     out = np.zeros((len(asked), 3))
     state, now = np.zeros(10), t[0]
+    state[0], state[1] = numbers[10], numbers[11]
     for row in range(len(asked)):
         steps = int(np.ceil((asked[row] - now) / step)) if asked[row] > now else 0
         h = (asked[row] - now) / steps if steps else 0.0
         for _ in range(steps):
-            a = _rates(numbers, corners, normals, walls, stiffness, t, wrench, now, state)
-            b = _rates(numbers, corners, normals, walls, stiffness, t, wrench, now + 0.5 * h, state + 0.5 * h * a)
-            c = _rates(numbers, corners, normals, walls, stiffness, t, wrench, now + 0.5 * h, state + 0.5 * h * b)
-            d = _rates(numbers, corners, normals, walls, stiffness, t, wrench, now + h, state + h * c)
+            a = _rates(numbers, corners, normals, pads, t, wrench, now, state)
+            b = _rates(numbers, corners, normals, pads, t, wrench, now + 0.5 * h, state + 0.5 * h * a)
+            c = _rates(numbers, corners, normals, pads, t, wrench, now + 0.5 * h, state + 0.5 * h * b)
+            d = _rates(numbers, corners, normals, pads, t, wrench, now + h, state + h * c)
             state = state + h / 6.0 * (a + 2.0 * b + 2.0 * c + d)
             now += h
+        c, s = np.cos(state[2]), np.sin(state[2])
         out[row] = state[:3]
+        out[row, 0] -= c * numbers[10] - s * numbers[11]
+        out[row, 1] -= s * numbers[10] + c * numbers[11]
     return out
 
 
 @numba.njit(cache=True)
-def _rates(numbers, corners, normals, walls, stiffness, t, wrench, now, state):  # type: ignore[no-untyped-def]
-    mass, inertia, exponent, damping, friction, gravity, arm, spring, frame_mass, frame_damping = numbers
+def _rates(numbers, corners, normals, pads, t, wrench, now, state):  # type: ignore[no-untyped-def]
+    mass, inertia, exponent, friction, along, gravity, arm, spring, frame_mass, frame_damping, ox, oy, drag = numbers
+    walls, stiffness, damping, recess = pads
     place = min(max((now - t[0]) / (t[1] - t[0]), 0.0), len(t) - 1.000001)
     left = int(place)
     load = wrench[left] + (place - left) * (wrench[left + 1] - wrench[left])
-    fx, fy = load[0], load[1] - mass * gravity
-    moment = load[2] - mass * gravity * arm
-    frame_x, frame_y = 0.0, 0.0
     c, s = np.cos(state[2]), np.sin(state[2])
+    fx, fy = load[0] - mass * along - drag * state[3], load[1] - mass * gravity - drag * state[4]
+    moment = load[2] - mass * gravity * arm - (c * ox - s * oy) * load[1] + (s * ox + c * oy) * load[0]
+    frame_x, frame_y = 0.0, 0.0
     for k in range(8):
         dx, dy = corners[0, k] + state[6] - state[0], corners[1, k] + state[7] - state[1]
         px, py = c * dx + s * dy, -s * dx + c * dy
         nx, ny = normals[0, k], normals[1, k]
-        depth = nx * px + ny * py - walls[k]
+        depth = nx * (px + ox) + ny * (py + oy) - walls[k]
+        if recess[k] > 0.0:
+            aside = nx * (py + oy - corners[1, k]) - ny * (px + ox - corners[0, k])
+            depth -= recess[k] * np.exp(-((aside / _HALF_RECESS) ** 2))
         if depth <= 0.0:
             continue
         ux, uy = state[8] - state[3], state[9] - state[4]
         wx, wy = c * ux + s * uy + state[5] * py, -s * ux + c * uy - state[5] * px
-        force = stiffness[k] * depth**exponent * (1.0 + damping * (nx * wx + ny * wy))
+        force = stiffness[k] * depth**exponent * (1.0 + damping[k] * (nx * wx + ny * wy))
         if force <= 0.0:
             continue
         rub = friction * force * np.tanh((nx * wy - ny * wx) / _CREEP)
