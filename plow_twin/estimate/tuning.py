@@ -144,6 +144,9 @@ MORE_ASKEW: Annotated[
 ] = 2.0
 CHANGE_CHI2: Annotated[float, Tuned("chi^2", "smallest gain in chi^2 of a change within the window")] = 200.0
 CHANGE_SHARE: Annotated[float, Tuned("1", "smallest share of the excess residuals that such a change explains")] = 0.25
+CHANGE_ENDS: Annotated[
+    float, Tuned("1", "share of the swings at each end of the window without a test for a change")
+] = 0.05
 STUCK: Annotated[
     tuple[float, ...],
     Tuned("rows, deviations", "smallest number of equal rows of a stuck sensor, and smallest motion meanwhile"),

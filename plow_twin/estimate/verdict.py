@@ -289,13 +289,17 @@ def _excess(fit: Fit) -> float:
 
 
 def _changes(problem: Problem, fit: Fit, columns: NDArray[np.intp]) -> Iterator[tuple[Array, Array]]:
-    """Yield the information matrix and the score for a change of the unknowns `columns` at each of several swings."""
+    """Yield the information matrix and the score for a change of the unknowns `columns` at each of several swings.
+
+    A change near an end of the window cannot be distinguished from a few swings that are fitted badly.
+    """
     count = len(columns)
     size = SIZE + OWN * problem.window.swings
     cross, own, score = np.zeros((size, count)), np.zeros((count, count)), np.zeros(count)
     swings = list(pieces(problem, fit.point, fit.linear, fit.variance))
     apart = math.ceil(len(swings) / MOMENTS)
-    for index in range(len(swings) - 1, 1, -1):
+    end = max(2, round(tuning.CHANGE_ENDS * len(swings)))
+    for index in range(len(swings) - 1, end - 1, -1):
         for piece in swings[index]:
             changed = piece.weighted[:, columns]
             crossed = piece.rows.T @ changed
@@ -303,7 +307,7 @@ def _changes(problem: Problem, fit: Fit, columns: NDArray[np.intp]) -> Iterator[
             cross[piece.own] += crossed[SIZE:]
             own += changed.T @ piece.rows[:, columns]
             score += changed.T @ piece.residual
-        if index < len(swings) - 1 and index % apart == 0:
+        if index <= len(swings) - end and index % apart == 0:
             yield own - cross.T @ fit.factor.solve(cross), score.copy()
 
 
