@@ -107,6 +107,15 @@ def test_a_sensor_beside_the_centre_or_behind_a_low_pass_is_found_and_the_interv
     assert np.hypot.reduce([share * by for share, by, _ in found]) == pytest.approx(size, rel=0.2)
 
 
+def test_walls_with_different_damping_are_found_and_the_intervals_hold() -> None:
+    """Without these quantities, a constant part of the load explains the motion, with errors of 4 deviations."""
+    truth = mismatched(KINDS["damping_walls"], 98_200)
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert max(share for name, (share, _, _) in result.differs.items() if name.startswith("damping_")) > 0.9
+    for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):
+        assert abs(value.mean - true) < min(2.0 * value.deviation, 2e-4)
+
+
 def test_swings_at_an_end_of_the_window_that_are_fitted_badly_are_no_change_of_the_machine() -> None:
     """With a change after the third of 176 swings, the estimate would be withdrawn, although it is right to 4 um."""
     truth = mismatched(KINDS["load_steps"], 98_201)

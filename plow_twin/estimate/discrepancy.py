@@ -21,6 +21,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from typing import Any, Final
 
 import numpy as np
@@ -52,8 +53,8 @@ STATED: Final = {
 }
 #: Path of the friction coefficient.
 FRICTION: Final = "friction.coefficient"
-#: Steps of the difference quotients with respect to the relative stiffness of a wall and to a constant load, in units
-#: of half the load's range.
+#: Steps of the difference quotients with respect to the relative stiffness and damping of a wall, and to a constant
+#: load in units of half the load's range.
 _WALL_STEP, _PUSH_STEP = 0.02, 5e-3
 #: Smallest error of the load in units of half the load's range, a guard against division by zero.
 _LEAST_PUSH = 1e-5
@@ -192,12 +193,12 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
     column = by_compliance(problem, point)
     if column is not None:
         out["compliance"] = _Column(UNSTATED["compliance"], column, least=0.0)
-    for wall, pads in zip(("left", "right", "top", "bottom"), WALLS, strict=True):
-        share, name, step = np.ones(PAIR_COUNT), f"stiffness_{wall}", problem.steps * _WALL_STEP
-        share[list(pads)] += step
-        column = by(step, share=share)
+    for (wall, pads), part in product(zip(("left", "right", "top", "bottom"), WALLS, strict=True), _of_walls(scene)):
+        of_pads, step = np.ones(PAIR_COUNT), problem.steps * _WALL_STEP
+        of_pads[list(pads)] += step
+        column = by(step, **{part: of_pads})
         if column is not None:
-            out[name] = _Column(UNSTATED[name], column)
+            out[f"{part}_{wall}"] = _Column(UNSTATED[f"{part}_{wall}"], column)
     held, columns, prior = problem.differences.any(), problem.by_differences(point), deviations()
     for index, name in enumerate(DIFFERENCES):
         least = 0.0 if index == LAG else -math.inf
@@ -214,6 +215,12 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
     step = problem.steps * _PUSH_STEP
     pushes = [by(step, push=step * push) for push in np.diag(np.maximum(size, 1e-3 * size.max()))]
     return out, np.stack([np.zeros_like(point.rate) if push is None else push for push in pushes], axis=2)
+
+
+def _of_walls(scene: Scene) -> tuple[str, ...]:
+    """Return the names of the numbers of the contact that may differ between the walls."""
+    constant = scene.contact.law == "hunt_crossley" and scene.contact.damping
+    return ("stiffness", "damping") if constant else ("stiffness",)
 
 
 def _of_sensor(problem: Problem, point: Point) -> Iterator[tuple[str, Array]]:

@@ -288,7 +288,8 @@ class Problem:
 
     def evaluate(
         self, shared: Array, states: Array, differences: Array | None = None, push: Array | None = None,
-        share: Array | None = None, change: Callable[[Scene], Scene] | None = None, load: Load | None = None,
+        stiffness: Array | None = None, change: Callable[[Scene], Scene] | None = None, load: Load | None = None,
+        damping: Array | None = None,
     ) -> Point | None:  # fmt: skip
         """Return the motion with the given unknowns; None if the motion leaves the range of the model.
 
@@ -298,19 +299,20 @@ class Problem:
             The unknowns.
         differences : ndarray, shape (7,), optional
             Values that replace the differences of the problem.
-        push, share : ndarray, optional
+        push, stiffness, damping : ndarray, optional
             As in `Forward.run`.
         change : callable, optional
             Function that returns a changed scene, which may need other compiled terms.
         load : Load, optional
             Load that replaces the load of the forward model.
         """
-        found = self._evaluate(shared, states[None], differences, push, share, change, load)
+        found = self._evaluate(shared, states[None], differences, push, stiffness, change, load, damping)
         return None if found is None else found[0]
 
     def _evaluate(
         self, shared: Array, several: Array, differences: Array | None = None, push: Array | None = None,
-        share: Array | None = None, change: Callable[[Scene], Scene] | None = None, load: Load | None = None,
+        stiffness: Array | None = None, change: Callable[[Scene], Scene] | None = None, load: Load | None = None,
+        damping: Array | None = None,
     ) -> list[Point] | None:  # fmt: skip
         """Return the motions for k sets of starting states `several`, shape (k, s, 6), as `evaluate` does."""
         window, differences = self.window, self.differences if differences is None else differences
@@ -324,7 +326,8 @@ class Problem:
         edges = (size * np.arange(count)[:, None] + rows.edges[:-1]).ravel()
         motions = forward.run(
             scene, shared[GAIN], np.tile(window.starts[:-1], count), several.reshape(-1, 6),
-            np.append(edges, size * count), np.tile(rows.asked, count), depth_of(differences[TURNS]), push, share,
+            np.append(edges, size * count), np.tile(rows.asked, count), depth_of(differences[TURNS]), push, stiffness,
+            damping,
         )  # fmt: skip
         if motions is None:
             return None

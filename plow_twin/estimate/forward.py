@@ -87,7 +87,8 @@ class Forward:
 
     def run(
         self, scene: Scene, gain: Array, starts: Array, states: Array, edges: NDArray[np.int64], times: Array,
-        depth: Array | None = None, push: Array | None = None, share: Array | None = None,
+        depth: Array | None = None, push: Array | None = None, stiffness: Array | None = None,
+        damping: Array | None = None,
     ) -> Motions | None:  # fmt: skip
         """Return the motions of `scene` from several states, under the load times `gain`, shape (3,).
 
@@ -103,19 +104,21 @@ class Forward:
             Outward displacement of each pad in m, in addition to the clearances.
         push : ndarray, shape (3,), optional
             A constant load that is added to the measured load, in N, N, N m.
-        share : ndarray, shape (8,), optional
+        stiffness : ndarray, shape (8,), optional
             Stiffness of each pair relative to the contact's stiffness.
+        damping : ndarray, shape (8,), optional
+            Damping of each pair relative to the contact's damping, for a law with a constant lambda.
 
         Returns
         -------
         Motions or None
             None if the head leaves the range of the model.
         """
-        params, segments = self._compiled(scene, gain, depth, push, share)
+        params, segments = self._compiled(scene, gain, depth, push, stiffness)
         records = new_records(state_type(self._terms), len(starts))
         records["y"] = body_states(states, scene.head.com_offset_m)
         if self._terms.hysteretic is not None:
-            records["damping_factor"] = scene.contact.damping or 0.0
+            records["damping_factor"] = (scene.contact.damping or 0.0) * (1.0 if damping is None else damping)
         records["step_start"] = starts
         records["time"] = starts
         totals = new_records(TOTALS, len(starts))
@@ -132,16 +135,16 @@ class Forward:
         return Motions(q, v, np.array(totals["time_in_contact"]))
 
     def _compiled(
-        self, scene: Scene, gain: Array, depth: Array | None, push: Array | None, share: Array | None
+        self, scene: Scene, gain: Array, depth: Array | None, push: Array | None, stiffness: Array | None
     ) -> tuple[Any, Any]:
-        walls = tuple(None if part is None else part.tobytes() for part in (depth, share))
+        walls = tuple(None if part is None else part.tobytes() for part in (depth, stiffness))
         if self._params is None or self._params[:2] != (scene, walls):
             params = compile_scene(scene, tuning.TOLERANCE, sampled=True).params
             if depth is not None:
                 params["penetration_rows"][4] -= depth
-            if share is not None:
+            if stiffness is not None:
                 # under a linear law, equivalent to a factor on the stiffness
-                params["penetration_rows"][:] *= share
+                params["penetration_rows"][:] *= stiffness
             self._params = scene, walls, params
         inertia = inertias(scene)
         segments = np.zeros(len(self._knots), SEGMENT)

@@ -34,7 +34,7 @@ SCALES: Final = (5e-3, 5e-3, 1e-2)
 BIAS: Final = (5e-3, 5e-3, 0.02)
 #: Prior standard deviations of quantities that a scene cannot state:
 #:
-#: - `stiffness_<wall>`: stiffness of a wall relative to the stiffness of the contact
+#: - `stiffness_<wall>`, `damping_<wall>`: stiffness and damping of a wall relative to those of the contact
 #: - `turn_<wall>`: rotation of a wall, as the difference in m between the outward displacements of its two pads
 #: - `scale_<axis>`: scale factor of the sensor
 #: - `lever_<axis>`: lever arm of the sensor in m
@@ -43,6 +43,7 @@ BIAS: Final = (5e-3, 5e-3, 0.02)
 #: - `compliance`: displacement of the frame per force in m/N; a force of 100 kN moves the frame by 0.25 mm
 UNSTATED: Final = {
     **{f"stiffness_{wall}": 0.1 for wall in ("left", "right", "top", "bottom")},
+    **{f"damping_{wall}": 0.3 for wall in ("left", "right", "top", "bottom")},
     **{f"turn_{wall}": 1e-3 for wall in ("left", "right", "top", "bottom")},
     **{f"scale_{axis}": scale for axis, scale in zip(("x", "y", "theta"), SCALES, strict=True)},
     **{f"lever_{axis}": 4e-3 for axis in ("x", "y")},
