@@ -10,10 +10,12 @@ from mismatched_machine import Machine, poses_of
 from scenes import preset
 
 from plow_twin.estimate.compliance import by_compliance
+from plow_twin.estimate.discrepancy import _halves
 from plow_twin.estimate.estimate import estimate
 from plow_twin.estimate.fit import Problem, Window
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.measurements import Load, Poses
+from plow_twin.estimate.result import NORMAL_P95
 from plow_twin.estimate.unknowns import Unknowns
 from plow_twin.model.loads import compile_loads
 
@@ -44,3 +46,14 @@ def test_a_frame_on_springs_is_found_and_the_clearances_hold() -> None:
     for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):
         # with a fixed frame, both errors are 0.12 mm
         assert value.p05 <= true <= value.p95 and abs(value.mean - true) < 6e-5
+
+
+def test_the_halves_of_a_clearance_have_the_quantiles_of_its_samples() -> None:
+    rng = np.random.default_rng(0)
+    means, deviations = np.array([[0.0, 1.0]] * 9 + [[-5.0, 1.0]]), np.array([[1.0, 0.5]] * 10)
+    drawn = means + deviations * rng.standard_normal((40_000, 10, 2))
+    mean = means.mean(axis=0)
+    below, above = _halves(mean, means, deviations)
+    low, high = np.quantile(drawn.reshape(-1, 2), (0.05, 0.95), axis=0)
+    assert np.allclose([mean - NORMAL_P95 * below, mean + NORMAL_P95 * above], [low, high], atol=0.05)
+    assert np.allclose([below[1], above[1]], 0.5, rtol=1e-4)

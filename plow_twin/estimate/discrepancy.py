@@ -27,7 +27,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.special import log_ndtr
+from scipy.special import log_ndtr, ndtr
 
 from plow_twin.estimate import tuning
 from plow_twin.estimate.compliance import by_compliance
@@ -36,6 +36,7 @@ from plow_twin.estimate.harmonics import Harmonics
 from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER
 from plow_twin.estimate.pads import deviations
 from plow_twin.estimate.priors import ROUNDING, UNSTATED, deviation_of
+from plow_twin.estimate.result import NORMAL_P95
 from plow_twin.estimate.unknowns import GX, GY, MOVING, SIZE, SOFTNESS
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Friction, Scene, largest_exponent
@@ -62,6 +63,8 @@ _LEAST_PUSH = 1e-5
 _ROUNDS = (8, 5, 3)
 #: Upper bound on the number of sweeps of the sampler, and number of initial sweeps that are discarded.
 _SWEEPS, _BURNT = 50, 10
+#: Number of bisections for a quantile, derived from an error of a millionth of the interval.
+_BISECTIONS = 20
 #: Upper bound on the lag in rows at which the correlation of residuals is computed.
 _LONGEST_LAG = 60
 
@@ -75,8 +78,11 @@ class Graded:
     shared, covariance : ndarray, shape (SIZE,), (SIZE, SIZE)
         The unknowns of the whole window and their covariance. If the fit passes all checks, the machine is assumed to
         differ from the scene only in them.
-    clearance, clearance_deviation : ndarray, shape (2,)
-        Clearances in m and their standard deviations, for a machine that may differ from the scene in any quantity.
+    clearance : ndarray, shape (2,)
+        Clearances in m, for a machine that may differ from the scene in any quantity.
+    clearance_deviation : ndarray, shape (2, 2)
+        Standard deviations in m of the two halves of normal distributions with the 5 % quantiles (first row) and the
+        95 % quantiles (second row) of the clearances.
     differs : dict of str to (float, float, float)
         Probability, mean and standard deviation of the difference from the scene, for each further quantity.
     load : ndarray, shape (3,)
@@ -125,7 +131,7 @@ def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) 
         linear.learn(rounds)
         linear.temper()
     linear.eliminate()
-    mean, covariance, often = linear.averaged(np.random.default_rng(seed), tuning.DIFFERS[int(doubtful)])
+    mean, covariance, often, halves = linear.averaged(np.random.default_rng(seed), tuning.DIFFERS[int(doubtful)])
     surprise, named = linear.surprise(mean, often), linear.named(mean, often)
     share, exponent, _ = named.get("contact.exponent", (0.0, 0.0, 0.0))
     bent = tuning.BENT_BY_EXPONENT * share * exponent**2
@@ -139,7 +145,8 @@ def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) 
         return out
 
     clearance = (found.shared + mean[:SIZE])[[GX, GY]]
-    deviation = np.sqrt(np.diag(widened(mean, covariance))[[GX, GY]])
+    added = np.diag(widened(mean, np.zeros_like(covariance)))[[GX, GY]]
+    deviation = np.sqrt(ratio * halves**2 + added)
     if not doubtful:
         mean, covariance = linear.exact()
     harmonics, variance = problem.harmonics, ratio * np.diag(covariance)
@@ -379,8 +386,9 @@ class _Linearised:
             evidence += _truncate(mean, covariance, SIZE + index, self._least[index] - self._value[index])
         return evidence, mean, covariance
 
-    def averaged(self, rng: np.random.Generator, prior: float) -> tuple[Array, Array, Array]:
-        """Return mean and covariance of the samples, and the share of samples in which each quantity differs.
+    def averaged(self, rng: np.random.Generator, prior: float) -> tuple[Array, Array, Array, Array]:
+        """Return mean and covariance of the samples, the share of samples in which each quantity differs, and the
+        deviations of the clearances as in `Graded.clearance_deviation`.
 
         `prior` is the prior probability of a difference. A quantity that the fit includes differs in all samples.
         """
@@ -397,6 +405,7 @@ class _Linearised:
         differs, counted = self._held.copy(), _SWEEPS - _BURNT
         now = given(differs)[0]
         mean, second, often = np.zeros(size), np.zeros((size, size)), np.zeros(len(differs))
+        parts = []
         for sweep in range(_SWEEPS):
             for index in rng.permutation(np.flatnonzero(~self._held)):
                 other = differs.copy()
@@ -409,8 +418,10 @@ class _Linearised:
                 second += covariance + np.outer(step, step)
                 mean += step
                 often += differs
+                parts.append((step[[GX, GY]], np.sqrt(np.diag(covariance)[[GX, GY]])))
         mean /= counted
-        return mean, second / counted - np.outer(mean, mean), often / counted
+        halves = _halves(mean[[GX, GY]], *np.stack(parts, axis=1))
+        return mean, second / counted - np.outer(mean, mean), often / counted, halves
 
     def scatter(self) -> float:
         scores = np.stack([score[:SIZE] for _, score in self._blocks])
@@ -434,6 +445,23 @@ class _Linearised:
             name: (float(share), float(value / max(share, 1e-9)), float(spread))
             for name, share, value, spread in zip(self.names, often, self._value + mean[SIZE:], deviation, strict=False)
         }
+
+
+def _halves(mean: Array, means: Array, deviations: Array) -> Array:
+    """Return the deviations of the two halves of normal distributions with the means `mean`, shape (2,), and the 5 %
+    and 95 % quantiles of mixtures of s normal distributions, shape (s, 2) each.
+
+    If a quantity that moves the clearance differs in few samples, the distribution is far from normal.
+    """
+    out = np.zeros((2, 2))
+    for row, (share, sign) in enumerate(((0.05, -1.0), (0.95, 1.0))):
+        low, high = (means - 5.0 * deviations).min(axis=0), (means + 5.0 * deviations).max(axis=0)
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (low + high)
+            below = ndtr((middle - means) / deviations).mean(axis=0) < share
+            low, high = np.where(below, middle, low), np.where(below, high, middle)
+        out[row] = np.maximum(sign * (low - mean), 0.0) / NORMAL_P95
+    return out
 
 
 def _truncate(mean: Array, covariance: Array, index: int, least: float) -> float:

@@ -52,8 +52,12 @@ class Interval:
     @staticmethod
     def normal(mean: float, deviation: float) -> Interval:
         """Return mean, 5 % quantile and 95 % quantile of a normal distribution."""
-        half = NORMAL_P95 * float(deviation)
-        return Interval(float(mean), float(mean) - half, float(mean) + half)
+        return Interval.of_halves(mean, deviation, deviation)
+
+    @staticmethod
+    def of_halves(mean: float, below: float, above: float) -> Interval:
+        """Return the interval of a distribution of two normal halves with the deviations `below` and `above`."""
+        return Interval(float(mean), float(mean - NORMAL_P95 * below), float(mean + NORMAL_P95 * above))
 
     @property
     def deviation(self) -> float:

@@ -63,7 +63,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
         covariance[[GX, GY], [GX, GY]] += _between_optima(problem, shared) ** 2
     rough = beside is not None and (suspect or not finished or bool(verdict.lacking))
     deviation = np.sqrt(np.diag(covariance))
-    published, spread = shared[[GX, GY]], deviation[[GX, GY]]
+    published, spread = shared[[GX, GY]], np.tile(deviation[[GX, GY]], (2, 1))
     if beside is not None:
         published = np.maximum(beside.clearance, LEAST_CLEARANCE)
         spread = np.hypot(beside.clearance_deviation, _between_optima(problem, shared))
@@ -95,7 +95,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
         observed = tested and touched > tuning.TOUCHED and shared[index] > LEAST_CLEARANCE
         observed &= deviation[index] < (2.0 * tuning.OBSERVED if rough else tuning.OBSERVED) and (finished or rough)
         apparent.append(Interval.normal(shared[index], deviation[index]))
-        value = Interval.normal(published[index], spread[index])
+        value = Interval.of_halves(published[index], *spread[:, index])
         if not observed:
             value = _unobserved(unknowns, deviation, index, least[index], fit.noise)
         clearances.append(value.above(0.0))
