@@ -180,6 +180,17 @@ def test_a_withdrawn_estimate_is_undone(truth: Truth) -> None:
     assert (np.ptp(follower.clearance(), axis=1) > 0.3 * before).all()
 
 
+def test_an_estimate_of_one_clearance_is_replaced_by_a_later_one_or_by_one_of_both(truth: Truth) -> None:
+    follower, both = Follower(truth.nominal, MEMBERS), _known(truth)
+    _run(follower, truth, 1.0)
+    horizontal = replace(both, vertical_state=State.NOT_OBSERVABLE)
+    later = replace(horizontal, horizontal=Interval.normal(truth.clearance[0] + 1e-4, 3e-5))
+    assert _take(follower, horizontal) and _take(follower, later)
+    assert follower.clearance()[0, 0] == pytest.approx(later.horizontal.mean)
+    assert not _take(follower, replace(both, horizontal_state=State.NOT_OBSERVABLE))
+    assert _take(follower, both) and not _take(follower, later)
+
+
 def test_a_rough_estimate_of_the_same_motion_does_not_replace_one_that_is_not_rough(truth: Truth) -> None:
     follower = Follower(truth.nominal, MEMBERS)
     _run(follower, truth, 0.5)

@@ -450,9 +450,9 @@ class Follower:
     def add_estimate(self, text: str, t: float, start: float = 0.0) -> None:
         """Add an estimate, the JSON of `Estimate.as_dict`, with a window from `start` [s], for use from time `t` [s].
 
-        The members follow an estimate that contains both clearances or, after the prior, one clearance. An estimate
-        does not replace an estimate from nearly the same motion that has fewer rough clearances. After a withdrawn
-        estimate, the members follow the prior.
+        After the prior, the members follow an estimate that contains a clearance. Only an estimate that contains the
+        same clearances replaces it. A rough clearance does not replace an estimated clearance from nearly the same
+        motion. After a withdrawn estimate, the members follow the prior.
         """
         self._add(t, _harmonics_from(text, start))
 
@@ -471,21 +471,23 @@ class Follower:
             self._use_pose(measured[0], np.array(measured[1:]))
             return
         found = Estimate.from_dict(json.loads(measured))
-        states = (found.horizontal_state, found.vertical_state)
-        if State.WITHDRAWN in states:
+        if State.WITHDRAWN in (found.horizontal_state, found.vertical_state):
             if self.estimate is not None:
                 self._begin_anew("")
-        elif self._is_better(found):
-            return
-        elif all(state.known for state in states) or (self.estimate is None and any(state.known for state in states)):
+        elif self._is_replaced_by(found):
             self._begin_anew(measured)
 
-    def _is_better(self, found: Estimate) -> bool:
-        before, window_s = self.estimate, found.t_end - found.t_start
-        if before is None or self.time - self._since >= tuning.NEW_MOTION * window_s:
+    def _is_replaced_by(self, found: Estimate) -> bool:
+        new = (found.horizontal_state, found.vertical_state)
+        before = self.estimate
+        if before is None:
+            return any(state.known for state in new)
+        pairs = tuple(zip((before.horizontal_state, before.vertical_state), new, strict=True))
+        if self.time - self._since < tuning.NEW_MOTION * (found.t_end - found.t_start) and any(
+            own is State.ESTIMATED and other is State.ROUGH for own, other in pairs
+        ):
             return False
-        own, new = ((one.horizontal_state, one.vertical_state) for one in (before, found))
-        return all(state.known for state in own) and own.count(State.ROUGH) < new.count(State.ROUGH)
+        return all(other.known for own, other in pairs if own.known)
 
     @property
     def known(self) -> str:
