@@ -39,6 +39,14 @@ def test_the_prior_is_the_scene_s_or_that_of_the_mark() -> None:
     assert far[0] == 2.0 * stated[0] and far[3] == pytest.approx(stated[3])
 
 
+@pytest.mark.parametrize("number", ["stiffness", "damping"])
+def test_a_deviation_far_above_its_number_is_that_of_a_log_normal_number(number: str) -> None:
+    scene, load = preset("paper"), Load.unmeasured(1.0)
+    marks = {f"contact.{number}": Provenance(Mark.ASSUMED, "", 100.0 * getattr(scene.contact, number))}
+    stated = Unknowns.stated(replace(scene, marks=marks), load, Poses(np.zeros(0), np.zeros((0, 3)))).deviations()
+    assert stated[2:4].max() == pytest.approx(np.sqrt(np.log(1.0 + 100.0**2)), rel=1e-2)
+
+
 def test_a_stated_deviation_of_a_zero_clearance_is_converted_to_other_units() -> None:
     scene = replace(preset("paper"), marks={"clearance.horizontal_m": Provenance(Mark.ASSUMED, "", 1e-3)})
     tight = replace(scene, clearance=replace(scene.clearance, horizontal_m=0.0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 from plow_twin.model.scene import Mark, Scene
@@ -87,5 +88,7 @@ def deviation_of(scene: Scene, path: str) -> float:
     if name == "restitution":
         return provenance.deviation / max(value * (1.0 - value), 1e-6)
     if kind in ("stiffness", "damping", "mass", "inertia"):
-        return provenance.deviation / max(abs(value), 1e-300)
+        share = provenance.deviation / max(abs(value), 1e-300)
+        # a log-normal number with the relative deviation s has a logarithm with the variance ln(1 + s^2)
+        return math.sqrt(2.0 * math.log(math.hypot(1.0, share))) if kind in ("stiffness", "damping") else share
     return provenance.deviation
