@@ -314,6 +314,18 @@ def test_a_silence_of_the_load_is_not_bridged() -> None:
     assert few.longest_stretch() is few, "a load given by few knots"
 
 
+def test_a_step_of_the_clock_leaves_the_longest_part() -> None:
+    """The step is not a period of the load, by which the units of the estimate would be chosen."""
+    truth, _ = known()[0]
+    load, poses = truth.load, truth.poses
+    first, second = (np.where(part.t < 3.0, part.t - 1e9, part.t) for part in (load, poses))
+    result = estimate(truth.nominal, Load(first, load.wrench), Poses(second, poses.q))
+    assert (result.model, result.sensor, result.horizontal_state) == ("ok", "ok", State.ESTIMATED)
+    assert result.t_start >= 3.0 and result.lost > 400
+    two = estimate(truth.nominal, Load(load.t[:2], load.wrench[:2]), poses)
+    assert two.horizontal_state is State.PRIOR, "poses after the load are not used"
+
+
 def test_a_constant_load_is_suspect_and_only_the_newest_part_of_long_data_is_used(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -20,7 +20,7 @@ from plow_twin.estimate.gaps import Gaps, GapsFit, fit_gaps
 from plow_twin.estimate.lacking import with_harmonics
 from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses, filled
 from plow_twin.estimate.pads import shown, with_differences
-from plow_twin.estimate.result import Estimate, ForcesUsed, Interval
+from plow_twin.estimate.result import Estimate, ForcesUsed, Interval, State
 from plow_twin.estimate.screening import is_dead, is_idle, rests, shortages, thinned, well_measured
 from plow_twin.estimate.search import LOW_PASS, behind_low_pass, candidate, refine
 from plow_twin.estimate.similar import Units
@@ -113,14 +113,15 @@ def estimate_window(
         span = (float(load.t[0]), float(load.t[-1]))
         poses = poses.between(span[0], span[1] + 1e-9)
         return estimate_block(scene, load, poses, prior_of(Unknowns.stated(scene, load, poses), span, lost)), ()
-    units = Units.of(scene, load)
+    units = Units.of(scene, load.longest_stretch())
     if units == Units():
         return _estimate(scene, load, poses, lost, guess, gaps, forces)
     its = units.load(load), units.poses(poses)
     found, following = _estimate(units.scene(scene), *its, lost, guess, units.gaps(gaps), units.forces(forces))
     found = units.in_si(found, scene)
-    if units.only_time and found.sensor == "ok":
+    if units.only_time and found.sensor == "ok" and found.horizontal_state is not State.PRIOR:
         # the duration of an impact does not depend on the load's period, so repeat with times in s
+        load, poses, _ = _usable(load, poses)
         period = _period(load, poses)
         unknowns = Unknowns.stated(scene, load, poses)
         found = under_uncertain_load(found, unknowns, thinned(load, period)[0], poses, period)
@@ -137,19 +138,9 @@ def _estimate(
     forces: ContactForces | None,
 ) -> tuple[Estimate, Guess]:
     """Return the result of `estimate_window`, with all numbers in the units of the arguments."""
-    known, measured = len(load.t), len(poses.t)
-    load = load.longest_stretch()
-    lost += known - len(load.t)
+    load, poses, unusable = _usable(load, poses)
+    lost += unusable
     span = float(load.t[0]), float(load.t[-1])
-    poses = poses.between(span[0], span[1] + 1e-9)
-    if len(load.t) < known:
-        lost += measured - len(poses.t)
-    load = load.newest(_LONGEST_S)
-    load = load.newest(max(MOST_PERIODS * (load.oscillation() or 0.0), MOST_SPAN_S))
-    span = float(load.t[0]), span[1]
-    poses = poses.between(span[0], span[1] + 1e-9).fresh()
-    poses, spikes = poses.without_spikes(noise_level(filled(poses)))
-    lost += spikes
     by_gaps = None if gaps is None else fit_gaps(scene, gaps.between(span[0], span[1] + 1e-9), poses)
     if isinstance(by_gaps, GapsFit) and len(by_gaps.poses.t) and (len(poses.t) < FEWEST_POSES or shortages(poses)):
         poses = by_gaps.poses
@@ -171,6 +162,21 @@ def _estimate(
     elif by_gaps is not None:
         result = replace(result, reasons=(*result.reasons, by_gaps))
     return result, following
+
+
+def _usable(load: Load, poses: Poses) -> tuple[Load, Poses, int]:
+    """Return the newest window of the longest stretch of the load, its poses without spikes, and the rows left out."""
+    known, measured, lost = len(load.t), len(poses.t), 0
+    load = load.longest_stretch()
+    span = float(load.t[0]), float(load.t[-1])
+    poses = poses.between(span[0], span[1] + 1e-9)
+    if len(load.t) < known:
+        lost = known - len(load.t) + measured - len(poses.t)
+    load = load.newest(_LONGEST_S)
+    load = load.newest(max(MOST_PERIODS * (load.oscillation() or 0.0), MOST_SPAN_S))
+    poses = poses.between(float(load.t[0]), span[1] + 1e-9).fresh()
+    poses, spikes = poses.without_spikes(noise_level(filled(poses)))
+    return load, poses, lost + spikes
 
 
 def _known(result: Estimate) -> bool:
