@@ -467,3 +467,7 @@ def test_the_command_writes_a_row_for_each_sample(truth: Truth, tmp_path: Path) 
     dense = ("--follow", "--follow-dt", "1e-9", "--out", tmp_path / "dense")
     refused = plow_twin_here("estimate", tmp_path / "in", *dense)
     assert refused.returncode == 2 and "rows, expected at most 10000000 rows" in refused.stderr
+    t = np.where(load.t < 0.5, load.t, load.t + 1e9)
+    replace(truth, load=Load(t, load.wrench), poses=poses).write(tmp_path / "stepped")
+    refused = plow_twin_here("estimate", tmp_path / "stepped", "--follow", "--out", tmp_path / "none")
+    assert refused.returncode == 2 and "1e+09 s between two samples, expected at most 3600 s" in refused.stderr
