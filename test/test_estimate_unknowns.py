@@ -13,7 +13,7 @@ from plow_twin.estimate.discrepancy import variants
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.similar import Units
 from plow_twin.estimate.uncertain_load import _with_exponent
-from plow_twin.estimate.unknowns import OF_SCENE, SIZE, Unknowns
+from plow_twin.estimate.unknowns import OF_SCENE, SIZE, Unknowns, with_other_law
 from plow_twin.model.loads import compile_loads
 
 
@@ -81,3 +81,12 @@ def test_the_estimate_changes_a_scene_only_as_its_contact_law_and_friction_admit
     assert max(one.friction.coefficient for one in changed if one.friction) == pytest.approx(0.21)
     drawn = [_with_exponent(Unknowns(scene), np.random.default_rng(seed)).scene.contact.exponent for seed in range(9)]
     assert (max(drawn) > contact.exponent) == bool(exponents)
+
+
+def test_the_alternative_law_has_no_options_of_the_scene_s_law() -> None:
+    falling = Contact(
+        "hunt_crossley", 1e7, restitution=0.4, restitution_fall=0.25, restitution_speed_m_s=0.05,
+        restitution_mass_power=0.5, restitution_fall_along_s_m=0.1,
+    )  # fmt: skip
+    other = with_other_law(Unknowns(replace(preset("paper"), contact=falling)))
+    assert other is not None and other.scene.contact == Contact("kelvin_voigt", 1e7, damping=1.0)

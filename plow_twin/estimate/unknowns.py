@@ -253,5 +253,5 @@ def with_other_law(unknowns: Unknowns) -> Unknowns | None:
     law = OTHER_LAW.get(contact.law)
     if law is None or contact.exponent != 1.0:
         return None
-    other = replace(contact, law=law, damping=1.0, restitution=None)
+    other = Contact(law, contact.stiffness, damping=1.0)
     return replace(unknowns, scene=replace(unknowns.scene, contact=other))
