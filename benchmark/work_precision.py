@@ -20,7 +20,7 @@ from lean import rk4
 from plow_twin import Result, Scene, SolverError, Status, simulate
 from plow_twin.run.motion import BUDGET, Motion, run_events
 from plow_twin.run.simulate import Method, output_times
-from plow_twin.solve.compiled_scene import compile_scene
+from plow_twin.solve.compiled_scene import CompiledScene, compile_scene
 from plow_twin.solve.state import new_work
 
 SECTION = "work_precision"
@@ -93,7 +93,12 @@ def prepare_simulate(
 
 def prepare_bare(scene: Scene, output_dt: float, tol: float, t_end: float = T_END) -> Callable[[], Sample]:
     """Prepare the compiled loop alone. Its only outputs are poses and rates, as for the peers."""
-    compiled, work, times = compile_scene(scene, tol), new_work(), output_times(t_end, output_dt)
+    return prepare_compiled(compile_scene(scene, tol), output_dt, t_end)
+
+
+def prepare_compiled(compiled: CompiledScene, output_dt: float, t_end: float) -> Callable[[], Sample]:
+    """Prepare the compiled loop alone, as `prepare_bare` does."""
+    work, times = new_work(), output_times(t_end, output_dt)
 
     def solve() -> tuple[int, Motion]:
         motion = Motion.start(compiled, np.zeros((len(times), 3)), np.zeros((len(times), 3)))
