@@ -54,7 +54,7 @@ def shown_calls() -> list[tuple[str, str]]:
     ]
 
 
-def test_every_call_that_a_page_shows_has_a_verb_and_options_that_exist() -> None:
+def test_every_call_that_a_page_shows_has_a_verb_options_that_exist_and_the_required_options() -> None:
     calls = shown_calls()
     assert len(calls) > 40
     unknown = []
@@ -65,7 +65,9 @@ def test_every_call_that_a_page_shows_has_a_verb_and_options_that_exist() -> Non
             command = command.commands[words.pop(0)]
         known = {option for one in command.params for option in (*one.opts, *one.secondary_opts)} | {"--help"}
         given = {word for word in words if word.startswith("--") and not word.startswith("---")}
-        if (isinstance(command, click.Group) and given != {"--help"}) or given - known:
+        required = [{*one.opts} for one in command.params if isinstance(one, click.Option) and one.required]
+        lacking = given != {"--help"} and not all(options & given for options in required)
+        if (isinstance(command, click.Group) and given != {"--help"}) or given - known or lacking:
             unknown.append((page, call))
     assert unknown == []
 
