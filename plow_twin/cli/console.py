@@ -146,15 +146,22 @@ def table(title: str, *columns: str) -> Table:
     return result
 
 
-def show_facts(console: Console, facts: Mapping[Any, Any], indent: int = 0) -> None:
-    """Print each fact on a line. The items of a mapping are printed as indented lines."""
+def show_facts(console: Console, facts: Mapping[Any, Any]) -> None:
+    """Print each fact on a line, with all values in one column. The items of a mapping are indented."""
+    lines = list(_lines(facts))
+    width = max([24, *(len(name) for name, _ in lines)])
+    for name, value in lines:
+        text = f"{name:{width}} {value}" if value else name
+        console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def _lines(facts: Mapping[Any, Any], indent: int = 0) -> Iterator[tuple[str, str]]:
+    """Yield the indented name and the text of each fact; the text of a mapping with items is empty."""
     for key, value in facts.items():
-        name = " " * indent + str(key)
-        if isinstance(value, Mapping) and value:
-            console.print(name, highlight=False)
-            show_facts(console, value, indent + 2)
-        else:
-            console.print(f"{name:24} {_plain(value)}", highlight=False, markup=False, soft_wrap=True)
+        nested = isinstance(value, Mapping) and len(value) > 0
+        yield " " * indent + str(key), "" if nested else _plain(value)
+        if nested:
+            yield from _lines(value, indent + 2)
 
 
 def _plain(value: Any) -> str:
