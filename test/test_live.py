@@ -31,7 +31,7 @@ from record_support import PAPER_AMPLITUDE, records_of, rewrite
 from waiting import until
 
 from plow_twin.cli.app import run as run_cli
-from plow_twin.cli.outlet import MOST_WAITING, Outlet
+from plow_twin.cli.live_report import MOST_WAITING, Outlet
 from plow_twin.errors import RecordingError
 from plow_twin.live import parameters
 from plow_twin.live.bridge.files import Files, StandardInput

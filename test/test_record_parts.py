@@ -19,7 +19,7 @@ from rosbags.highlevel import AnyReader
 
 from plow_twin import Wear
 from plow_twin.cli.app import run as cli
-from plow_twin.cli.recording_facts import read_recording
+from plow_twin.cli.info import read_recording
 from plow_twin.errors import RecordingError
 from plow_twin.record import measured
 from plow_twin.record.bag import BagWriter, Topic

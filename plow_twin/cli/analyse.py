@@ -107,15 +107,6 @@ def found_recordings(recordings: Sequence[Path], out: Path | None = None) -> tup
     return found, tuple(left)
 
 
-def _watched(task: Any, every: float, as_json: bool, quiet: bool) -> int:
-    facts = _watch(task, every, as_json, quiet)
-    if as_json:
-        click.echo(json.dumps(facts, allow_nan=False))
-    else:
-        _show([facts], False, False, quiet)
-    return DONE_WITH_LOSS if facts["lossy"] else DONE
-
-
 def _results(tasks: list[Any], many: bool, workers: int | None, dask: str | None, quiet: bool) -> list[dict[str, Any]]:
     from plow_twin.study.analysis.many import run_many
 
@@ -125,7 +116,7 @@ def _results(tasks: list[Any], many: bool, workers: int | None, dask: str | None
         return [tasks[0].stored() or tasks[0].run(on_progress)]
 
 
-def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any]:
+def _watched(task: Any, every: float, as_json: bool, quiet: bool) -> int:
     import time
 
     from plow_twin.cli.interruption import interruptible
@@ -135,12 +126,8 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
 
     due = time.monotonic() + every
 
-    def report(found: Any) -> None:
-        nonlocal due
-        if time.monotonic() < due:
-            return
-        begin = time.monotonic()
-        facts = found.facts()
+    def show(found: Any, **end: bool) -> None:
+        facts = {**found.facts(), **end}
         if task.out is not None:
             write_report(found, task.out)
         if as_json:
@@ -148,16 +135,21 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
             sys.stdout.flush()
         else:
             _show([facts], False, False, quiet)
-        # the interval between reports is chosen so that the reports take at most a tenth of the time
-        due = time.monotonic() + max(every, 9.0 * (time.monotonic() - begin))
+
+    def report(found: Any) -> None:
+        nonlocal due
+        begin = time.monotonic()
+        if begin >= due:
+            show(found)
+            # the interval between reports is chosen so that the reports take at most a tenth of the time
+            due = time.monotonic() + max(every, 9.0 * (time.monotonic() - begin))
 
     with interruptible() as stopped:
         path = find_run(task.path, max(every, 10.0), stopped)
         task.clear([path])
         found = replace(task, path=path).analyse(tail=Tail(stopped), on_caught_up=report)
-        if task.out is not None:
-            write_report(found, task.out)
-    return {**found.facts(), "lossy": found.lossy}
+        show(found, lossy=found.lossy)
+    return DONE_WITH_LOSS if found.lossy else DONE
 
 
 def _show_contacts(console: Console, results: Sequence[dict[str, Any]]) -> None:

@@ -35,35 +35,22 @@ from plow_twin.errors import ExcessError, InputError, PlowTwinError, RunInterrup
 
 #: Extra of the package that must be installed for each optional module.
 EXTRA_OF_MODULE: Final = {
-    "rclpy": "ros",
-    "rcl_interfaces": "ros",
-    "builtin_interfaces": "ros",
-    "diagnostic_msgs": "ros",
-    "geometry_msgs": "ros",
-    "lifecycle_msgs": "ros",
-    "nav_msgs": "ros",
-    "rosgraph_msgs": "ros",
-    "sensor_msgs": "ros",
-    "std_msgs": "ros",
-    "std_srvs": "ros",
-    "visualization_msgs": "ros",
-    "mcap": "record",
-    "rosbags": "record",
-    "paho": "mqtt",
-    "asyncua": "opcua",
-    "google": "sparkplug",
-    "influxdb_client": "influx",
-    "prometheus_client": "metrics",
-    "starlette": "dashboard",
-    "uvicorn": "dashboard",
-    "websockets": "dashboard",
-    "rerun": "view",
-    "rainflow": "study",
-    "matplotlib": "study",
-    "pandas": "study",
-    "pyarrow": "study",
-    "jinja2": "study",
-    "distributed": "dask",
+    module: extra
+    for extra, modules in {
+        "ros": "rclpy rcl_interfaces builtin_interfaces diagnostic_msgs geometry_msgs lifecycle_msgs nav_msgs "
+        "rosgraph_msgs sensor_msgs std_msgs std_srvs visualization_msgs",
+        "record": "mcap rosbags",
+        "mqtt": "paho",
+        "opcua": "asyncua",
+        "sparkplug": "google",
+        "influx": "influxdb_client",
+        "metrics": "prometheus_client",
+        "dashboard": "starlette uvicorn websockets",
+        "view": "rerun",
+        "study": "rainflow matplotlib pandas pyarrow jinja2",
+        "dask": "distributed",
+    }.items()
+    for module in modules.split()
 }
 
 #: Largest length of an error message [characters]. A message may list all names in a file.
@@ -90,25 +77,9 @@ def commands(laws: tuple[str, ...]) -> None:
 
 
 for _verb in (
-    simulate,
-    demo,
-    setup,
-    live,
-    call,
-    dashboard,
-    telemetry,
-    estimate,
-    forecast,
-    record,
-    replay,
-    analyse,
-    compare,
-    export,
-    doctor,
-    view,
-    info,
-    study,
-):
+    simulate, demo, setup, live, call, dashboard, telemetry, estimate, forecast, record, replay, analyse, compare,
+    export, doctor, view, info, study,
+):  # fmt: skip
     commands.add_command(_verb)
 
 

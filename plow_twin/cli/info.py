@@ -64,22 +64,8 @@ def _environment() -> dict[str, Any]:
     from plow_twin.scene_file.presets import config_folder
 
     facts: dict[str, Any] = dict(build_fingerprint())
-    core = ("scipy", "click", "rich", "PyYAML", "jsonschema")
-    extras = (
-        "mcap",
-        "rosbags",
-        "paho-mqtt",
-        "asyncua",
-        "starlette",
-        "uvicorn",
-        "rerun-sdk",
-        "matplotlib",
-        "pyarrow",
-        "Jinja2",
-        "distributed",
-        "rclpy",
-    )
-    for name in (*core, *extras):
+    extras = "mcap rosbags paho-mqtt asyncua starlette uvicorn rerun-sdk matplotlib pyarrow Jinja2 distributed rclpy"
+    for name in ("scipy", "click", "rich", "PyYAML", "jsonschema", *extras.split()):
         try:
             facts[name] = version(name)
         except PackageNotFoundError:
@@ -123,12 +109,55 @@ def _print_numbers(console: Console, target: str, rows: Sequence[dict[str, Any]]
 
 
 def _recording(path: Path, as_json: bool) -> int:
-    from plow_twin.cli.recording_facts import read_recording
-
     facts, lossy = read_recording(path)
     _show(facts, as_json)
     say_end(path, facts["status"])
     return DONE_WITH_LOSS if lossy else DONE
+
+
+def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
+    """Return a summary of a recording, and whether it is incomplete or has losses or failed advances.
+
+    Raises
+    ------
+    RecordingError
+        The file is not a recording of plow_twin.
+    """
+    from plow_twin.record.reader import FileStatus, RunReader
+    from plow_twin.record.run_time import RunTime
+    from plow_twin.record.unused import InputCounts
+    from plow_twin.stream.journal import Failed
+
+    reader = RunReader(path)
+    header = reader.header
+    inputs, run_time, failed = InputCounts(header.excitation_source), RunTime(header.parameters), 0
+    for batch in reader.batches():
+        inputs.add(batch.entries)
+        run_time.add(batch.entries)
+        failed += sum(entry.advances for entry in batch.entries.rest.values() if isinstance(entry, Failed))
+    facts: dict[str, Any] = {
+        "file": str(reader.path),
+        "status": reader.status.value,
+        "stop_reason": reader.stop_reason,
+        "duration_s": run_time.span_s,
+        "without_samples": run_time.silences.facts(),
+        "messages": dict(sorted(reader.counts.items())),
+        "inputs": inputs.facts(),
+        "failed_advances": failed,
+        "lost": {**reader.lost, **reader.lost_parts},
+        "damaged_chunks": reader.damaged_chunks,
+        "foreign_parts": {file.name: list(keys) for file, keys in reader.foreign.items()},
+        "run_id": header.run_id,
+        "package_version": header.package_version,
+        "node": header.node,
+        "excitation_source": header.excitation_source,
+        "tol": header.tol,
+        "clock": header.clock,
+        "origin_ns": header.origin_ns,
+        "build": dict(header.build),
+        "parameters": dict(header.parameters),
+    }
+    return facts, bool(facts["lost"] or failed) or reader.status is not FileStatus.COMPLETE
 
 
 def _unused(path: Path, as_json: bool) -> int:
