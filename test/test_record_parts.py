@@ -21,9 +21,9 @@ from plow_twin import Wear
 from plow_twin.cli.app import run as cli
 from plow_twin.cli.info import read_recording
 from plow_twin.errors import RecordingError
+from plow_twin.live.recording import Decimation
 from plow_twin.record import measured
 from plow_twin.record.bag import BagWriter, Topic
-from plow_twin.record.decimation import Decimation
 from plow_twin.record.doctor import examine, repair
 from plow_twin.record.header import RunHeader
 from plow_twin.record.measured import read_recording as read_measured

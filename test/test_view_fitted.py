@@ -17,8 +17,7 @@ from plow_twin.estimate.result import Motion
 from plow_twin.estimate.summary import priors
 from plow_twin.estimate.unknowns import QUANTITIES
 from plow_twin.view.estimate import estimate_picture
-from plow_twin.view.fitted import FittedPicture, FittedValue
-from plow_twin.view.fitted_file import write_fit_picture
+from plow_twin.view.fitted import FittedPicture, FittedValue, write_fit_picture
 
 
 @pytest.fixture(scope="module")

@@ -293,7 +293,7 @@ def _title(source: Path, scene: Path | None, task: _Task) -> str:
 def _plot(task: _Task, result: Estimate, path: Path, title: str) -> None:
     from plow_twin.estimate.summary import priors
     from plow_twin.view.estimate import estimate_picture
-    from plow_twin.view.fitted_file import write_fit_picture
+    from plow_twin.view.fitted import write_fit_picture
 
     prior = priors(task.scene, task.load, task.poses)
     write_fit_picture(estimate_picture(result, prior, task.poses, _labels(task.scene), title), path)

@@ -16,27 +16,20 @@ Array = NDArray[np.float64]
 
 #: Topics whose messages a replay can compute from the journal.
 REPLAYED: Final = topics_of(Cadence.EACH, Cadence.FOLLOWED, Cadence.SLOW)
+#: Topics on which only a marked publication has a message.
+MARKED: Final = topics_of(Cadence.MARKED)
 PUBLICATION_TOPICS: Final = tuple(topic.name for topic in REPLAYED)
 #: Topics on which only a twin with `follow: full` publishes.
 FOLLOWED_TOPICS: Final = names_of(Cadence.FOLLOWED)
 
 
-def publication_messages(published: Published, frame_id: str, child_frame_id: str) -> dict[str, Message]:
+def publication_messages(
+    published: Published, frame_id: str, child_frame_id: str, topics: tuple[Topic, ...] = REPLAYED
+) -> dict[str, Message]:
     """Return the messages of a publication by base name of the topic.
 
-    Slow topics have a message only if the publication has a slow part.
+    Slow topics have a message only if the publication has a slow part, and the topics `MARKED` only if it is marked.
     """
-    return _messages(REPLAYED, published, frame_id, child_frame_id)
-
-
-def marks(published: Published, frame_id: str) -> dict[str, Message]:
-    """Return the messages that only a marked publication has."""
-    return _messages(topics_of(Cadence.MARKED), published, frame_id, "")
-
-
-def _messages(
-    topics: tuple[Topic, ...], published: Published, frame_id: str, child_frame_id: str
-) -> dict[str, Message]:
     messages: dict[str, Message] = {}
     for topic in topics:
         records = topic.record_of(published)

@@ -34,7 +34,7 @@ from plow_twin.model.scene import Scene
 from plow_twin.record.alarms import ALARMS, AlarmCheck
 from plow_twin.record.cdr import encode
 from plow_twin.record.chunks import Messages, scan
-from plow_twin.record.comparing import Sent
+from plow_twin.record.comparing import Sent, SentMessages
 from plow_twin.record.entries import Batch, Entries, EntryRecord, OutputRecord, first_difference
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
@@ -47,7 +47,6 @@ from plow_twin.record.outputs import (
 )
 from plow_twin.record.reader import FileStatus, RunReader, sample_template
 from plow_twin.record.replay_report import Divergence, ReplayReport
-from plow_twin.record.sent_messages import SentMessages
 from plow_twin.record.template import Indexes, Templates, read_numbers
 from plow_twin.record.unused import InputCounts
 from plow_twin.run.twin import Twin

@@ -14,8 +14,7 @@ from plow_twin.study.calibration.unknowns import Space, Unknown
 from plow_twin.study.statistics import unit_of
 from plow_twin.study.words import parameter_words
 from plow_twin.view.figures import signed, write_png
-from plow_twin.view.fitted import FittedPicture, FittedValue
-from plow_twin.view.fitted_file import write_fit_picture
+from plow_twin.view.fitted import FittedPicture, FittedValue, write_fit_picture
 
 #: Largest absolute residual on the axis; larger residuals are drawn at this value.
 _MOST: Final = 5.0
