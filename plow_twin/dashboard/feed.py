@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from plow_twin.dashboard.link import Link, number, numbers
 from plow_twin.live.part import Part
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.record.messages import DiagnosticStatus, JointState, Message
 from plow_twin.stream.intake import NS_PER_S
 from plow_twin.stream.outputs import CLEARANCE_NAMES, Published
 
@@ -259,13 +258,3 @@ class Feed:
 
 def _joined(rows: list[NDArray[np.void]], name: str) -> NDArray[Any]:
     return np.concatenate([one[name] for one in rows])
-
-
-def part_of(message: Message) -> Part:
-    """Convert a status or named numbers to the form that the page reads."""
-    if isinstance(message, DiagnosticStatus):
-        return message.level, message.message, dict(message.values)
-    if not isinstance(message, JointState):
-        return 0, "", {}
-    values = message.position if len(message.position) else message.effort
-    return 0, "", {name: repr(value) for name, value in zip(message.name, values.tolist(), strict=False)}

@@ -6,12 +6,11 @@ from dataclasses import asdict
 
 from plow_twin.dashboard.access import PageAccess
 from plow_twin.dashboard.facts import facts_of
-from plow_twin.dashboard.feed import RATE_HZ, part_of
+from plow_twin.dashboard.feed import RATE_HZ
 from plow_twin.dashboard.screen import Screen
 from plow_twin.live.front import BridgeFront
 from plow_twin.live.services import Services
 from plow_twin.live.timer import Timer
-from plow_twin.record.alarms import ALARMS, alarms_message
 
 
 def open_screen(front: BridgeFront, access: PageAccess, source: str) -> Screen:
@@ -25,7 +24,6 @@ def open_screen(front: BridgeFront, access: PageAccess, source: str) -> Screen:
     facts = facts_of(runtime.scene, asdict(runtime.settings), source)
     load = (lambda: runtime.driver.session.twin.wrench) if facts["loads"] else None
     screen = Screen(access, facts, answer, load, front.say_error)
-    screen.feed.part(ALARMS, part_of(alarms_message(runtime.alarms, front.name, "")))
     front.attach(screen.feed)
     front.timers.append(Timer(1.0 / RATE_HZ, screen.feed.turn))
     return screen

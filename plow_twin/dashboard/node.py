@@ -20,9 +20,9 @@ from std_srvs.srv import Trigger
 
 from plow_twin.dashboard.access import DashboardError, PageAccess
 from plow_twin.dashboard.facts import facts_of
-from plow_twin.dashboard.feed import RATE_HZ, Feed, part_of
+from plow_twin.dashboard.feed import RATE_HZ, Feed
 from plow_twin.dashboard.screen import Screen
-from plow_twin.live.part import Part
+from plow_twin.live.part import Part, part_of
 from plow_twin.live.timer import Timer
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.record import messages as plain

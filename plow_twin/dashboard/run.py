@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from plow_twin.dashboard.access import PageAccess
 from plow_twin.dashboard.facts import facts_of
-from plow_twin.dashboard.feed import RATE_HZ, Feed, part_of
+from plow_twin.dashboard.feed import RATE_HZ, Feed
 from plow_twin.dashboard.screen import Screen
+from plow_twin.live.part import part_of
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.record.entries import Batch
 from plow_twin.record.follow import Tail

@@ -63,19 +63,17 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "holds": "advances under the hold policy",
         "silences": "intervals without samples longer than excitation_timeout and five times the previous interval",
         "silent_s": "total duration of the counted silences [s]",
-        "travel_used": "messages used",
-        "travel_dropped": "messages dropped",
         "travel_misplaced": "speeds that took effect immediately, because their stamps are from another clock",
-        "travel_implausible": "messages dropped because they exceed the limits of the input",
-        "travel_not_followed": "messages of publishers that are not followed",
-        "head_pose_used": "messages used",
-        "head_pose_dropped": "messages dropped",
-        "head_pose_implausible": "messages dropped because they exceed the limits of the input",
-        "head_pose_not_followed": "messages of publishers that are not followed",
-        "gaps_used": "messages used",
-        "gaps_dropped": "messages dropped",
-        "gaps_implausible": "messages dropped because they exceed the limits of the input",
-        "gaps_not_followed": "messages of publishers that are not followed",
+        **{
+            f"{topic}_{count}": description
+            for topic in OPTIONAL
+            for count, description in {
+                "used": "messages used",
+                "dropped": "messages dropped",
+                "implausible": "messages dropped because they exceed the limits of the input",
+                "not_followed": "messages of publishers that are not followed",
+            }.items()
+        },
         "head_pose_residual": "pose of the model minus the last measured pose: x, y [m], theta [rad]",
         "refused_publishers": "publishers with an incompatible type or quality of service",
     },

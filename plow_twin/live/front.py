@@ -16,7 +16,7 @@ from plow_twin.live.bridge.feeder import Feeder
 from plow_twin.live.bridge.source import Bridge, BridgeError, Messages, Reporting
 from plow_twin.live.load_model import read_load_model
 from plow_twin.live.parameters import Settings
-from plow_twin.live.part import Part
+from plow_twin.live.part import Part, part_of
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.timer import Timer
@@ -101,7 +101,8 @@ class BridgeFront:
         self.more_parts: dict[str, Callable[[], Part]] = {}
 
     def attach(self, watcher: Watcher) -> None:
-        """Add a watcher, which receives all reports and publications from the time of the call."""
+        """Add a watcher, which receives the present alarms, and later all reports and publications."""
+        watcher.part(ALARMS, part_of(alarms_message(self.runtime.alarms, self.name, "")))
         self._watchers.append(watcher)
         self.runtime.publishing.watch = self._published
 
@@ -118,12 +119,8 @@ class BridgeFront:
 
     def send(self, topic: str, message: memoryview | Message) -> None:
         """Report the message if it contains alarms or an estimate. Messages of the motion are only recorded."""
-        if isinstance(message, DiagnosticStatus):
-            self._tell(topic, (message.level, message.message, dict(message.values)))
-        elif isinstance(message, JointState):
-            numbers = message.position if len(message.position) else message.effort
-            values = zip(message.name, numbers.tolist(), strict=True)
-            self._tell(topic, (0, "", {name: repr(value) for name, value in values}))
+        if isinstance(message, DiagnosticStatus | JointState):
+            self._tell(topic, part_of(message))
 
     def _tell(self, name: str, part: Part) -> None:
         self._say(name, part)

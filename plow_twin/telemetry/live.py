@@ -6,11 +6,9 @@ from collections.abc import Callable
 from dataclasses import asdict
 
 from plow_twin.dashboard.facts import facts_of
-from plow_twin.dashboard.feed import part_of
 from plow_twin.live.front import BridgeFront
 from plow_twin.live.services import Services
 from plow_twin.live.timer import Timer
-from plow_twin.record.alarms import ALARMS, alarms_message
 from plow_twin.telemetry.access import WayOut
 from plow_twin.telemetry.outlet import Outlet
 
@@ -25,7 +23,6 @@ def open_way(front: BridgeFront, way: WayOut, rate_hz: float, source: str) -> Ou
 
     asked: Callable[[str, str], tuple[bool, str]] | None = answer if way.may_acknowledge else None
     outlet = Outlet(way, facts_of(runtime.scene, asdict(runtime.settings), source), asked, front.say_error)
-    outlet.feed.part(ALARMS, part_of(alarms_message(runtime.alarms, front.name, "")))
     front.attach(outlet.feed)
     front.more_parts[way.name] = outlet.part
     front.timers.append(Timer(1.0 / rate_hz, outlet.turn))
