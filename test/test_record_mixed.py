@@ -24,6 +24,7 @@ from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.driver import Arrival, Driver
 from plow_twin.stream.intake import NS_PER_S, Intake
+from plow_twin.stream.journal import Parameter
 from plow_twin.stream.outputs import Published
 from plow_twin.stream.session import Session
 from plow_twin.stream.topics import TOPICS
@@ -109,7 +110,7 @@ class Mixed:
 
     def acknowledge(self) -> None:
         self.alarms.acknowledge()
-        self.driver.parameter(ACKNOWLEDGED, True)
+        self.driver.session.apply(Parameter(ACKNOWLEDGED, True))
         self.front.send(*self.publishing.alarms_now(self.driver.session.stamp_ns or T0))
 
     def replayed(self) -> ReplayReport:
@@ -161,7 +162,7 @@ def test_after_a_hold_and_a_reset_samples_are_not_taken_for_held(tmp_path: Path)
     live.silence(100)
     live.driver.reset(T0, "asked for")
     live.send(*map(_swinging, range(200, 300)))
-    live.driver.parameter("hold_limit", 31.0)
+    live.driver.session.apply(Parameter("hold_limit", 31.0))
     live.publish_due()
     report = live.replayed()
     assert _same(report) and report.compared["alarms"] == len(live.front.alarms) == 1
@@ -192,7 +193,7 @@ def test_a_blow_before_a_hold_raises_an_alarm_and_a_blow_in_the_hold_does_not(ho
 def test_nothing_is_published_again_when_a_late_sample_fails(span: float, tmp_path: Path) -> None:
     live = Mixed(tmp_path, rollback_span=span, failure_limit=1000)
     live.send(*(_swinging(2 * index) for index in range(100)))
-    live.driver.parameter("hold_limit", 31.0)
+    live.driver.session.apply(Parameter("hold_limit", 31.0))
     for index in (*range(100, 125), *range(126, 130), 125):
         live.send(_at(2 * index, ABSURD))
     assert [(int(frame.rows["stamp_ns"][0]) - T0) // MS for frame in live.front.frames[-2:]] == [196, 198]
@@ -289,7 +290,7 @@ def _drive(live: Mixed, random: Random, calls: int) -> None:
             case "ack":
                 live.acknowledge()
             case "parameter":
-                live.driver.parameter("hold_limit", 1.0 + random.random())
+                live.driver.session.apply(Parameter("hold_limit", 1.0 + random.random()))
             case "model":
                 live.driver.set_model(stamp_ns, {"wear.coefficient_m2_n": 1e-12 * (1.0 + random.random())})
             case "due":

@@ -78,7 +78,7 @@ def test_a_restored_motion_continues_as_after_its_snapshot_for_any_stamps() -> N
         assert _same(first, again[1:])
         assert (again[-1].rows["makes"] >= makes).all()  # counts never decrease
     assert bench.driver.resets == 0
-    bench.driver.mark(bench.session.stamp_ns or 0, "after the third")
+    bench.session.apply(Mark(bench.session.stamp_ns or 0, "after the third"))
     bench.session.close()
     assert [entry.text for entry in bench.journal if isinstance(entry, Mark)] == ["after the third"]
     assert _again(PAPER, bench.journal) == bench.journal

@@ -31,7 +31,7 @@ from plow_twin.record.wear_state import scene_identity
 from plow_twin.stream.driver import Arrival, Driver, Policy
 from plow_twin.stream.health import Periods
 from plow_twin.stream.intake import Verdict
-from plow_twin.stream.journal import Entry, Gaps, Pose, pose_entry
+from plow_twin.stream.journal import Entry, Gaps, Mark, Parameter, Pose, pose_entry
 from plow_twin.stream.limits import Limits, excitation_limits, pose_limits, value_limits
 from plow_twin.stream.model_changes import changed_scene, changed_twin
 from plow_twin.stream.session import Series, Session
@@ -224,7 +224,7 @@ class Runtime:
         """Write a text to the journal, and the ring of the recorder to the disk; return success and an answer."""
         if (problem := mark_problem(text)) is not None:
             return False, problem
-        self.driver.mark(self.stamp_ns, text)
+        self.driver.session.apply(Mark(self.stamp_ns, text))
         if self.recording is None:
             return False, "nothing is recorded"
         folder = self.recording.recorder.mark()
@@ -307,7 +307,7 @@ class Runtime:
             self.driver.set_model(self.stamp_ns, model_changes(settings))
             self._front.changed()
         elif not isinstance(value, tuple):  # the list `set_wear` takes effect, and is journalled, by its service
-            self.driver.parameter(name, value)
+            self.driver.session.apply(Parameter(name, value))
 
     def _set_limits(self, settings: Settings) -> None:
         pose = pose_limits(self.scene, settings.limit_pose, settings.limit_pose_rate)
@@ -460,7 +460,7 @@ class Runtime:
         self._waiting_seconds = self._waiting_seconds + 1 if waited_s > _LONGEST_WAIT_S else 0
         if self._waiting_seconds == _WAITING_SECONDS and not self.reduced and not self.waits_for_clock:
             self.reduced = True
-            self.driver.parameter("follow", "parameters")
+            self.driver.session.apply(Parameter("follow", "parameters"))
             self._front.changed()
 
     def _look_for_clock(self) -> None:

@@ -9,7 +9,7 @@ from plow_twin.live.parameters import services_off
 from plow_twin.live.runtime import Runtime
 from plow_twin.record.alarms import ACKNOWLEDGED, alarm_texts, alarms_message
 from plow_twin.record.wear_state import check_depth
-from plow_twin.stream.journal import Snapshot
+from plow_twin.stream.journal import Parameter, Snapshot
 
 
 class Services:
@@ -64,7 +64,7 @@ class Services:
         """Release the latched alarms."""
         alarms = self._runtime.alarms
         left = alarms.acknowledge()
-        self._runtime.driver.parameter(ACKNOWLEDGED, self._runtime.stamp_ns)
+        self._runtime.driver.session.apply(Parameter(ACKNOWLEDGED, self._runtime.stamp_ns))
         self._runtime.send_alarms()
         values = dict(alarms_message(alarms, "", "").values)
         return True, f"still active: {'; '.join(alarm_texts(values, newest=True))}" if left else "no alarm is active"

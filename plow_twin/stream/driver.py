@@ -293,18 +293,6 @@ class Driver:
                 stamp_ns = reached_ns
         self.session.apply(journal.Travel(stamp_ns, speed_m_s))
 
-    def parameter(self, name: str, value: journal.ParameterValue) -> None:
-        """Journal a changed parameter."""
-        self.session.apply(journal.Parameter(name, value))
-
-    def spread(self, stamp_ns: int, deviation: Sequence[float]) -> None:
-        """Journal the standard deviations of the load (Fx, Fy [N], M [N m]) that apply from a stamp on."""
-        self.session.apply(journal.Spread(stamp_ns, tuple(deviation)))
-
-    def mark(self, stamp_ns: int, text: str) -> None:
-        """Journal a mark, which is a remark of the operator at a time."""
-        self.session.apply(journal.Mark(stamp_ns, text))
-
     def snapshot(self) -> journal.Snapshot:
         """Journal and return the exact state; samples older than this state can no longer be inserted."""
         snapshot = self.session.renew()

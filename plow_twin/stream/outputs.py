@@ -197,10 +197,6 @@ class Outputs:
         values[_KNOWN] = shift
         self._shift = values if values.any() else None
 
-    def clear_shift(self) -> None:
-        """Publish the clearances of the model without a shift."""
-        self._shift = None
-
     def add(self, rows: Rows, stamps: NDArray[np.int64], taken: NDArray[np.int64], *, held: bool = False) -> Published:
         """Add advances to the window, and publish after some of them.
 

@@ -35,6 +35,7 @@ DIGEST_INTERVAL: Final = 100
 #: must come from a different clock.
 _AHEAD_NS: Final = 3_600_000_000_000
 _NO_LOAD: Final = np.zeros((1, 3))
+_NO_SHIFT: Final = (0.0,) * 6
 _NO_ROWS: Final = NOTHING.rows
 
 
@@ -166,7 +167,8 @@ class Session:
         self._wears = scene.wear is not None and scene.wear.coefficient_m2_n != 0.0
         self._speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
         self._travels: list[journal.Travel] = []
-        self._on_entry = on_entry
+        #: function that emits an entry; called by others only for an entry that does not change the motion
+        self.emit = on_entry
         self._advances = 0
 
     def _use(self, twin: Driven) -> None:
@@ -182,12 +184,12 @@ class Session:
 
     def start(self) -> None:
         """Emit the snapshot that opens a journal."""
-        self._on_entry(self.snapshot())
+        self.emit(self.snapshot())
 
     def close(self) -> None:
         """Emit the digest that ends a journal."""
         if self.stamp_ns is not None:
-            self._on_entry(journal.Digest(self.stamp_ns, self.twin.digest()))
+            self.emit(journal.Digest(self.stamp_ns, self.twin.digest()))
 
     def apply(self, entry: journal.Entry) -> Rows | None:
         """Emit an entry and apply it; return the row of its advance, shape (1,), or None if the entry makes no advance.
@@ -208,7 +210,7 @@ class Session:
                 return None
             case journal.Travel(_, speed):
                 check_travel_speed(self.twin.scene, speed)
-        self._on_entry(entry)
+        self.emit(entry)
         match entry:
             case journal.Travel():
                 self._apply_travel(entry)
@@ -217,7 +219,7 @@ class Session:
             case journal.SetWear(_, depth):
                 self._restart(np.array(depth))
                 # the estimate refers to the wear before this change
-                self.outputs.clear_shift()
+                self.outputs.set_shift(_NO_SHIFT)
             case journal.Estimated(shift=shift):
                 self.outputs.set_shift(shift)
                 if self.stamp_ns is not None:
@@ -273,7 +275,7 @@ class Session:
             late = sum(self._is_late(sample.stamp_ns) for sample in samples)
             self._check_late(first_ns)
         for sample in samples:
-            self._on_entry(sample)
+            self.emit(sample)
         if late:
             applied = self._work_in(first_ns, samples)
             applied = applied._replace(published=self.outputs.pop() if each else NOTHING, late=late)
@@ -395,10 +397,6 @@ class Session:
         published = Published.joined([part.published for part in parts])
         digests = [digest for part in parts for digest in part.digests]
         return Applied(parts[-1].rows if rows is None else rows, published, digests, sum(part.failed for part in parts))
-
-    def emit(self, entry: journal.Entry) -> None:
-        """Emit an entry that does not change the motion."""
-        self._on_entry(entry)
 
     def check_model(self, changes: Mapping[str, float]) -> None:
         """Raise an `ArgumentError` if changes of the scene are impossible while the model runs."""
@@ -561,7 +559,7 @@ class Session:
         stamp_ns = entry.stamp_ns
         if self.stamp_ns is not None and stamp_ns < self.stamp_ns:
             raise ValueError(f"stamp: got {stamp_ns} ns, expected at least the time reached, {self.stamp_ns} ns")
-        self._on_entry(entry)
+        self.emit(entry)
         if self.origin_ns is None:
             self.origin_ns = self._begin(stamp_ns)
         if self._sampled:
@@ -632,7 +630,7 @@ class Session:
     def _count(self, advances: int) -> None:
         before, self._advances = self._advances, self._advances + advances
         if before // DIGEST_INTERVAL != self._advances // DIGEST_INTERVAL and self.stamp_ns is not None:
-            self._on_entry(journal.Digest(self.stamp_ns, self.twin.digest()))
+            self.emit(journal.Digest(self.stamp_ns, self.twin.digest()))
 
     def _remember(self, *, kept: bool = True, resumed: bool = False) -> None:
         if self.stamp_ns is not None:
@@ -676,7 +674,7 @@ class Session:
         if self._wears:
             self.twin.set_travel_speed(speed)
         self.outputs.scene = self.twin.scene
-        self.outputs.clear_shift()
+        self.outputs.set_shift(_NO_SHIFT)
         self._forget()
 
     def _changed_twin(self, changes: Mapping[str, float]) -> Driven:

@@ -25,6 +25,7 @@ from plow_twin.record.messages import Message
 from plow_twin.record.sources import Arrived
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
+from plow_twin.stream.journal import Spread
 
 #: Largest jump of the message number within a sequence. If the message after a larger jump has the next number, the
 #: sender has restarted.
@@ -195,7 +196,7 @@ class Feeder:
             return [(stamp_ns, wrench)]  # the intake will refuse this sample, so its deviation is not used
         if any(abs(new - old) > _NOTABLE * max(new, old) for new, old in zip(deviation, self._deviation, strict=True)):
             self._deviation = deviation
-            self._runtime.driver.spread(stamp_ns, deviation)
+            self._runtime.driver.session.apply(Spread(stamp_ns, deviation))
         return [(stamp_ns, wrench)]
 
     def _numbered(self, role: Role, arrived: Arrived) -> tuple[bytes, int, bool]:
