@@ -23,24 +23,16 @@ COMPARED_S: Final = 3.2
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Forces in the last `COMPARED_S` of a run.
+    """Forces in the last `COMPARED_S` of a run."""
 
-    Attributes
-    ----------
-    peaks : dict of str to ndarray, shape (8,)
-        Largest force of each pair [N], for the keys `nominal`, `followed` and `true`.
-    error : dict of str to float
-        RMS of the difference from the true forces, divided by the RMS of the true forces. The keys are `nominal` and
-        `followed`.
-    estimates_s : list of float
-        Times in the run at which estimates were made [s].
-    since_s : float
-        Time in the run at which the compared part begins [s].
-    """
-
+    #: largest force of each pair [N], for the keys `nominal`, `followed` and `true`, shape (8,)
     peaks: dict[str, Array]
+    #: RMS of the difference from the true forces, divided by the RMS of the true forces; the keys are `nominal` and
+    #: `followed`
     error: dict[str, float]
+    #: times in the run at which estimates were made [s]
     estimates_s: list[float]
+    #: time in the run at which the compared part begins [s]
     since_s: float
 
 

@@ -63,21 +63,15 @@ _STAMP: Final = struct.Struct("<4xiI")
 
 @dataclass(frozen=True)
 class Plan:
-    """The samples to send.
+    """The samples to send."""
 
-    Attributes
-    ----------
-    wrench : ndarray, shape (n, 3)
-        Loads Fx, Fy [N], M [N m]. The interval between two rows is `period_ns`.
-    speed : ndarray, shape (n,)
-        Speed of travel [m/s].
-    pose : ndarray, shape (m, 3)
-        Poses x, y [m], theta [rad] of a synthetic sensor. One row is sent with every `pose_every`-th sample.
-    """
-
+    #: loads Fx, Fy [N], M [N m], shape (n, 3); the interval between two rows is `period_ns`
     wrench: NDArray[np.float64]
     period_ns: int
+    #: speed of travel [m/s], shape (n,)
     speed: NDArray[np.float64] | None = None
+    #: poses x, y [m], theta [rad] of a synthetic sensor, shape (m, 3); one row is sent with every `pose_every`-th
+    #: sample
     pose: NDArray[np.float64] | None = None
     pose_every: int = 1
 

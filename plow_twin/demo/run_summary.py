@@ -23,38 +23,26 @@ SENSES: Final = {"ccw": STOPS_COUNTER_CLOCKWISE, "cw": ~STOPS_COUNTER_CLOCKWISE}
 
 @dataclass(frozen=True)
 class RunSummary:
-    """Summary of one run.
-
-    Attributes
-    ----------
-    largest : ndarray, shape (8,)
-        Largest force of each pair [N].
-    mean_in_contact : ndarray, shape (8,)
-        Impulse of each pair divided by its time in contact [N]. The time in contact is a sum of sample intervals, so
-        each touch adds an uncertainty of one interval.
-    makes : ndarray, shape (8,)
-        Number of touches.
-    contact_sets : dict
-        Share of the contact time in which exactly the corners of a set carry force. The keys are the direction of the
-        swing and the set.
-    clearance : dict
-        Newest value, 5 % point and 95 % point of the clearances `horizontal` and `vertical` [m].
-    wear_depth : ndarray, shape (8,)
-        Newest wear depth of each pad [m].
-    frames : int
-        Number of messages on the topic `contact_forces`.
-    estimate : dict or None
-        The newest estimate of the node, in the format of `plow-twin estimate --json`.
-    """
+    """Summary of one run."""
 
     scene: Scene
+    #: largest force of each pair [N], shape (8,)
     largest: NDArray[np.float64]
+    #: impulse of each pair divided by its time in contact [N], shape (8,); the time in contact is a sum of sample
+    #: intervals, so each touch adds an uncertainty of one interval
     mean_in_contact: NDArray[np.float64]
+    #: number of touches, shape (8,)
     makes: NDArray[np.float64]
+    #: share of the contact time in which exactly the corners of a set carry force; the keys are the direction of the
+    #: swing and the set
     contact_sets: dict[str, dict[str, float]]
+    #: newest value, 5 % point and 95 % point of the clearances `horizontal` and `vertical` [m]
     clearance: dict[str, tuple[float, float, float]]
+    #: newest wear depth of each pad [m], shape (8,)
     wear_depth: NDArray[np.float64]
+    #: number of messages on the topic `contact_forces`
     frames: int
+    #: the newest estimate of the node, in the format of `plow-twin estimate --json`
     estimate: dict[str, Any] | None = None
 
 

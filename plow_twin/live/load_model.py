@@ -34,33 +34,22 @@ Wrench = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class LoadModel:
-    """Coefficients of the load model. Each coefficient is a mean and a standard deviation.
+    """Coefficients of the load model. Each coefficient is a mean and a standard deviation."""
 
-    Attributes
-    ----------
-    push_ratio : tuple of float
-        Ratio of the force into the face to the cutting force.
-    lateral_ratio : tuple of float
-        Ratio of the lateral force to the cutting force.
-    at_m : tuple of float
-        Point of action x, y from the centre of the cavity [m].
-    efficiency : tuple of float, optional
-        Ratio of the power at the chain to the motor power.
-    idle_force_n : tuple of float
-        Chain force without cutting [N].
-    specific_force_n_m : tuple of float, optional
-        Cutting force per metre of depth [N/m].
-    resistance : tuple of tuples, optional
-        Positions along the face [m], and the factor of the specific force at each position. The factor is interpolated
-        linearly.
-    """
-
+    #: ratio of the force into the face to the cutting force
     push_ratio: Number
+    #: point of action x, y from the centre of the cavity [m]
     at_m: tuple[float, float]
+    #: ratio of the lateral force to the cutting force
     lateral_ratio: Number = (0.0, 0.0)
+    #: ratio of the power at the chain to the motor power
     efficiency: Number | None = None
+    #: chain force without cutting [N]
     idle_force_n: Number = (0.0, 0.0)
+    #: cutting force per metre of depth [N/m]
     specific_force_n_m: Number | None = None
+    #: positions along the face [m], and the factor of the specific force at each position; the factor is interpolated
+    #: linearly
     resistance: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def cutting_force(self, drive: Mapping[str, float]) -> Number | None:

@@ -28,23 +28,16 @@ _IS_SLOW = np.array([topic.cadence is Cadence.SLOW for topic in REPLAYED])
 
 @dataclass(frozen=True)
 class SentMessages:
-    """Recorded messages of several chunks in the order of their sequence numbers.
+    """Recorded messages of several chunks in the order of their sequence numbers."""
 
-    Attributes
-    ----------
-    parts : list of Outputs
-        Messages of each chunk.
-    begins : ndarray of int64, shape (k + 1,)
-        Index of the first message of each part in the whole sequence. The last element is the number of all messages.
-    sequence : ndarray of int64, shape (n,)
-        Sequence number of each message.
-    kind : ndarray of int64, shape (n,)
-        Kind of each message.
-    """
-
+    #: messages of each chunk
     parts: list[Outputs]
+    #: index of the first message of each part in the whole sequence, shape (k + 1,); the last element is the number of
+    #: all messages
     begins: Indexes
+    #: sequence number of each message, shape (n,)
     sequence: Indexes
+    #: kind of each message, shape (n,)
     kind: Indexes
 
     @classmethod

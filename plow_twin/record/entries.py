@@ -57,34 +57,23 @@ class Entries:
     """Journal entries in the order in which the twin used them.
 
     A sample is a load at a time. A digest is a hash of the exact state of the twin.
-
-    Attributes
-    ----------
-    sequence : ndarray of int64, shape (n,)
-        Sequence number of each entry, without the wrap at 2^32.
-    log_time_ns : ndarray of int64, shape (n,)
-        Receive time of each entry.
-    sample : ndarray of bool, shape (n,)
-        Whether an entry is a sample of the load.
-    stamp_ns : ndarray of int64, shape (n,)
-        Stamp of each sample and digest.
-    wrench : ndarray, shape (n, 3)
-        Load of each sample [N, N, N m].
-    digest_at : ndarray, shape (m,)
-        Index of each digest in the arrays of shape (n,).
-    digest : ndarray, shape (m,)
-        Value of each digest.
-    rest : dict
-        Entries that are neither samples nor digests, by index.
     """
 
+    #: sequence number of each entry, without the wrap at 2^32, shape (n,)
     sequence: Indexes
+    #: receive time of each entry, shape (n,)
     log_time_ns: Indexes
+    #: whether an entry is a sample of the load, shape (n,)
     sample: NDArray[np.bool_]
+    #: stamp of each sample and digest, shape (n,)
     stamp_ns: Indexes
+    #: load of each sample [N, N, N m], shape (n, 3)
     wrench: NDArray[np.float64]
+    #: index of each digest in the arrays of shape (n,), shape (m,)
     digest_at: Indexes
+    #: value of each digest, shape (m,)
     digest: NDArray[np.uint64]
+    #: entries that are neither samples nor digests, by index
     rest: Mapping[int, Entry | Dropped]
 
     def __len__(self) -> int:

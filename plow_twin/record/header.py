@@ -25,40 +25,29 @@ LAYOUT_VERSION: Final = 4
 
 @dataclass(frozen=True)
 class RunHeader:
-    """Scene and settings of a run.
+    """Scene and settings of a run."""
 
-    Attributes
-    ----------
-    scene_yaml : str
-        Scene in YAML, without references to other files.
-    topics : dict
-        Topic name of each output in the run, by base name of the output.
-    clock : str
-        Clock of the receive times: `system`, or `ros` if the node used the time from `/clock`.
-    origin_ns : int or None
-        First stamp [ns], or None if it was not known at the start.
-    record_outputs : str
-        Recorded outputs: `all`, `decimated` or `none`.
-    part : int
-        Number of this file in the run.
-    run_id : str
-        Random identifier of the run, which is the same in all files of the run.
-    """
-
+    #: scene in YAML, without references to other files
     scene_yaml: str
     tol: float = 1e-9
     excitation_source: str = "excitation"
     node: str = "/plow_twin"
+    #: topic name of each output in the run, by base name of the output
     topics: Mapping[str, str] = field(default_factory=dict)
     frame_id: str = "slide_frame"
     child_frame_id: str = "head_frame"
+    #: clock of the receive times: `system`, or `ros` if the node used the time from `/clock`
     clock: str = "system"
+    #: first stamp [ns], or None if it was not known at the start
     origin_ns: int | None = None
     parameters: Mapping[str, ParameterValue] = field(default_factory=dict)
     build: Mapping[str, str] = field(default_factory=build_fingerprint)
     package_version: str = field(default_factory=package_version)
+    #: recorded outputs: `all`, `decimated` or `none`
     record_outputs: str = "all"
+    #: number of this file in the run
     part: int = 0
+    #: random identifier of the run, which is the same in all files of the run
     run_id: str = ""
 
     @property

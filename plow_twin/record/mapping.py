@@ -68,34 +68,25 @@ class Role:
     A path to a field consists of names that are separated by dots. In a path, `[3]` selects the array item with the
     index 3, and `[fx]` selects the array item with the index that `fx` has in the field `name` of the message. A path
     to a quaternion yields the angle about z.
-
-    Attributes
-    ----------
-    fields : dict
-        Path of each quantity.
-    scale, offset, factor : dict
-        Conversion of each quantity to SI: (`scale` * field + `offset`) * `factor`.
-    limits : dict
-        Range of each quantity [SI units]. Values outside the range are not used.
-    stamp : str
-        `header` (stamp of the message), `log` (receive time), or the path of the time in a CSV or JSON message. At the
-        path, the time is a number in the unit `stamp_unit` or an ISO 8601 text.
-    clock_offset_ns : int
-        Time that is added to each stamp [ns].
-    sequence : str
-        Path of the message number that the sender assigned, or an empty string.
     """
 
     topic: str
     message_type: TopicType
+    #: path of each quantity
     fields: Mapping[str, str]
+    #: conversion of each quantity to SI: (`scale` * field + `offset`) * `factor`
     scale: Mapping[str, float] = field(default_factory=dict)
     offset: Mapping[str, float] = field(default_factory=dict)
+    #: `header` (stamp of the message), `log` (receive time), or the path of the time in a CSV or JSON message; at the
+    #: path, the time is a number in the unit `stamp_unit` or an ISO 8601 text
     stamp: str = "header"
     factor: Mapping[str, float] = field(default_factory=dict)
+    #: range of each quantity [SI units]; values outside the range are not used
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     stamp_unit: str = "s"
+    #: time that is added to each stamp [ns]
     clock_offset_ns: int = 0
+    #: path of the message number that the sender assigned, or an empty string
     sequence: str = ""
     #: whether the mapping or an option states `stamp_unit`
     stamp_unit_is_stated: bool = False

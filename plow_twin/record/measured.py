@@ -90,40 +90,26 @@ class _Rows:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Measurements of one run.
-
-    Attributes
-    ----------
-    scene : Scene
-    load : ndarray, shape (n, 4)
-        t [s] and the measured load Fx, Fy [N], M [N m].
-    poses : ndarray, shape (k, 4)
-        t [s] and x, y [m], theta [rad]. An empty cell is NaN.
-    unreadable : int
-        Number of rows and messages that could not be read or used.
-    pose_deviation : tuple of float
-        Standard deviations of x, y [m] and theta [rad] that the run contains. A missing value is 0.
-    load_deviation : tuple of float
-        Standard deviations of Fx, Fy [N] and M [N m] that the run contains. A missing value is 0.
-    gaps : ndarray, shape (m, 9)
-        t [s] and the gaps of the eight pairs [m]. The gap of a pair without a sensor is NaN.
-    gaps_deviation : float
-        Standard deviation of the gaps that the run contains [m]. A missing value is 0.
-    lost : mapping of str to int
-        Counts of the losses by reason. The sum of the counts is `unreadable`.
-    forces : ndarray, shape (m, 9)
-        t [s] and the contact forces of the eight pairs [N].
-    """
+    """Measurements of one run."""
 
     scene: Scene
+    #: t [s] and the measured load Fx, Fy [N], M [N m], shape (n, 4)
     load: Array
+    #: t [s] and x, y [m], theta [rad], shape (k, 4); an empty cell is NaN
     poses: Array
+    #: number of rows and messages that could not be read or used
     unreadable: int
+    #: standard deviations of x, y [m] and theta [rad] that the run contains; a missing value is 0
     pose_deviation: Deviation = UNSTATED
+    #: standard deviations of Fx, Fy [N] and M [N m] that the run contains; a missing value is 0
     load_deviation: Deviation = UNSTATED
+    #: t [s] and the gaps of the eight pairs [m], shape (m, 9); the gap of a pair without a sensor is NaN
     gaps: Array = field(default_factory=lambda: np.zeros((0, 1 + PAIR_COUNT)))
+    #: standard deviation of the gaps that the run contains [m]; a missing value is 0
     gaps_deviation: float = 0.0
+    #: counts of the losses by reason; the sum of the counts is `unreadable`
     lost: Mapping[str, int] = field(default_factory=dict)
+    #: t [s] and the contact forces of the eight pairs [N], shape (m, 9)
     forces: Array = field(default_factory=lambda: np.zeros((0, 1 + PAIR_COUNT)))
 
 

@@ -19,18 +19,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Rows:
-    """Numbers of the messages on one topic.
+    """Numbers of the messages on one topic."""
 
-    Attributes
-    ----------
-    sequence, stamp_ns : ndarray of int64, shape (n,)
-        Sequence number and stamp [ns] of each message.
-    numbers : ndarray, shape (n, k)
-        Numbers of each message, in the order of the template.
-    """
-
+    #: sequence number and stamp [ns] of each message, shape (n,)
     sequence: Indexes
     stamp_ns: Indexes
+    #: numbers of each message, in the order of the template, shape (n, k)
     numbers: Array
 
     def __len__(self) -> int:

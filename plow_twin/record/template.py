@@ -36,21 +36,14 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @dataclass(frozen=True)
 class Template:
-    """Template of messages.
-
-    Attributes
-    ----------
-    data : ndarray of uint8, shape (size,)
-        Bytes of a message in which the stamp and the numbers are 0.
-    places : ndarray of int64, shape (count,)
-        Offset of each number [B].
-    fixed : ndarray of uint8, shape (size,)
-        Mask of the bytes that are equal in all messages: 255 for an equal byte, otherwise 0.
-    """
+    """Template of messages."""
 
     message_type: str
+    #: bytes of a message in which the stamp and the numbers are 0, shape (size,)
     data: Bytes
+    #: offset of each number [B], shape (count,)
     places: Indexes
+    #: mask of the bytes that are equal in all messages: 255 for an equal byte, otherwise 0, shape (size,)
     fixed: Bytes
 
     @classmethod

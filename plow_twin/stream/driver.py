@@ -53,25 +53,17 @@ class StreamState(Enum):
 
 @dataclass
 class Policy:
-    """Settings for silences and failures, which may change at run time.
+    """Settings for silences and failures, which may change at run time."""
 
-    Attributes
-    ----------
-    excitation_timeout_s : float
-        Time without a sample [s] after which the model follows the steady clock. The model lags behind the clock by
-        `excitation_timeout_s`, so that a sample with a smaller delay can still be used.
-    hold : str
-        With `hold`, the last load acts during a silence. With `zero`, the load falls to zero within one call of
-        `Driver.silence`.
-    hold_limit_s : float
-        Time without a sample [s], counted from the end of `excitation_timeout_s`, after which the model stands still.
-    failure_limit : int
-        Number of consecutive failed advances after which the model is reset (see `Failures.wants_restart`); 0: never.
-    """
-
+    #: time without a sample [s] after which the model follows the steady clock; the model lags behind the clock by
+    #: `excitation_timeout_s`, so that a sample with a smaller delay can still be used
     excitation_timeout_s: float = 0.5
+    #: with `hold`, the last load acts during a silence; with `zero`, the load falls to zero within one call of
+    #: `Driver.silence`
     hold: str = "hold"
+    #: time without a sample [s], counted from the end of `excitation_timeout_s`, after which the model stands still
     hold_limit_s: float = 60.0
+    #: number of consecutive failed advances after which the model is reset (see `Failures.wants_restart`); 0: never
     failure_limit: int = 10
 
 

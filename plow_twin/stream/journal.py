@@ -177,30 +177,21 @@ class Unused:
 
 @dataclass(frozen=True)
 class Estimated:
-    """A finished estimate, from the measurements of a window.
+    """A finished estimate, from the measurements of a window."""
 
-    Attributes
-    ----------
-    start_ns, end_ns : int
-        Beginning and end of the window; the end is not part of the window.
-    samples, poses : int
-        Numbers of load samples and of poses in the window.
-    guess : tuple of float
-        Starting point of the fit. It is empty if the fit began with a search.
-    shift : tuple of float, length 6
-        Shifts [m] that are added to the model's clearances from the time of this entry on. The first three shifts are
-        for the horizontal clearance with wear, its 5 % quantile and its 95 % quantile. The last three shifts are for
-        the vertical clearance.
-    result : str
-        The whole estimate (JSON).
-    """
-
+    #: beginning and end of the window; the end is not part of the window
     start_ns: int
     end_ns: int
+    #: numbers of load samples and of poses in the window
     samples: int
     poses: int
+    #: starting point of the fit; it is empty if the fit began with a search
     guess: tuple[float, ...]
+    #: shifts [m] that are added to the model's clearances from the time of this entry on, length 6; the first three
+    #: shifts are for the horizontal clearance with wear, its 5 % quantile and its 95 % quantile; the last three shifts
+    #: are for the vertical clearance
     shift: tuple[float, ...]
+    #: the whole estimate (JSON)
     result: str
 
 

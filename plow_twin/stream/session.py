@@ -64,26 +64,17 @@ class Applied(NamedTuple):
 
 
 class Series(NamedTuple):
-    """Samples that were applied together and have not been journalled yet.
+    """Samples that were applied together and have not been journalled yet."""
 
-    Attributes
-    ----------
-    stamps : ndarray of int64, shape (n,)
-        Stamps [ns].
-    wrench : ndarray, shape (n, 3)
-        Loads Fx, Fy [N] and M [N m].
-    published : Published
-        A row for each sample, or no rows.
-    digests : sequence of str
-        The m digests.
-    digest_after : ndarray of int64, shape (m,)
-        Number of samples before each digest.
-    """
-
+    #: stamps [ns], shape (n,)
     stamps: NDArray[np.int64]
+    #: loads Fx, Fy [N] and M [N m], shape (n, 3)
     wrench: NDArray[np.float64]
+    #: a row for each sample, or no rows
     published: Published
+    #: the m digests
     digests: Sequence[str]
+    #: number of samples before each digest, shape (m,)
     digest_after: NDArray[np.int64]
 
     def part(self, begin: int, end: int) -> Series:

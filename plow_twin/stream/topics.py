@@ -35,38 +35,26 @@ class Cadence(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Topic:
-    """Description of one topic.
+    """Description of one topic."""
 
-    Attributes
-    ----------
-    name, type : str
-        Base name, and ROS 2 message type.
-    cadence : Cadence
-        When a message is sent.
-    content : str
-        Content of a message, with units.
-    cumulative : bool
-        Whether a message depends on the previous publication. If it does, a replay cannot compare the topic after a
-        lost message.
-    latched : bool
-        Whether a subscriber that joins late receives earlier messages (durability `transient_local`).
-    depth : int
-        Number of messages in the publisher's history.
-    names : tuple of str
-        Names in a `JointState`.
-    columns : mapping
-        Fields of the record that fill each field of the message, in order, as (name, count of numbers). Empty if a
-        record does not contain all data of the message.
-    """
-
+    #: base name, and ROS 2 message type
     name: str
     type: str
+    #: when a message is sent
     cadence: Cadence
+    #: content of a message, with units
     content: str
+    #: whether a message depends on the previous publication; if it does, a replay cannot compare the topic after a lost
+    #: message
     cumulative: bool = False
+    #: whether a subscriber that joins late receives earlier messages (durability `transient_local`)
     latched: bool = False
+    #: number of messages in the publisher's history
     depth: int = _DEPTH
+    #: names in a `JointState`
     names: tuple[str, ...] = ()
+    #: fields of the record that fill each field of the message, in order, as (name, count of numbers); empty if a
+    #: record does not contain all data of the message
     columns: Mapping[str, tuple[tuple[str, int], ...]] = field(default_factory=dict)
 
     @property
