@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -156,18 +157,15 @@ def _run(
         watch, spin = opened.enter_context(_watching())
         twin = opened.enter_context(_process(node, folder / "node.log"))
         task = bar.add_task("compiling the solver", total=None)
-        _until("active node", lambda: watch.text("state", "lifecycle") == "active", spin, twin, _START_TIMEOUT_S)
+        until = partial(_until, spin=spin, child=twin, timeout_s=_START_TIMEOUT_S)
+        until("active node", lambda: watch.text("state", "lifecycle") == "active")
         if estimating:
             bar.update(task, description="compiling the estimator")
-            _until(
-                "compiled estimator",
-                lambda: watch.number("estimate", "ready") or watch.text("estimate", "error"),
-                spin, twin, _START_TIMEOUT_S,
-            )  # fmt: skip
+            until("compiled estimator", lambda: watch.number("estimate", "ready") or watch.text("estimate", "error"))
         if screen is not None:
             command = ["plow_twin", "dashboard", "--ros", *screen]
             shown = opened.enter_context(_process(command, folder / "screen.log"))
-            _until("screen", lambda: "screen: " in shown.output(), spin, shown, _START_TIMEOUT_S)
+            until("screen", lambda: "screen: " in shown.output(), child=shown)
             console.print(shown.output(), highlight=False, markup=False)
         bar.update(task, description="running", total=seconds, completed=0.0)
         with _process([*publisher, "--rate", repr(_RATE_HZ)], folder / "publisher.log") as source:
@@ -177,13 +175,9 @@ def _run(
         _catch_up(watch, sent, spin, twin)
         if estimating:
             bar.update(task, description="estimating", total=None)
-            _until(
-                "estimate",
-                lambda: watch.number("estimate", "estimates") or watch.text("estimate", "error"),
-                spin, twin, _START_TIMEOUT_S,
-            )  # fmt: skip
+            until("estimate", lambda: watch.number("estimate", "estimates") or watch.text("estimate", "error"))
         reports = watch.reports
-        _until("report of the node", lambda: watch.reports > reports, spin, twin, _STOP_TIMEOUT_S)
+        until("report of the node", lambda: watch.reports > reports, timeout_s=_STOP_TIMEOUT_S)
         twin.stop()
     return watch, sent
 
@@ -216,14 +210,14 @@ def _catch_up(watch: Watch, sent: int, spin: Callable[[], object], twin: Child) 
             moved, before = time.monotonic(), watch.accounted
 
 
-def _until(name: str, reached: Any, spin: Any, twin: Child, timeout_s: float) -> None:
-    """Wait until `reached` is true. Raise `DemoError` after the time limit, or if the twin has ended."""
+def _until(name: str, reached: Callable[[], Any], spin: Callable[[], Any], child: Child, timeout_s: float) -> None:
+    """Wait until `reached` is true. Raise `DemoError` after the time limit, or if the process `child` has ended."""
     give_up = time.monotonic() + timeout_s
     while not reached():
         spin()
-        twin.check()
+        child.check()
         if time.monotonic() > give_up:
-            raise DemoError(f"no {name} within {timeout_s:g} s\n{twin.output()}")
+            raise DemoError(f"no {name} within {timeout_s:g} s\n{child.output()}")
 
 
 class Child:

@@ -109,25 +109,9 @@ def from_message(message: Message, source: str = "journal") -> journal.Entry | D
 def read_digests(
     buffer: Bytes, start: Indexes, length: Indexes
 ) -> tuple[NDArray[np.bool_], Indexes, NDArray[np.uint64]]:
-    """Find the messages that are digests.
+    """Find the messages that are digests, among messages with offset `start` and `length`, shape (n,), in a buffer.
 
-    Parameters
-    ----------
-    buffer : ndarray of uint8
-        Content of a chunk.
-    start : ndarray of int64, shape (n,)
-        Offset of each message in the buffer.
-    length : ndarray of int64, shape (n,)
-        Length of each message.
-
-    Returns
-    -------
-    found : ndarray of bool, shape (n,)
-        Whether each message is a digest.
-    stamp_ns : ndarray, shape (m,)
-        Stamp of each digest [ns].
-    digest : ndarray, shape (m,)
-        Value of each digest.
+    Return whether each message is a digest, shape (n,), and the stamps [ns] and values of the digests, shape (m,).
     """
     found = (length == _DIGEST_SIZE) & (start >= 0) & (start + _DIGEST_SIZE <= buffer.size)
     messages = buffer[start[found, None] + np.arange(_DIGEST_SIZE)]
@@ -170,29 +154,16 @@ def _integer(value: Any) -> int:
     return found
 
 
-def _floats(value: Any) -> tuple[float, ...]:
-    read = _exactly(float)
-    return tuple(read(item) for item in value)
-
-
-def _ints(value: Any) -> tuple[int, ...]:
-    return tuple(map(_integer, value))
-
-
-def _rows(value: Any) -> tuple[tuple[float, ...], ...]:
-    read = _exactly(float, str)
-    rows = tuple(tuple(float(read(item)) for item in row) for row in value)
-    return rows
-
-
 _READERS: Final[dict[str, Callable[[Any], Any]]] = {
     "int": _integer,
     "float": _exactly(float, int),
     "str": _exactly(str),
     "bytes": partial(base64.b64decode, validate=True),
-    "tuple[float, ...]": _floats,
-    "tuple[int, ...]": _ints,
-    "tuple[tuple[float, ...], ...]": _rows,
+    "tuple[float, ...]": lambda row: tuple(map(_exactly(float), row)),
+    "tuple[int, ...]": lambda row: tuple(map(_integer, row)),
+    "tuple[tuple[float, ...], ...]": lambda rows: tuple(
+        tuple(map(float, map(_exactly(float, str), row))) for row in rows
+    ),
     "ParameterValue": _exactly(bool, int, float, str),
 }
 #: Functions that read the fields of each kind of entry, by name of the field.
