@@ -53,20 +53,10 @@ class LoadModel:
     resistance: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def cutting_force(self, drive: Mapping[str, float]) -> Number | None:
-        """Return the mean and the standard deviation of the cutting force [N].
+        """Return the mean and the standard deviation of the cutting force [N], which is zero at a standstill.
 
-        At a standstill, the force is zero.
-
-        Parameters
-        ----------
-        drive
-            Signals: `power` [W], `chain_force` [N], `speed` [m/s], `depth` [m] and `position` [m]. A signal may be
-            missing or NaN.
-
-        Returns
-        -------
-        tuple of float or None
-            None if the signals are not sufficient.
+        The signals are `power` [W], `chain_force` [N], `speed` [m/s], `depth` [m] and `position` [m]. A signal may be
+        missing or NaN. The result is None if the signals are not sufficient.
         """
         known = {name: value for name, value in drive.items() if math.isfinite(value)}
         if abs(known.get("speed", math.inf)) < SLOWEST_M_S and "chain_force" not in known:

@@ -427,16 +427,9 @@ def look_ahead(descriptor, size, place, table):  # type: ignore[no-untyped-def]
 def scan(content: Bytes, table: Indexes, others: Indexes) -> tuple[int, int, bool]:
     """Find the messages, schemas and channels in the decompressed content of a chunk.
 
-    Each message fills a column of `table`. The array `others` receives the offsets of schemas and channels.
-
-    Returns
-    -------
-    messages : int
-        Number of messages; the number of columns plus one if the table is too small.
-    others : int
-        Number of schemas and channels.
-    whole : bool
-        Whether the last record ends at the end of the chunk.
+    Each message fills a column of `table`. The array `others` receives the offsets of schemas and channels. Return the
+    number of messages (the number of columns plus one if the table is too small), the number of schemas and channels,
+    and whether the last record ends at the end of the chunk.
     """
     place, count, other = 0, 0, 0
     size, room = content.size, table.shape[1]

@@ -164,13 +164,8 @@ def _with_whole_rows(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
 def _pieces(numbers: list[list[NDArray[np.float64]]], templates: Templates) -> tuple[Indexes, Indexes]:
     """Return the pieces of all kinds of messages, and the index at which the pieces of each kind end.
 
-    A piece is a series of numbers that is contiguous in the message and in a row of the publications. Each piece has
-    four values:
-
-    - the offset in the message [B]
-    - the count of numbers
-    - the address in the first row
-    - the distance of rows [B]
+    A piece is a series of numbers that is contiguous in the message and in a row of the publications. It has four
+    values: offset in the message [B], count of numbers, address in the first row, and distance of rows [B].
     """
     found, ends = [], [0]
     for kind, parts in enumerate(numbers):
@@ -194,29 +189,11 @@ def compare(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Compare each message with its template, filled with the stamp and the numbers of the publication.
 
-    Parameters
-    ----------
-    kinds : ndarray of int64, shape (n,)
-        The array `kind` of `Sent`.
-    after : ndarray of int64, shape (n,)
-        The array `after` of `Sent`.
-    publication : ndarray of int64
-        Index of the publication after each advance.
-    slow : ndarray of int64
-        Index of the slow part of each publication. An index below 0 means that a publication has no slow part.
-    compared : ndarray of bool
-        Whether messages of each kind are compared.
-    pieces, piece_ends
-        Results of `_pieces`.
-    data, fixed, ends
-        Attributes of `Templates`.
-    different : ndarray of bool, shape (n,)
-        Receives True for each message that differs.
-
-    Returns
-    -------
-    int
-        Number of messages that differ.
+    `kinds` and `after`, shape (n,), are arrays of `Sent`. `publication` is the index of the publication after each
+    advance, and `slow` the index of the slow part of each publication, below 0 without a slow part. `compared` states
+    for each kind whether it is compared. `pieces` and `piece_ends` are the results of `_pieces`, and `data`, `fixed`
+    and `ends` the attributes of `Templates`. `different`, shape (n,), receives True for each message that differs.
+    Return the number of these messages.
     """
     count = 0
     for n in range(starts.size):

@@ -211,24 +211,11 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
 
 
 def _journal(reader: RunReader, lost: Counter[str]) -> tuple[Array, list[int], Array, Array, Array, Array]:
-    """Return the measurements in the journal of a run.
+    """Return the measurements in the journal of a run, without data before a change of the pads or a step of the clock.
 
-    Data before a change of the pads, or before a step of the clock, are omitted.
-
-    Returns
-    -------
-    loads : ndarray, shape (n, 4)
-        Stamp [ns] and load of each sample.
-    begins : list of int
-        Rows of `loads` before which samples are missing.
-    poses : ndarray, shape (k, 4)
-        Stamp [ns] and values of each pose.
-    gaps : ndarray, shape (m, 9)
-        Stamp [ns] and gaps of each measurement of the gaps.
-    spread : ndarray, shape (3,)
-        Largest standard deviation of the load that the journal contains.
-    deviations : ndarray, shape (k, 3)
-        Standard deviation of each pose, NaN if the journal does not contain it.
+    The results are the loads with their stamps [ns], shape (n, 4); the rows of the loads before which samples are
+    missing; the poses, shape (k, 4), and gaps, shape (m, 9), with their stamps [ns]; the largest standard deviation of
+    the load, shape (3,); and the standard deviation of each pose, shape (k, 3), NaN if the journal has none.
     """
     loads, poses, gaps = _Rows(4), _Rows(7), _Rows(1 + PAIR_COUNT)
     holes, begins, spread = Holes(), list[int](), np.zeros(3)
@@ -276,16 +263,8 @@ def _collect(
 ) -> tuple[dict[str, Array], list[int], Counter[str], str]:
     """Return the messages of the wanted roles in several recordings.
 
-    Returns
-    -------
-    tables : dict of ndarray
-        Stamp [ns] and values of each message, for each role.
-    begins : list of int
-        Rows of the load before which messages are missing.
-    lost : Counter
-        Losses by reason.
-    why : str
-        Reasons why messages do not fit their roles, for an error message.
+    The results are the stamps [ns] and values of the messages of each role, the rows of the load before which messages
+    are missing, the losses by reason, and, for an error message, the reasons why messages do not fit their roles.
     """
     rows = {name: _Rows(1 + len(ROLES[name])) for name in wanted}
     lost, begins = Counter[str](), list[int]()

@@ -198,15 +198,10 @@ class Recorder:
         return RecorderCounters(self._written, self._queued, self._writer.bytes_written, lost, error, *marks)
 
     def mark(self) -> Path | None:
-        """Request that the ring is written to a new folder.
+        """Request that the ring is written to a new folder. Return the folder, or None if the recorder has no ring.
 
         The ring is written before the next `Snapshot` in the journal, or when the recorder is closed. Until then,
         further calls have no effect.
-
-        Returns
-        -------
-        Path or None
-            The folder, or None if the recorder has no ring.
         """
         from plow_twin.record.writer import free_folder
 
@@ -273,11 +268,8 @@ class Recorder:
     def series(self, series: Series) -> NDArray[np.int64]:
         """Add the samples and digests of a series to the queue as journal entries. The queue accepts all or none.
 
-        Returns
-        -------
-        ndarray of int64, shape (n,)
-            Sequence number for the publication after each sample. It is the number of the sample or, if a digest
-            follows the sample, the number of the digest.
+        Return the sequence number for the publication after each sample, shape (n,): the number of the sample or, if a
+        digest follows the sample, the number of the digest.
         """
         now, samples = self._now_ns(), len(series.stamps)
         count = samples + len(series.digests)

@@ -221,15 +221,8 @@ class Table:
 def export(recording: Recording, kind: str, out: Path) -> dict[str, int]:
     """Write all tables that have rows, and return the number of rows of each table.
 
-    Parameters
-    ----------
-    recording
-        The recording.
-    kind
-        With `csv` or `parquet`, a file for each table is written to the folder `out`. With `npz`, the file `out`
-        contains the arrays `<table>/stamp_ns`, `<table>/values` and `<table>/columns` of all tables.
-    out
-        Folder or file.
+    If `kind` is `csv` or `parquet`, a file for each table is written to the folder `out`. If it is `npz`, the file
+    `out` contains the arrays `<table>/stamp_ns`, `<table>/values` and `<table>/columns` of all tables.
 
     Raises
     ------

@@ -199,11 +199,8 @@ class _Replay:
     def _run_ends(self, entries: Entries) -> Indexes:
         """Return the indexes at which runs end, in ascending order, up to the number of entries.
 
-        A run ends at a missing entry, and before and after each entry that must be applied in a call of its own:
-
-        - a late sample
-        - an entry that changes the motion
-        - a digest without a preceding sample in the run
+        A run ends at a missing entry, and before and after each entry that must be applied in a call of its own: a late
+        sample, an entry that changes the motion, or a digest without a preceding sample in the run.
         """
         count = len(entries)
         breaks = np.ones(count, bool)

@@ -36,12 +36,8 @@ class RunTime:
     def add(self, entries: Entries) -> list[tuple[int, int, int]]:
         """Add entries, and return the silences that end at these entries.
 
-        An interval with missing entries is not a silence.
-
-        Returns
-        -------
-        list of tuple
-            Index of the sample that ends the silence, and begin and end of the silence [ns].
+        A silence is the index of the sample that ends it, its begin and its end [ns]. An interval with missing entries
+        is not a silence.
         """
         found, done, missing = [], 0, self._holes.find(entries)
         samples = np.flatnonzero(entries.sample)

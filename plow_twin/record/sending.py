@@ -35,14 +35,10 @@ class Messages:
         self.memory = dict(part for group in groups[: 3 + intervals] for part in group.parts)
 
     def write(self, published: Published) -> tuple[tuple[str, memoryview], ...]:
-        """Return the messages of a publication that has one row, in the order of sending.
+        """Return the base names and bytes of the messages of a publication that has one row, in the order of sending.
 
-        The method `intervals` returns the messages with intervals. The next call of `write` overwrites the bytes.
-
-        Returns
-        -------
-        tuple of (str, memoryview)
-            Base name of the topic, and bytes of the message. The tuple is empty if a number is not finite.
+        The result is empty if a number is not finite. The method `intervals` returns the messages with intervals. The
+        next call of `write` overwrites the bytes.
         """
         rows, slow = published
         if not self._each.fill(rows) or (len(slow) and not self._slow.fill(slow)):

@@ -92,14 +92,8 @@ def unit_doubts(
 ) -> list[UnitDoubt]:
     """Return the doubts about the units of measured numbers, whose magnitudes are compared with the scene.
 
-    Parameters
-    ----------
-    values
-        Measured numbers of each quantity, by role and name, such as ("excitation", "fx"). A missing number is NaN.
-    load_stamps_s
-        Stamps of the load [s].
-    scene
-        Scene whose loads and sizes determine plausible magnitudes.
+    `values` contains the measured numbers of each quantity, by role and name, such as ("excitation", "fx"). A missing
+    number is NaN.
     """
     magnitudes = {key: _usual_magnitude(np.asarray(found, float)) for key, found in values.items()}
     load = [values["excitation", name] for name in ("fx", "fy", "m") if ("excitation", name) in values]

@@ -143,19 +143,10 @@ class Intake:
     ) -> Verdict:
         """Judge one sample, count it under its verdict, and return the verdict.
 
-        Parameters
-        ----------
-        stamp_ns
-            Stamp of the sample [ns].
-        values
-            All numbers of the sample.
-        reached_ns
-            Stamp that the model has reached [ns], None before the first sample.
-        history
-            Stamps of earlier samples, among which late samples are inserted.
-        may_reset
-            Whether a jump may reset the model. A jump that returns to the stamps before the last jump always resets the
-            model. Without this exception, a single wrong stamp could exclude all correct stamps.
+        `values` are all numbers of the sample, `reached_ns` is the stamp that the model has reached [ns], and `history`
+        contains the stamps of earlier samples, among which late samples are inserted. Unless `may_reset` is true, a
+        jump resets the model only if it returns to the stamps before the last jump. Without this exception, a single
+        wrong stamp could exclude all correct stamps.
         """
         verdict = self._judge(stamp_ns, values, reached_ns, history)
         self.returned = verdict.resets and self._goes_on_from_before(stamp_ns)

@@ -198,24 +198,12 @@ class Outputs:
         self._shift = values if values.any() else None
 
     def add(self, rows: Rows, stamps: NDArray[np.int64], taken: NDArray[np.int64], *, held: bool = False) -> Published:
-        """Add advances to the window, and publish after some of them.
+        """Add advances to the window, and return the publications after some of them.
 
-        Parameters
-        ----------
-        rows : ndarray of `ROW`, shape (n,)
-            The advances. The rows with the indices `taken` are overwritten by the publications.
-        stamps : ndarray of int64, shape (n,)
-            Stamps of the advances [ns].
-        taken : ndarray of int64, shape (m,)
-            Rising indices of the advances after which to publish. If all advances of a publication have failed, the
-            stamp of the publication is 0.
-        held : bool
-            Whether the advances were computed without samples.
-
-        Returns
-        -------
-        Published
-            A publication of m rows.
+        `rows`, shape (n,), are the advances, and `stamps`, shape (n,), their stamps [ns]. A publication follows each
+        advance with an index in `taken`, shape (m,), whose indices must rise, and overwrites the row of the advance. If
+        all its advances have failed, the stamp of a publication is 0. `held` states whether the advances were computed
+        without samples.
         """
         self._waits = self._publish(rows, np.ascontiguousarray(stamps), int(held), taken, self._window, self._waits)
         if not len(taken):

@@ -281,16 +281,8 @@ class Session:
         """Apply samples together without emitting entries; the caller must journal the returned series.
 
         The result is None, without any change, if the samples must be applied one by one, for example because an
-        advance fails.
-
-        Parameters
-        ----------
-        stamps : ndarray of int64, shape (n,)
-            Rising stamps [ns]. The first stamp must not be late.
-        wrench : ndarray, shape (n, 3)
-            Finite loads Fx, Fy [N] and M [N m].
-        each : bool
-            As for `apply_samples`.
+        advance fails. The `stamps` [ns], shape (n,), must rise, and the first must not be late. The loads `wrench`,
+        shape (n, 3), must be finite. `each` is as for `apply_samples`.
         """
         if self.stamp_ns is None or self.held or self._travels or not (self.outputs.is_clear or not each):
             return None
@@ -328,16 +320,10 @@ class Session:
     ) -> Applied:
         """Advance to samples that are already in a journal, without emitting entries.
 
-        Parameters
-        ----------
-        stamps, wrench : ndarray, shapes (n,) and (n, 3)
-            Stamps [ns] that do not fall, and the loads Fx, Fy [N] and M [N m]. The first stamp must not be late.
-        rows : ndarray of `ROW`, shape (n,), or None
-            Array that receives the rows; with None, rows are neither computed nor published.
-        taken : ndarray of int64
-            As for `Outputs.add`.
-        digest_after : ndarray of int64, shape (m,)
-            Rising counts of samples, from 1 to n, after each of which a digest is computed.
+        The `stamps` [ns], shape (n,), must not fall, and the first must not be late. `wrench`, shape (n, 3), is Fx, Fy
+        [N] and M [N m]. The array `rows`, shape (n,), receives the rows; with None, rows are neither computed nor
+        published. `taken` is as for `Outputs.add`. A digest is computed after each of the rising counts of samples in
+        `digest_after`, shape (m,), from 1 to n.
 
         Raises
         ------
@@ -430,14 +416,9 @@ class Session:
         resumed: bool = False,
         undo: bytes | None = None,
     ) -> Applied:
-        """Advance to samples without other entries between them.
+        """Advance to samples without other entries between them. `resumed` marks the first sample after a held load.
 
-        `resumed` is True for the first sample after a held load.
-
-        Raises
-        ------
-        _UndoneError
-            If an advance fails and the snapshot `undo` is given, from which the twin has been restored.
+        If an advance fails and the snapshot `undo` is given, restore the twin from it and raise `_UndoneError`.
         """
         origin_ns = self._begin(int(stamps[0])) if self.origin_ns is None else self.origin_ns
         # no state is saved at the stamp of a speed, because a late sample may change the load there
@@ -671,10 +652,7 @@ class Session:
     def _changed_twin(self, changes: Mapping[str, float]) -> Driven:
         """Return a twin of the scene with changed numbers.
 
-        Raises
-        ------
-        ArgumentError
-            If the changes are impossible, or the changed scene does not allow the present or a waiting travel speed.
+        Raise `ArgumentError` if the changes, or a present or waiting travel speed in the changed scene, are impossible.
         """
         found = changed_twin(self.twin, self._scene, changes)
         for speed in (self._speed, *(travel.speed_m_s for travel in self._travels)):
