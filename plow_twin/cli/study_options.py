@@ -34,10 +34,7 @@ def usage_errors() -> Iterator[None]:
 def study_scene(name: str, settings: Sequence[str]) -> Scene:
     """Load a scene, and apply the changes of the option `--set`.
 
-    Raises
-    ------
-    StudyError, SceneError
-        The scene or a change is invalid.
+    Raise `StudyError` or `SceneError` if the scene or a change is invalid.
     """
     from plow_twin.scene_file import load_scene
     from plow_twin.study.parameters import parse_settings, with_parameters

@@ -216,13 +216,7 @@ def asked_of(settings: Settings) -> Asked:
 
 
 def scenarios_of(settings: Settings) -> tuple[Scenario, ...]:
-    """Return the scenarios from the parameter `forecast_scenarios`.
-
-    Raises
-    ------
-    LifeError
-        The text is invalid.
-    """
+    """Return the scenarios from the parameter `forecast_scenarios`. Raise `LifeError` if the text is invalid."""
     return tuple(Scenario.parse(text) for text in settings.forecast_scenarios.split(";") if text.strip())
 
 

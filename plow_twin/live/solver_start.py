@@ -55,12 +55,8 @@ class Preparation:
     def result(self, stop_asked: Callable[[], bool]) -> Prepared:
         """Wait for the twin and return it.
 
-        Raises
-        ------
-        SceneError, OSError
-            The scene is invalid or cannot be read.
-        StartAbandoned
-            A stop was requested. The compilation cannot be interrupted and continues in its thread.
+        Raise `SceneError` or `OSError` if the scene is invalid or cannot be read, and `StartAbandoned` if a stop was
+        requested. The compilation cannot be interrupted and continues in its thread.
         """
         while not wait((self._future,), _LOOK_S).done:
             if stop_asked():

@@ -455,13 +455,7 @@ def scan(content: Bytes, table: Indexes, others: Indexes) -> tuple[int, int, boo
 
 
 def open_mcap(path: Path) -> IO[bytes]:
-    """Open an MCAP file.
-
-    Raises
-    ------
-    RecordingError
-        The file cannot be read or is not an MCAP file.
-    """
+    """Open an MCAP file. Raise `RecordingError` if the file cannot be read or is not an MCAP file."""
     try:
         stream = path.open("rb")
     except OSError as error:

@@ -77,10 +77,8 @@ class RunHeader:
     def scene(self, source: object) -> Scene:
         """Return the scene of the run; an error message names the recording by `source`.
 
-        Raises
-        ------
-        RecordingError
-            The recording is damaged, or this version of plow_twin does not have the contact law of the scene.
+        Raise `RecordingError` if the recording is damaged, or this version of plow_twin does not have the contact law
+        of the scene.
         """
         from plow_twin.scene_file import loads_scene
 

@@ -49,13 +49,7 @@ class Feed:
         self._steps = Steps(self.intake)
 
     def run(self, messages: Iterable[Arrived]) -> None:
-        """Process all messages and close the walkers.
-
-        Raises
-        ------
-        RecordingError
-            No load sample can be used.
-        """
+        """Process all messages and close the walkers. Raise `RecordingError` if no load sample can be used."""
         for name, arrived, found in readings(messages, self.roles):
             if arrived.after_hole:
                 self._hole()

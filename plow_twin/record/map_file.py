@@ -82,12 +82,7 @@ def read_map_file(path: Path) -> dict[str, Any]:
     """Return the checked content of a mapping file: the roles, and the load model if the file has one.
 
     A role may state one scale, offset, unit or limit for all its quantities. In the result, the value is repeated for
-    each quantity.
-
-    Raises
-    ------
-    MapError
-        The file cannot be read or is invalid.
+    each quantity. Raise `MapError` if the file cannot be read or is invalid.
     """
     given, problems = read_yaml(path, "mapping", ", ".join(ROLES))
     if isinstance(given, dict):

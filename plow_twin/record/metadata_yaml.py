@@ -129,10 +129,7 @@ def bag_metadata(
 def listed_parts(folder: Path) -> list[str]:
     """Return the names of the files in `metadata.yaml`.
 
-    Raises
-    ------
-    RecordingError
-        `metadata.yaml` is not the metadata of a bag.
+    Raise `RecordingError` if `metadata.yaml` is not the metadata of a bag.
     """
     path = folder / "metadata.yaml"
     try:

@@ -222,12 +222,8 @@ def export(recording: Recording, kind: str, out: Path) -> dict[str, int]:
     """Write all tables that have rows, and return the number of rows of each table.
 
     If `kind` is `csv` or `parquet`, a file for each table is written to the folder `out`. If it is `npz`, the file
-    `out` contains the arrays `<table>/stamp_ns`, `<table>/values` and `<table>/columns` of all tables.
-
-    Raises
-    ------
-    RecordingError
-        A file cannot be written.
+    `out` contains the arrays `<table>/stamp_ns`, `<table>/values` and `<table>/columns` of all tables. Raise
+    `RecordingError` if a file cannot be written.
     """
     try:
         return _exported_npz(recording, out) if kind == "npz" else _exported_tables(recording, kind, out)

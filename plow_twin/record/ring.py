@@ -71,12 +71,8 @@ class RingWriter(RunWriter):
     def dump(self, folder: Path, loss: Mapping[str, int]) -> None:
         """Write all completed parts to a new folder, and remove them from memory.
 
-        Raises
-        ------
-        TakenError
-            The folder contains another recording.
-        OSError, RecordingError
-            The folder cannot be written. The parts then stay in memory.
+        Raise `TakenError` if the folder contains another recording, and `OSError` or `RecordingError` if the folder
+        cannot be written. The parts then stay in memory.
         """
         make_folder(folder)
         with ExitStack() as undone:  # after an error, the files written so far are removed

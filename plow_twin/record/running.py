@@ -15,10 +15,7 @@ from plow_twin.record.reader import read_header, run_parts
 def find_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False) -> Path:
     """Return the result of `running_run` or, if it is None, the path of the existing recording `path`.
 
-    Raises
-    ------
-    RecordingError
-        No recording exists.
+    Raise `RecordingError` if no recording exists.
     """
     found = running_run(path, wait_s, stop)
     if found is None and not path.exists():

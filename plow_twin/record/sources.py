@@ -111,13 +111,7 @@ class Source(Protocol):
 
 
 def open_source(path: Path) -> Source:
-    """Open a recording.
-
-    Raises
-    ------
-    RecordingError
-        The path is not a recording that can be read.
-    """
+    """Open a recording. Raise `RecordingError` if the path is not a recording that can be read."""
     if path.is_dir():
         missing = [Path(name) for name in missing_files(path)]
         source: Source
@@ -304,13 +298,7 @@ class SqliteSource:
         return connection
 
     def topics(self) -> dict[str, str]:
-        """Return the type of each topic.
-
-        Raises
-        ------
-        RecordingError
-            No file can be read.
-        """
+        """Return the type of each topic. Raise `RecordingError` if no file can be read."""
         found: dict[str, str] = {}
         for part in self.parts:
             with self._reading(part) as (_, topics):
@@ -417,12 +405,8 @@ class CsvSource:
 def read_table(path: Path) -> tuple[Columns, Iterator[list[str]]]:
     """Return the columns of a CSV or Parquet file, and an iterator over its rows.
 
-    Lines that begin with `#` are skipped.
-
-    Raises
-    ------
-    RecordingError
-        The file cannot be read, or two columns have the same name. The function or the iterator raises the error.
+    Lines that begin with `#` are skipped. Raise `RecordingError` if the file cannot be read, or two columns have the
+    same name. The function or the iterator raises the error.
     """
     rows = _table_rows(path)
     names = tuple(name.strip() for name in next(rows, ()))
@@ -461,10 +445,7 @@ def _table_rows(path: Path) -> Iterator[list[str]]:
 def columns_of(source: Path | str, names: Sequence[str]) -> Columns:
     """Return the columns with these names; `source` is named in an error.
 
-    Raises
-    ------
-    RecordingError
-        Two columns have the same name.
+    Raise `RecordingError` if two columns have the same name.
     """
     columns = Columns(tuple(names))
     twice = [name for name, count in Counter(names).items() if name and count > 1]

@@ -166,12 +166,7 @@ def check_poses(t: Array, q: Array, scene: Scene, source: object) -> None:
     """Check the units of measured poses.
 
     The poses `q`, shape (n, 3), are x, y [m] and theta [rad] at the times `t` [s], shape (n,). An error names the
-    recording by `source`.
-
-    Raises
-    ------
-    UnitError
-        The numbers of a quantity seem to be in another unit.
+    recording by `source`. Raise `UnitError` if the numbers of a quantity seem to be in another unit.
     """
     magnitudes = {("head_pose", name): _usual_magnitude(q[:, place]) for place, name in enumerate(("x", "y"))}
     doubts = [*_lengths(magnitudes, scene), *_angle(q[:, 2], scene), *_spacing(t, q)]

@@ -137,10 +137,7 @@ def wear_content(head: str, scene: str, depth_m: Sequence[float]) -> bytes:
 def save_wear(folder: Path, content: bytes) -> None:
     """Replace the wear file atomically. After a crash, either the complete old file or the complete new file exists.
 
-    Raises
-    ------
-    OSError
-        The file cannot be written, or the disk has not confirmed the new content.
+    Raise `OSError` if the file cannot be written, or the disk has not confirmed the new content.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / FILE_NAME, content, sync=True)

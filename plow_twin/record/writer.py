@@ -351,12 +351,7 @@ def _size(path: Path) -> int:
 def make_folder(folder: Path) -> None:
     """Create a folder for a recording.
 
-    Raises
-    ------
-    TakenError
-        The folder is not empty.
-    RecordingError
-        The folder cannot be created.
+    Raise `TakenError` if the folder is not empty, and `RecordingError` if the folder cannot be created.
     """
     if not _is_free(folder):
         raise TakenError(f"{folder}: exists already, expected a new or empty folder for the recording")

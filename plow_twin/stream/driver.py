@@ -302,10 +302,7 @@ class Driver:
     def set_model(self, stamp_ns: int, changes: Mapping[str, float]) -> None:
         """Continue with changed numbers of the scene; a number without a key in `changes` is that of the scene file.
 
-        Raises
-        ------
-        ArgumentError
-            If a change is impossible while the twin runs. The twin is unchanged.
+        Raise `ArgumentError` if a change is impossible while the twin runs. The twin is unchanged.
         """
         self.session.check_model(changes)
         if dict(changes) != self.session.changes:

@@ -67,10 +67,7 @@ def changed_twin(twin: Driven, scene: Scene, changes: Mapping[str, float]) -> Dr
 def read_changes(text: str) -> dict[str, float]:
     """Return the changes, by key of the scene file, from their JSON text.
 
-    Raises
-    ------
-    ArgumentError
-        If the text is not a JSON object of numbers.
+    Raise `ArgumentError` if the text is not a JSON object of numbers.
     """
     try:
         found = json.loads(text)

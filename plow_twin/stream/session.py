@@ -323,12 +323,8 @@ class Session:
         The `stamps` [ns], shape (n,), must not fall, and the first must not be late. `wrench`, shape (n, 3), is Fx, Fy
         [N] and M [N m]. The array `rows`, shape (n,), receives the rows; with None, rows are neither computed nor
         published. `taken` is as for `Outputs.add`. A digest is computed after each of the rising counts of samples in
-        `digest_after`, shape (m,), from 1 to n.
-
-        Raises
-        ------
-        ValueError
-            If a number is not finite, or the stamps fall. The motion is unchanged.
+        `digest_after`, shape (m,), from 1 to n. Raise `ValueError` if a number is not finite, or the stamps fall. The
+        motion is unchanged.
         """
         if self._is_late(int(stamps[0])) or (stamps[1:] < stamps[:-1]).any():
             raise ValueError(

@@ -19,13 +19,7 @@ MINUS: Final = "\N{MINUS SIGN}"
 
 
 def write_png(figure: Figure, path: Path) -> None:
-    """Write a figure as a PNG file.
-
-    Raises
-    ------
-    RecordingError
-        The file cannot be written.
-    """
+    """Write a figure as a PNG file. Raise `RecordingError` if the file cannot be written."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     try:

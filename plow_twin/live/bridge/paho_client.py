@@ -27,12 +27,8 @@ def make_client(client_id: str, *, clean: bool) -> Any:
 def use_tls(client: Any, ca: Path | str | None, certificate: Path | str | None, key: Path | str | None) -> None:
     """Configure a client to use TLS, and to check the certificate and the name of the broker.
 
-    The certificate is checked with the authority in `ca` or, if `ca` is None, with the authorities of the system.
-
-    Raises
-    ------
-    OSError, ValueError
-        A file cannot be read or is invalid.
+    The certificate is checked with the authority in `ca` or, if `ca` is None, with the authorities of the system. Raise
+    `OSError` or `ValueError` if a file cannot be read or is invalid.
     """
     if key and not certificate:
         raise ValueError("got a key without its certificate")
