@@ -46,7 +46,7 @@ def _plans(runs: PaperRuns) -> list[tuple[str, str, str, str, Callable[[], Figur
 
     scene = runs.scene.clearance
     case = f"{1e3 * scene.horizontal_m:g} mm horizontal, {1e3 * scene.vertical_m:g} mm vertical clearance"
-    plans: list[tuple[str, str, str, str, Callable[[], Figure]]] = [
+    return [
         (
             "paper_fig06", "Fig. 6: motion of the head",
             "x, y and theta in time; all oscillate, y further down than up.", case, lambda: motion.fig06(runs),
@@ -93,7 +93,6 @@ def _plans(runs: PaperRuns) -> list[tuple[str, str, str, str, Callable[[], Figur
             lambda: trends.faces(runs.faces_horizontal, "horizontal"),
         ),
     ]  # fmt: skip
-    return plans
 
 
 def _falls(runs: PaperRuns) -> str:

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from plow_twin.model.scene import Mark, Scene
+from plow_twin.run.simulate import Result
 from plow_twin.study.report import require
-from plow_twin_paper.comparison import all_rows, one_run_rows
+from plow_twin_paper import rows_motion, rows_sets, rows_trends
 from plow_twin_paper.contradictions import Contradiction, contradictions
 from plow_twin_paper.figures import Picture, draw_all, draw_rotation
 from plow_twin_paper.recording import Recording, record
 from plow_twin_paper.rotation import RotationRow, rotation_rows
-from plow_twin_paper.rows import FITTED, Row, Verdict
+from plow_twin_paper.rows import FITTED, UNKNOWN, Row, Verdict
 from plow_twin_paper.runs import PaperRuns, run_all
 
 OnProgress = Callable[[float], object]
@@ -117,14 +120,26 @@ def study_paper(
     return study
 
 
+def all_rows(runs: PaperRuns) -> list[Row]:
+    """Return all rows of the comparison in the order of the paper."""
+    rows = [*_rows_of_run(runs.scene, runs.case), *rows_trends.rows(runs)]
+    if any(entry.mark is Mark.RECONSTRUCTED for entry in runs.scene.marks.values()):
+        return rows
+    return [replace(row, inputs=UNKNOWN) for row in rows]
+
+
+def _rows_of_run(scene: Scene, result: Result) -> list[Row]:
+    return [*rows_motion.rows(scene, result), *rows_sets.rows(scene, result)]
+
+
 def _changes(runs: PaperRuns) -> list[Change]:
     if runs.rotation is None:
         return []
-    first = one_run_rows(runs, 0)
+    first, *others = map(_rows_of_run, runs.rotation.scenes, runs.rotation.results)
     return [
-        Change(FORMS[index], row)
-        for index in (1, 2)
-        for before, row in zip(first, one_run_rows(runs, index), strict=True)
+        Change(form, row)
+        for form, rows in zip(FORMS[1:], others, strict=True)
+        for before, row in zip(first, rows, strict=True)
         if before.verdict is not row.verdict
     ]
 
@@ -177,7 +192,7 @@ def _context(study: PaperStudy) -> dict[str, Any]:
     return {
         **_as_plain(study),
         "study": study,
-        "groups": _grouped(study.rows),
+        "groups": {group: list(rows) for group, rows in groupby(study.rows, attrgetter("group"))},
         "disagreeing": [row for row in study.rows if row.verdict is Verdict.DISAGREES],
         "fitted": [row for row in study.rows if row.inputs == FITTED],
         "checks": [row for row in study.rows if row.inputs != FITTED],
@@ -186,10 +201,3 @@ def _context(study: PaperStudy) -> dict[str, Any]:
         "mark_counts": Counter(entry.mark.value for entry in marks.values()),
         "forms": FORMS,
     }
-
-
-def _grouped(rows: Sequence[Row]) -> Mapping[str, list[Row]]:
-    groups: dict[str, list[Row]] = {}
-    for row in rows:
-        groups.setdefault(row.group, []).append(row)
-    return groups
