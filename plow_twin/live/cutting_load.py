@@ -86,32 +86,21 @@ class Face:
 
 @dataclass(frozen=True)
 class CuttingLoad:
-    """Fluctuating cutting force into the face and lateral force with mean zero, which act at one point of the head.
+    """Fluctuating cutting force into the face and lateral force with mean zero, which act at one point of the head."""
 
-    Parameters
-    ----------
-    face : Face
-        The face and the motion along it.
-    force_n : float
-        Mean cutting force along x [N]. A negative force acts against the x direction.
-    lateral_n : float
-        Standard deviation of the normally distributed lateral force along y [N].
-    at_m : tuple of float
-        Point of action (x, y) from the centre of the cavity [m]. The moment is M = x Fy - y Fx.
-    variation : float
-        Coefficient of variation of the cutting force.
-    correlation_m : float
-        Distance along the face at which the correlation is 1/e [m].
-    seed : int
-        Seed of the random numbers.
-    """
-
+    #: the face and the motion along it
     face: Face
+    #: mean cutting force along x [N]; a negative force acts against the x direction
     force_n: float
+    #: standard deviation of the normally distributed lateral force along y [N]
     lateral_n: float = 0.0
+    #: point of action (x, y) from the centre of the cavity [m]; the moment is M = x Fy - y Fx
     at_m: tuple[float, float] = (0.0, 0.0)
+    #: coefficient of variation of the cutting force
     variation: float = 0.5
+    #: distance along the face at which the correlation is 1/e [m]
     correlation_m: float = 0.05
+    #: seed of the random numbers
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -113,25 +113,18 @@ class ChunkReader:
     The reader adds each declared channel to `channels`, and sets `finished` to True if the file is complete. `damaged`
     is the number of records and chunks that could not be read, plus `left_out`. `left_out` is the number of damaged
     chunks that an earlier repair removed.
-
-    Parameters
-    ----------
-    path
-        The file.
-    on_metadata
-        Function that receives each metadata record.
-    wanted
-        Function that receives the set of channel numbers of a chunk. If it returns False, the chunk is skipped. A chunk
-        without a usable index is always read.
-    more
-        Function that waits until the file grows. The reader calls it at the end of the file, with the stream and the
-        size of the file [B]. If `more` returns True, the reader continues. Before each call, the reader yields an empty
-        batch.
     """
 
+    #: the file
     path: Path
+    #: function that receives each metadata record
     on_metadata: Callable[[str, dict[str, str]], object] = lambda name, record: None
+    #: function that receives the set of channel numbers of a chunk; if it returns False, the chunk is skipped; a chunk
+    #: without a usable index is always read
     wanted: Callable[[set[int]], bool] | None = None
+    #: function that waits until the file grows; the reader calls it at the end of the file, with the stream and the
+    #: size of the file [B]; if `more` returns True, the reader continues; before each call, the reader yields an empty
+    #: batch
     more: Callable[[IO[bytes], int], bool] | None = None
     channels: dict[int, Channel] = field(default_factory=dict)
     finished: bool = False
