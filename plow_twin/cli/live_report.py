@@ -9,12 +9,14 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import click
 
 from plow_twin.cli.console import say_error
-from plow_twin.live.part import Part
+
+if TYPE_CHECKING:
+    from plow_twin.live.part import Part
 
 #: Largest number of lines in the queue. If there are more lines, the oldest lines are dropped.
 MOST_WAITING: Final = 1000
