@@ -120,6 +120,18 @@ def test_a_paused_node_counts_the_overrun_of_its_queue_and_continues(tmp_path: P
         assert running.twin.stop() == 0
 
 
+def test_the_publisher_ends_after_a_twin_that_is_behind_has_used_the_last_sample(tmp_path: Path) -> None:
+    settings = {"input_depth": 20000, "excitation_timeout": 60.0, "jump_forward": 60.0}
+    with bench(tmp_path, **settings, **RELIABLE_INPUT) as running:
+        publisher = running.publisher("--rate", "1000", "--seconds", "3")
+        running.probe.until(lambda: int(running.probe.figures("input")["samples_used"]) > 200, "samples")
+        running.twin.send_signal(signal.SIGSTOP)
+        time.sleep(6.0)  # the publisher waits 2 s for the acknowledgement of its last sample
+        running.twin.send_signal(signal.SIGCONT)
+        figures = _until_accounted(running, _sent(publisher))
+        assert figures["samples_used"] == "3000"
+
+
 def test_outputs_come_in_time_while_samples_come_ten_times_as_fast(tmp_path: Path) -> None:
     # a best-effort subscriber would not detect the loss of the last samples, so the subscriber is reliable
     settings = {"publish_mode": "fixed_rate", "publish_rate": 100.0, "input_depth": 20000}
