@@ -135,6 +135,19 @@ def test_a_stranger_s_mistake_is_named_in_a_message(
     assert sorted(desk.rglob("*")) == before
 
 
+def test_rows_that_an_estimate_cannot_use_are_counted_in_its_losses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    _write("twice/load.csv", LOAD)
+    Path("twice/pose.csv").write_text("t,x,y,theta\n1,0,0,0\n1,0,0,0\nwhat,0,0,0\n")
+    Path("twice/scene.yaml").write_text(scene_path("paper").read_text())
+    assert cli(["estimate", "twice", "--json"]) == 3
+    shown = capsys.readouterr()
+    assert json.loads(shown.out)["losses"] == {"unreadable_rows": 1, "unusable_rows": 1}
+    assert "twice: lost unreadable_rows: 1, unusable_rows: 1" in shown.err
+
+
 def test_a_load_that_looks_like_kilonewtons_is_named_before_it_is_estimated(
     desk: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

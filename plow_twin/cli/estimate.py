@@ -122,6 +122,9 @@ def estimate(
     compile_s, begin = time.perf_counter() - begin, time.perf_counter()
     with busy("estimating", quiet or as_json):
         result, more = task.run()
+    unusable = result.lost - sum(more["losses"].values())
+    if unusable > 0:
+        more["losses"]["unusable_rows"] = unusable
     facts = {**result.as_dict(), **more, "wall_s": time.perf_counter() - begin, "compile_s": compile_s}
     forces = None
     if members is not None:
