@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from scenes import preset
 
-from plow_twin import Contact, Friction, Mark, Provenance
+from plow_twin import Contact, Frame, Friction, Mark, Provenance
+from plow_twin.estimate.bouncing import hidden_by_geometry
 from plow_twin.estimate.discrepancy import variants
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.similar import Units
 from plow_twin.estimate.uncertain_load import _with_exponent
 from plow_twin.estimate.unknowns import OF_SCENE, SIZE, Unknowns, with_other_law
 from plow_twin.model.loads import compile_loads
+from plow_twin.model.scene import MOST_DAMPING_FACTOR
 
 
 def test_the_prior_is_the_scene_s_or_that_of_the_mark() -> None:
@@ -90,3 +92,19 @@ def test_the_alternative_law_has_no_options_of_the_scene_s_law() -> None:
     )  # fmt: skip
     other = with_other_law(Unknowns(replace(preset("paper"), contact=falling)))
     assert other is not None and other.scene.contact == Contact("kelvin_voigt", 1e7, damping=1.0)
+
+
+def test_no_drawn_damping_factor_exceeds_the_admissible_one() -> None:
+    stiff = Contact("hunt_crossley", 1e7, damping=0.1 * MOST_DAMPING_FACTOR)
+    unknowns = Unknowns(replace(preset("paper"), contact=stiff))
+    vector = unknowns.nominal() + 3.0 * unknowns.deviations()
+    assert unknowns.scene_of(unknowns.within(vector)).contact.damping == MOST_DAMPING_FACTOR
+
+
+def test_rounded_corners_may_be_larger_than_a_thin_frame() -> None:
+    """The prior radius of a corner, 3 mm, would take both sides of the frame."""
+    t = np.arange(0.0, 20.0, 0.02)
+    poses = Poses(t, np.outer(np.sin(2.0 * t), [0.0125, 0.015, 0.01]))
+    scene = replace(preset("paper"), frame=Frame(0.005, 0.4))
+    unseen, rounded = hidden_by_geometry(Unknowns(scene), poses, np.pi, np.array([0.025, 0.030]))
+    assert np.isfinite(unseen).all() and np.isfinite(rounded).all()

@@ -28,7 +28,9 @@ from plow_twin import (
     simulate,
 )
 from plow_twin.model.loads import compile_loads
+from plow_twin.model.scene import MOST_DAMPING_FACTOR
 from plow_twin.run import sensitivity
+from plow_twin.solve.compiled_scene import compile_scene
 from plow_twin.study.parameters import with_parameters
 
 
@@ -140,6 +142,28 @@ def test_the_linearised_equations_agree_with_displaced_motions(name: str, monkey
         pairs += [(found.by_parameter[path][place], shadows.by_parameter[path][place]) for path in paths]
         for equations, differences in pairs:
             assert equations == pytest.approx(differences, abs=1e-4 * np.abs(differences).max())
+
+
+def test_a_restitution_that_falls_has_no_linearised_equations() -> None:
+    """They lack the change of the damping number with the impact speed; the derivatives were wrong by a tenth."""
+    contact = Contact("exact_restitution", 1e7, restitution=0.7)
+    falls = {"restitution_fall": 0.25, "restitution_speed_m_s": 0.05}, {"restitution_fall_along_s_m": 0.2}
+    assert sensitivity.fits_tangents(compile_scene(replace(preset("paper"), contact=contact), 1e-9))
+    for fall in falls:
+        scene = replace(preset("paper"), contact=replace(contact, **fall))
+        assert not sensitivity.fits_tangents(compile_scene(scene, 1e-9))
+
+
+@pytest.mark.parametrize(
+    ("contact", "path"),
+    [
+        (Contact("exact_restitution", 1e7, restitution=1.0), "contact.restitution"),
+        (Contact("hunt_crossley", 1e7, damping=MOST_DAMPING_FACTOR), "contact.damping"),
+    ],
+)
+def test_a_largest_admissible_value_is_changed_downwards(contact: Contact, path: str) -> None:
+    changed = sensitivity.ChangedScene.of(replace(preset("paper"), contact=contact), path, 1e-9)
+    assert changed.change < 0.0
 
 
 def test_derivatives_where_errors_grow_follow_a_motion_that_is_known_better(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -334,7 +334,8 @@ def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: A
     )
     # a stated radius or deviation of a side includes the effect of rounded corners
     known = scene.frame.corner_radius_m is not None or any(is_stated(scene, path) for path in _SIDES)
-    across = 0.0 if known else -2.0 * priors.ROUNDING
+    # the sides stay positive
+    across = 0.0 if known else -min(2.0 * priors.ROUNDING, 0.5 * min(scene.frame.width_m, scene.frame.height_m))
     return unseen, moved(across, across) if across else np.zeros(2)
 
 

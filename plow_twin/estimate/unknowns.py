@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from plow_twin.estimate import priors, tuning
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.priors import deviation_of, is_stated
-from plow_twin.model.scene import Clearance, Contact, Scene
+from plow_twin.model.contact_laws import LAWS
+from plow_twin.model.scene import MOST_DAMPING_FACTOR, Clearance, Contact, Scene
 
 Array = NDArray[np.float64]
 
@@ -238,13 +239,17 @@ class Unknowns:
 
 
 def contact_with(contact: Contact, stiffness: float, damping: float | None) -> Contact:
-    """Return a contact with the given stiffness and, unless it is None, damping or restitution."""
+    """Return a contact with the given stiffness and, unless it is None, damping or restitution.
+
+    A damping above the largest admissible damping factor becomes this factor.
+    """
     contact = replace(contact, stiffness=stiffness)
     if damping is None:
         return contact
     if contact.restitution is not None:
         return replace(contact, restitution=damping)
-    return replace(contact, damping=damping)
+    most = math.inf if LAWS[contact.law].additive else MOST_DAMPING_FACTOR
+    return replace(contact, damping=min(damping, most))
 
 
 def with_other_law(unknowns: Unknowns) -> Unknowns | None:

@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.errors import ArgumentError, SolverError
+from plow_twin.errors import ArgumentError, SceneError, SolverError
 from plow_twin.model import geometry
 from plow_twin.model.scene import DOF_NAMES, Load, Scene, Table
 from plow_twin.run.motion import BUDGET, Motion, next_slice, run_events
@@ -160,9 +160,13 @@ class ChangedScene:
         value = sensitivity_parameters(scene)[path]
         length = path.startswith("clearance")
         change = DISPLACEMENT * geometry.length_scale(scene) if length else _RELATIVE_CHANGE * value
-        if path == "contact.restitution" and value + change > 1.0:
+        try:
+            changed = _changed(scene, path, value + change)
+        except SceneError:
+            # the value is the largest admissible value
             change = -change
-        return ChangedScene(path, compile_scene(_changed(scene, path, value + change), tol), change)
+            changed = _changed(scene, path, value + change)
+        return ChangedScene(path, compile_scene(changed, tol), change)
 
 
 def refuse_support(scene: Scene) -> None:

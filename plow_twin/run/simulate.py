@@ -154,7 +154,8 @@ def simulate(
         selects derivatives with respect to these parameters.
 
         The computation takes some five times as long as the run. It takes a hundred times as long, or longer, for
-        scenes with friction, wear, a ramp, a table, a locked degree of freedom or overdamped contact.
+        scenes with friction, wear, a ramp, a table, a locked degree of freedom, overdamped contact or a restitution
+        that falls.
 
     Returns
     -------

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.solve.compiled_scene import CompiledScene, per_mass
+from plow_twin.solve.compiled_scene import CompiledScene, options, per_mass
 from plow_twin.solve.state import Terms, new_records
 from plow_twin.solve.tangents import COLUMNS, STATE_COLUMNS, WIDTH
 
@@ -21,13 +21,14 @@ _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "f
 def fits_tangents(compiled: CompiledScene) -> bool:
     """Return whether the linearised equations support all terms of a scene. Exponents must be integers or 1.5.
 
-    A law with a restitution is supported, although slow touches under it need implicit steps.
+    A law with a constant restitution is supported, although slow touches under it need implicit steps.
     """
     terms, contact = compiled.parts.terms, compiled.scene.contact
     there = {name for name, term in zip(Terms._fields, terms, strict=True) if term is not None}
     known = terms.fraction is None or contact.exponent == 1.5
     explicit = compiled.parts.implicit is None or contact.restitution is not None
-    return known and explicit and there <= _COVERED and compiled.scene.head.carries == "walls"
+    alike = not (options(compiled.scene).corners or options(compiled.scene).falling)
+    return known and explicit and there <= _COVERED and alike
 
 
 def is_curved(terms: Terms) -> int | None:
