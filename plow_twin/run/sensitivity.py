@@ -38,9 +38,11 @@ _STRETCHES: Final = 200
 #: Change of a parameter relative to its value, unless the parameter is a length.
 _RELATIVE_CHANGE: Final = 1e-6
 #: `_CLEAR_OF_WALLS`: smallest distance from each wall at the beginning of a stretch, divided by the displacement of the
-#: shadows. If the displacement would become too small, the previous stretch continues, at most `_MOST_MERGED` times.
+#: shadows. If the displacement would become too small, the previous stretch continues, at most `_MOST_MERGED` times or
+#: `LONGEST_S` [s]. A contact of a short motion lasts many stretches, and has the damping of its first touch.
 _CLEAR_OF_WALLS: Final = 100.0
 _MOST_MERGED: Final = 20
+LONGEST_S: Final = 0.5
 #: Largest number of solver steps of a shadow in one stretch.
 _SHADOW_BUDGET: Final = 10**7
 #: `_EQUATIONS_TOLERANCE`: tolerance of the motion along which the equations are linearised. If the resulting error of
@@ -314,7 +316,7 @@ def _by_equations(scene: Scene, t_end: float, tol: float, parameters: Sequence[s
         begin, allowed = _time.perf_counter(), min(most, int(state.steps) + size)
         code = follow_columns(
             compiled.params, parts, state, work, along, columns, omegas, amplitudes, is_curved(parts.terms), ends, room,
-            _MOST_MERGED, reached, allowed, out, whole,
+            _most_merged(t_end), reached, allowed, out, whole,
         )  # fmt: skip
         size = next_slice(size, _time.perf_counter() - begin)
     if code != Status.OK:
@@ -330,7 +332,7 @@ def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str
     compiled = compile_scene(scene, fine)
     changed = [ChangedScene.of(scene, path, fine) for path in parameters]
     scale, free = scale_of(compiled), free_places(scene)
-    work, merged, size = new_work(), 0, len(free)
+    work, merged, most_merged, size = new_work(), 0, _most_merged(t_end), len(free)
     moved, implicit = DISPLACEMENT, 0
     scenes = [compiled] * (1 + size) + [one.compiled for one in changed]
     first_states = [one.compiled.initial_state() for one in changed]
@@ -349,7 +351,7 @@ def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str
         possible = displacement_beside(
             depths, scale[0], held=held, reads_speed=bool(compiled.params.damping_number >= 0.0)
         )
-        ends = possible is not None or merged >= _MOST_MERGED
+        ends = possible is not None or merged >= most_merged
         if ends:
             merged, moved, implicit = 0, possible or DISPLACEMENT, int(states[0].implicit_steps)
             states = _beside(compiled, states[0], moved * scale, free, states[1 + size :], work)
@@ -366,6 +368,10 @@ def _ends(t_end: float) -> Array:
     ends *= t_end / _STRETCHES
     ends[-1] = t_end
     return ends
+
+
+def _most_merged(t_end: float) -> int:
+    return max(_MOST_MERGED, math.ceil(LONGEST_S * _STRETCHES / t_end))
 
 
 def scale_of(compiled: CompiledScene) -> Array:

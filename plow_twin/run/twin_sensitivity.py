@@ -16,6 +16,7 @@ from plow_twin.run.advance import Advance
 from plow_twin.run.batch import TwinBatch
 from plow_twin.run.sensitivity import (
     DISPLACEMENT,
+    LONGEST_S,
     SHADOW_TOLERANCE,
     ChangedScene,
     StretchProduct,
@@ -33,8 +34,6 @@ Array = NDArray[np.float64]
 
 #: `_STRETCH_S`: length of a stretch in s. `_FAR`: growth factor of a shadow's displacement at which a stretch ends.
 _STRETCH_S, _FAR = 0.1, 100.0
-#: Longest stretch in s. A stretch continues while a contact prevents the start of the next stretch.
-_LONGEST_S = 0.5
 
 
 class TwinSensitivity:
@@ -143,7 +142,7 @@ class TwinSensitivity:
         if t - self.t >= _STRETCH_S or np.abs(away[:size]).max() > _FAR * DISPLACEMENT:
             depths = rows.penetration[0, 0, self._enabled]
             clear = displacement_beside(depths, float(self._scale[0]), reads_speed=self._reads_speed) is not None
-            if clear or t - self.t >= _LONGEST_S:
+            if clear or t - self.t >= LONGEST_S:
                 self._end(t, away[:size].T / DISPLACEMENT, away[size:])
         return advanced
 
