@@ -152,7 +152,7 @@ def test_the_intervals_of_a_machine_that_does_not_differ_stay_narrow() -> None:
         for value, exact, true in zip(
             (result.horizontal, result.vertical), result.apparent, truth.clearance, strict=True
         ):
-            assert exact.deviation < value.deviation < 2.5 * exact.deviation and value.p05 < true < value.p95
+            assert exact.deviation < value.deviation < 3.0 * exact.deviation and value.p05 < true < value.p95
 
 
 @pytest.mark.stress

@@ -16,7 +16,6 @@ def facts_of(scene: Scene, parameters: Mapping[str, Any], source: str) -> dict[s
 
     `source` is a description of the origin of the samples.
     """
-    letters = {corner: letter for letter, corner in scene.frame.labels.items()}
     places = zip(PAIR_NAMES, CORNER_X, CORNER_Y, NORMAL_X, NORMAL_Y, strict=True)
     return {
         "scene": Path(str(parameters.get("scene", ""))).name,
@@ -25,7 +24,7 @@ def facts_of(scene: Scene, parameters: Mapping[str, Any], source: str) -> dict[s
         "frame": [scene.frame.width_m, scene.frame.height_m],
         "clearance": [scene.clearance.horizontal_m, scene.clearance.vertical_m],
         "pads": [
-            {"name": name, "corner": letters.get(corner_of(pair), ""), "at": [x, y], "normal": [nx, ny]}
+            {"name": name, "corner": scene.frame.letters.get(corner_of(pair), ""), "at": [x, y], "normal": [nx, ny]}
             for pair, (name, x, y, nx, ny) in enumerate(places)
         ],
         "thresholds": {

@@ -48,8 +48,7 @@ class RunSummary:
 
 def corner_letters(scene: Scene) -> dict[str, str]:
     """Return the letter of each corner, or its name if it has no letter."""
-    letters = {corner: letter for letter, corner in scene.frame.labels.items()}
-    return {corner: letters.get(corner, corner) for corner in CORNER_NAMES}
+    return {corner: scene.frame.letters.get(corner, corner) for corner in CORNER_NAMES}
 
 
 def summarise(path: Path) -> RunSummary:

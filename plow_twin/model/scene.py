@@ -116,6 +116,11 @@ class Frame:
     )
     corner_radius_m: float | None = _quantity("m", "radius of rounded corners, sharp unless given", None, gt=0.0)
 
+    @property
+    def letters(self) -> dict[str, str]:
+        """Letter of each corner that has one."""
+        return {corner: letter for letter, corner in self.labels.items()}
+
 
 @dataclass(frozen=True)
 class Clearance:

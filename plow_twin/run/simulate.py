@@ -376,9 +376,8 @@ def statistics_of(totals: Totals, duration: float) -> dict[str, dict[str, float]
 
 def contact_sets_of(scene: Scene, totals: Totals) -> dict[str, dict[str, float]]:
     """Return the shares of contact time, as in `Result.contact_sets`, in descending order."""
-    letters = {corner: letter for letter, corner in scene.frame.labels.items()}
-    labels = [letters.get(corner, corner) for corner in CORNER_NAMES]
-    joint = "" if letters else "+"
+    labels = [scene.frame.letters.get(corner, corner) for corner in CORNER_NAMES]
+    joint = "" if scene.frame.labels else "+"
     senses = {}
     # the force of a pair turns a block and a cavity in opposite senses
     order = ("ccw", "cw") if scene.head.carries == "walls" else ("cw", "ccw")

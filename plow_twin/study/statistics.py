@@ -121,8 +121,7 @@ def unit_of(path: str) -> str:
 
 
 def _labels(scene: Scene) -> list[str]:
-    letters = {corner: letter for letter, corner in scene.frame.labels.items()}
-    return [letters.get(corner, corner) for corner in CORNER_NAMES]
+    return [scene.frame.letters.get(corner, corner) for corner in CORNER_NAMES]
 
 
 def _groups(scene: Scene) -> dict[str, list[int]]:

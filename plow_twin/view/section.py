@@ -64,9 +64,8 @@ class Section:
         """Return the cross-section of a scene."""
         frame = _MM * np.array([scene.frame.width_m, scene.frame.height_m])
         gaps = _MM * np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
-        letters = {corner: letter for letter, corner in scene.frame.labels.items()}
         name = "frame (fixed)" if scene.support is None else "frame (on springs)"
-        labels = tuple(letters.get(corner, "") for corner in CORNER_NAMES)
+        labels = tuple(scene.frame.letters.get(corner, "") for corner in CORNER_NAMES)
         is_block = scene.head.carries == "corners"
         radius = _MM * corner_radius(scene)
         return cls(frame, frame + gaps, labels, "guide (fixed)" if is_block else name, is_block, radius)

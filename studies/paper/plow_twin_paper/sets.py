@@ -46,8 +46,7 @@ class SetFigures:
 
 def letters_of_pairs(scene: Scene) -> list[str]:
     """Return the letter of each pair's corner, shape (8,)."""
-    letters = {corner: letter for letter, corner in scene.frame.labels.items()}
-    return [letters[CORNER_NAMES[pair // 2]] for pair in range(PAIR_COUNT)]
+    return [scene.frame.letters[CORNER_NAMES[pair // 2]] for pair in range(PAIR_COUNT)]
 
 
 def of_sense(sense: Sense) -> NDArray[np.bool_]:
