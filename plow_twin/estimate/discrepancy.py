@@ -32,7 +32,7 @@ from scipy.special import log_ndtr, ndtr
 from plow_twin.estimate import tuning
 from plow_twin.estimate.compliance import by_compliance
 from plow_twin.estimate.fit import DIFFERENCES, FEWEST_OF_SWING, LAG, WALLS, Fit, Point, Problem, freed, huber_weight
-from plow_twin.estimate.harmonics import Harmonics
+from plow_twin.estimate.harmonics import COMPONENTS, Harmonics
 from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER
 from plow_twin.estimate.pads import deviations
 from plow_twin.estimate.priors import ROUNDING, UNSTATED, deviation_of
@@ -221,6 +221,9 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
     size = np.ptp(problem.forward.load.wrench, axis=0) / 2.0
     step = problem.steps * _PUSH_STEP
     pushes = [by(step, push=step * push) for push in np.diag(np.maximum(size, 1e-3 * size.max()))]
+    if problem.harmonics is None:
+        constants = zip(COMPONENTS, pushes, strict=True)
+        out |= {f"load_{name}": _Column(UNSTATED[f"load_{name}"], push) for name, push in constants if push is not None}
     return out, np.stack([np.zeros_like(point.rate) if push is None else push for push in pushes], axis=2)
 
 

@@ -41,6 +41,7 @@ BIAS: Final = (5e-3, 5e-3, 0.02)
 #: - `lever_<axis>`: lever arm of the sensor in m
 #: - `filter`: squared time constant of the sensor's low pass in s2, without its mean delay
 #: - `clock`: relative drift of the sensor's clock
+#: - `load_<component>`: constant error of the load in units of half its range
 #: - `compliance`: displacement of the frame per force in m/N; a force of 100 kN moves the frame by 0.25 mm
 UNSTATED: Final = {
     **{f"stiffness_{wall}": 0.1 for wall in ("left", "right", "top", "bottom")},
@@ -48,6 +49,7 @@ UNSTATED: Final = {
     **{f"turn_{wall}": 1e-3 for wall in ("left", "right", "top", "bottom")},
     **{f"scale_{axis}": scale for axis, scale in zip(("x", "y", "theta"), SCALES, strict=True)},
     **{f"lever_{axis}": 4e-3 for axis in ("x", "y")},
+    **{f"load_{name}": 0.02 for name in ("fx", "fy", "m")},
     "filter": 4e-4,
     "clock": 1e-4,
     "compliance": 2.5e-9,
