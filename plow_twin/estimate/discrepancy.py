@@ -3,8 +3,9 @@
 Three kinds of differences are considered:
 
 - Further unknowns, each with a prior: inertia, size and compliance of the frame, friction, exponent, differences
-  between the walls, and errors of the sensor. They are estimated in one linearised step from the fit. Bayesian variable
-  selection samples which of them differ from the scene. Unknowns that cannot be negative have one-sided priors.
+  between the walls, errors of the sensor, and constant errors of the load. They are estimated in one linearised step
+  from the fit. Bayesian variable selection samples which of them differ from the scene. Unknowns that cannot be
+  negative have one-sided priors.
 - The load is assumed to have a constant error in each swing (a part of the motion that begins in flight). The size of
   the errors is estimated from all swings (empirical Bayes).
 - The remaining residuals are treated as noise. The variance of the measurements is increased if the residuals are
