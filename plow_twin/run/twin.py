@@ -16,7 +16,7 @@ from plow_twin.errors import ArgumentError, LimitError, RunInterrupted
 from plow_twin.kernel.compiler import for_arguments
 from plow_twin.model import geometry
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
-from plow_twin.model.scene import Initial, Scene, check_travel_speed
+from plow_twin.model.scene import DOF_NAMES, Initial, Scene, check_travel_speed
 from plow_twin.run.advance import Advance, AdvanceSeries, check_times
 from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, Pace, check_limits
 from plow_twin.solve import loop
@@ -301,7 +301,8 @@ class Twin:
         wear_depth : array_like, shape (8,), optional
             Wear depth of each pad in m, at least 0. The default is the scene's initial wear depth.
         pose : tuple of array_like, shapes (3,) and (3,), optional
-            x, y [m], theta [rad] and their rates at the start. The default is the scene's initial state.
+            x, y [m], theta [rad] and their rates at the start. The default is the scene's initial state. Rates of
+            locked degrees of freedom, which rounding leaves in a motion, are set to 0.
 
         Raises
         ------
@@ -318,6 +319,7 @@ class Twin:
             q, v = (np.asarray(part, dtype=np.float64) for part in pose)
             if q.shape != (3,) or v.shape != (3,) or not np.isfinite([q, v]).all():
                 raise ArgumentError(f"pose: got {pose!r}, expected two times 3 finite numbers")
+            v = np.where([name in self.scene.locked for name in DOF_NAMES], 0.0, v)
             initial = Initial((q[0], q[1], q[2]), (v[0], v[1], v[2]))
             begin = replace(begin, scene=replace(self.scene, initial=initial))
         self._states[0] = begin.initial_state(t, depth)
