@@ -613,6 +613,9 @@ def _check_friction(friction: Friction) -> Iterator[Problem]:
         for name in ("stick_damping_n_s_m", "static_coefficient"):
             if getattr(friction, name) is not None:
                 yield Problem(f"friction.{name}", getattr(friction, name), "nothing without stick_stiffness_n_m")
+    elif static and friction.coefficient == 0.0:
+        expected = "nothing or 0 with a coefficient of 0, which means no friction"
+        yield Problem("friction.static_coefficient", static, expected)
     elif static is not None and static < friction.coefficient:
         yield Problem("friction.static_coefficient", static, f"at least the coefficient {friction.coefficient:g} [1]")
 
