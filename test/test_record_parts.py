@@ -153,6 +153,16 @@ def test_faults_that_stop_other_programs_are_named_and_repaired(tmp_path: Path) 
         assert reader.message_count
 
 
+def test_a_damaged_qos_of_a_topic_does_not_stop_a_repair(tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(100)))
+    data = run.file.read_bytes()
+    assert data.count(b"keep_last") > 1  # in the declarations of the topics, which are outside the chunks
+    run.file.write_bytes(data.replace(b"keep_last", b"keep\x17last")[:-100])
+    assert repair(run.folder) == [run.file] and examine(run.folder).problems == []
+    with AnyReader([run.folder]) as reader:
+        assert reader.message_count
+
+
 def test_a_repair_keeps_every_old_file_and_lists_every_part(tmp_path: Path) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), **SMALL)
     parts = RunReader(run.folder).parts

@@ -7,7 +7,7 @@ counted as lost.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -15,7 +15,7 @@ from typing import Any, Final
 from plow_twin.errors import RecordingError
 from plow_twin.record.bag import beside_folders
 from plow_twin.record.cdr import type_hash
-from plow_twin.record.chunks import DAMAGE_RECORD, MAGIC, ChunkReader, Messages, is_mcap
+from plow_twin.record.chunks import DAMAGE_RECORD, MAGIC, Channel, ChunkReader, Messages, is_mcap
 from plow_twin.record.follow import is_claimed
 from plow_twin.record.header import LAYOUT_VERSION, LOSS_RECORD
 from plow_twin.record.mcap_file import ChunkBuilder, McapFile, UnbufferedFile
@@ -25,6 +25,7 @@ from plow_twin.record.metadata_yaml import (
     TopicCount,
     bag_metadata,
     listed_parts,
+    profiles,
     qos_text,
     recorded_losses,
     write_metadata,
@@ -39,6 +40,7 @@ _CHUNK_SIZE: Final = 2**20
 #: the key.
 REPAIRED_KEY: Final = "repaired"
 _HASH: Final = "topic_type_hash"
+_QOS: Final = "offered_qos_profiles"
 
 
 @dataclass
@@ -350,11 +352,7 @@ def _copy(messages: Messages, reader: ChunkReader, file: McapFile, numbers: dict
         if channel is None:
             continue
         if number not in numbers:
-            kind = channel.message_type
-            known = kind in MESSAGE_TYPES
-            offered = qos_text(channel.topic.rpartition("/")[2])
-            qos = {"offered_qos_profiles": offered, "topic_type_hash": type_hash(kind)} if known else {}
-            numbers[number] = file.channel(channel.topic, kind, channel.schema, channel.metadata or qos)
+            numbers[number] = file.channel(channel.topic, channel.message_type, channel.schema, _description(channel))
         builder.add(
             numbers[number],
             int(messages.sequence[index]),
@@ -365,6 +363,14 @@ def _copy(messages: Messages, reader: ChunkReader, file: McapFile, numbers: dict
         if builder.size >= _CHUNK_SIZE:
             file.chunk(builder)
     file.chunk(builder)
+
+
+def _description(channel: Channel) -> Mapping[str, str]:
+    """Return the metadata of a channel. A missing or damaged QoS, which other readers refuse, is replaced."""
+    kind, found = channel.message_type, channel.metadata
+    if kind not in MESSAGE_TYPES or profiles(found.get(_QOS, "")):
+        return found
+    return {**found, _QOS: qos_text(channel.topic.rpartition("/")[2]), _HASH: type_hash(kind)}
 
 
 def _facts(part: Path) -> PartFacts:
@@ -380,6 +386,6 @@ def _facts(part: Path) -> PartFacts:
     for number, count in sorted(counts.items()):
         channel = reader.channels.get(number)
         if channel is not None and (channel.message_type in MESSAGE_TYPES or _HASH in channel.metadata):
-            qos, digest = channel.metadata.get("offered_qos_profiles", ""), channel.metadata.get(_HASH, "")
+            qos, digest = channel.metadata.get(_QOS, ""), channel.metadata.get(_HASH, "")
             topics.append(TopicCount(channel.topic, channel.message_type, count, qos, digest))
     return PartFacts(part.name, start, end, topics)

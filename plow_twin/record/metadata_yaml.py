@@ -22,7 +22,7 @@ _LOST: Final = "plow_twin_lost "
 
 @dataclass
 class TopicCount:
-    """A topic of a recording with its number of messages. `bag_metadata` replaces an empty QoS or type hash."""
+    """A topic of a recording with its number of messages. `bag_metadata` replaces an unreadable QoS or type hash."""
 
     topic: str
     message_type: str
@@ -101,9 +101,7 @@ def bag_metadata(
                 "name": topic.topic,
                 "type": topic.message_type,
                 "serialization_format": "cdr",
-                "offered_qos_profiles": _parsed(load_yaml(topic.qos, "QoS", "profiles"))
-                if topic.qos
-                else [qos_profile("")],
+                "offered_qos_profiles": profiles(topic.qos) or [qos_profile("")],
                 "type_description_hash": topic.type_hash or type_hash(topic.message_type),
             },
             "message_count": topic.count,
@@ -124,6 +122,12 @@ def bag_metadata(
             "ros_distro": "jazzy",
         }
     }
+
+
+def profiles(qos: str) -> list[Any]:
+    """Return the QoS profiles in the text of a channel; the list is empty if the text is missing or damaged."""
+    document, problems = load_yaml(qos, "QoS", "profiles")
+    return document if not problems and isinstance(document, list) else []
 
 
 def listed_parts(folder: Path) -> list[str]:
