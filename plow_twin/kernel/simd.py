@@ -82,22 +82,43 @@ def exact_row(typingctx: Any, array: Any, index: Any) -> Any:
     return exact_lanes(array, index), _load
 
 
+def _from_places(context: Any, builder: Any, signature: Any, arguments: Any, places: Any) -> Any:
+    """Return the code that loads a vector from eight offsets `places` from a row."""
+    index = context.cast(builder, arguments[1], signature.args[1], types.intp)
+    row_pointer = _pointer(context, builder, signature.args[0], arguments[0], index)
+    first, vector = builder.bitcast(row_pointer, ir.DoubleType().as_pointer()), ir.Constant(_VECTOR, ir.Undefined)
+    for lane, place in enumerate(places):
+        number = builder.load(builder.gep(first, [place]))
+        vector = builder.insert_element(vector, number, ir.Constant(ir.IntType(32), lane))
+    return vector
+
+
 @_operation
 def gathered(typingctx: Any, array: Any, index: Any, places: Any) -> Any:
     """Return eight elements of a contiguous array of shape (n, 8), by their offsets `places` from row `index`."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        row_index = context.cast(builder, arguments[1], signature.args[1], types.intp)
-        first = builder.bitcast(
-            _pointer(context, builder, signature.args[0], arguments[0], row_index), ir.DoubleType().as_pointer()
-        )
-        vector = ir.Constant(_VECTOR, ir.Undefined)
-        for lane in range(_WIDTH):
-            number = builder.load(builder.gep(first, [builder.extract_value(arguments[2], lane)]))
-            vector = builder.insert_element(vector, number, ir.Constant(ir.IntType(32), lane))
-        return vector
+        places = [builder.extract_value(arguments[2], lane) for lane in range(_WIDTH)]
+        return _from_places(context, builder, signature, arguments, places)
 
     return exact_lanes(array, index, places), codegen
+
+
+@_operation
+def picked(typingctx: Any, array: Any, index: Any, order: Any) -> Any:
+    """Return a row with element `order`[i] in lane i, for eight int64 numbers `order` that `exact_row` has loaded."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        numbers = builder.bitcast(arguments[2], _BITS)
+        if "+avx512f" in context.codegen().magic_tuple()[2]:
+            # LLVM does not find this instruction if the loop is elsewhere than the loads of `order`
+            kind, name = ir.FunctionType(_VECTOR, [_VECTOR, _BITS]), "llvm.x86.avx512.permvar.df.512"
+            permute = cgutils.get_or_insert_function(builder.module, kind, name)
+            return builder.call(permute, [_load(context, builder, signature, arguments), numbers])
+        places = [builder.extract_element(numbers, ir.Constant(ir.IntType(32), i)) for i in range(_WIDTH)]
+        return _from_places(context, builder, signature, arguments, places)
+
+    return exact_lanes(array, index, order), codegen
 
 
 @_operation

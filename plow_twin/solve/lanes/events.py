@@ -13,7 +13,18 @@ import numpy as np
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.polynomial import first_root
-from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, gathered, lowest_bit, magnitude, set_row
+from plow_twin.kernel.simd import (
+    below,
+    choose,
+    exact_row,
+    exact_splat,
+    fused,
+    gathered,
+    lowest_bit,
+    magnitude,
+    picked,
+    set_row,
+)
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.events import LET_GO, ON_THE_WALL
 from plow_twin.solve.lanes.record import (
@@ -35,8 +46,6 @@ _AT_ONCE = 1e-12
 #: `_STRAIGHT`: effect of the curvature on the change. `_ROUNDED`: relative change due to rounding.
 _FOUND, _STRAIGHT, _ROUNDED = 1e-6, 1e-3, 2e-16
 _MOST_CHANGES = 80
-#: Factor for rounding. A root that exceeds a shortened step by this factor is certainly beyond the step.
-_SURELY_LATER = 1.0 + 1e-9
 #: Indices in `lanes.chosen` after the five coefficients of a penetration: factor of d, factor of d', constant.
 _DEPTH, _RATE, _CONSTANT = 5, 6, 7
 
@@ -148,7 +157,7 @@ def _list_off(lanes, order) -> None:
 def _row_of(array, k, places):
     if places is None:
         return exact_row(array, k)
-    return gathered(array, k, places)
+    return picked(array, k, places)
 
 
 @kernel()
@@ -156,8 +165,7 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
     """Write the guard functions `of_depth` d + `of_rate` d' + `constant` to `guard`, with the penetrations d.
 
     `places` contains the lanes of the guard functions; None means one guard function of each lane, in order. Returns a
-    bit mask of the guard functions that may become negative. g stays positive on [0, h] if g_0 and b(h) = g_0 + g_1 h -
-    sum over k > 1 of max(-g_k, 0) h^k are positive, because b is concave and a lower bound of g.
+    bit mask of the guard functions that may become negative, by the lower bound in `solve.events._unsafe_pairs`.
     """
     cosine, sine, x, y = lanes.series[COS], lanes.series[SIN], lanes.series[X], lanes.series[Y]
     reach = term = deeper = zero = exact_splat(0.0)
@@ -239,7 +247,8 @@ def _write_choice(lanes, lane, guard, i, hysteretic, fraction) -> None:
         elif guard < SECOND and mode != OFF:
             constant = _allowance(lanes, pair, lane, mode)
     chosen[_DEPTH, i], chosen[_RATE, i], chosen[_CONSTANT, i] = sign, rate, constant
-    lanes.begin[i], lanes.reach[i] = begin, lanes.step[lane] - begin
+    # other lanes influence when a step is shortened, and the bits of a root depend on the searched interval
+    lanes.begin[i], lanes.reach[i] = begin, lanes.accurate[lane] - begin
     lanes.row_place[i] = pair * 5 * WIDTH + lane
 
 
@@ -330,28 +339,16 @@ def cross(lanes, column, order, bits) -> None:
 
 
 @kernel()
-def _leaves(guard, i, order, h) -> bool:
-    """Return whether a penetration provably decreases over the whole step."""
-    rise = 0.0
-    for k in range(order, 1, -1):
-        rise = (rise + k * max(guard[k, i], 0.0)) * h
-    return rise + guard[1, i] < 0.0
-
-
-@kernel()
-def _note_root(lanes, lane, at, i, order) -> None:
+def _note_root(lanes, lane, guard, root, is_only_root) -> None:
     """End the step at a root, or record the separation of a CLIPPED or RELEASED pair."""
-    guard, root = lanes.guarded[at, i], lanes.root[i] + lanes.begin[i]
     pair = guard % PAIR_COUNT
     if guard < SECOND and lanes.mode[pair, lane] > ON:
         lanes.parted[pair, lane] = root
         lanes.parting[0] |= 1 << lane
-        if not _leaves(lanes.guard[at], i, order, lanes.step[lane]):
+        if not is_only_root:
+            # the pair may touch again within the step
             lanes.todo[lane] |= 1 << AGAIN + pair
-        return
-    if SECOND <= guard < AGAIN and root >= lanes.parted[pair, lane]:
-        return
-    if root < lanes.step[lane]:
+    elif guard < SECOND or guard >= AGAIN or root < lanes.parted[pair, lane]:
         lanes.step[lane], lanes.event[lane] = root, guard
 
 
@@ -391,7 +388,7 @@ def _write_chosen(lanes, at, order, full, fraction):
     for k in range(order + 1, full + 1):
         set_row(guard, k, zero)
     bits = _write_guard(
-        lanes, places_of(lanes.owner[at]), chosen, exact_row(chosen, _DEPTH), exact_row(chosen, _RATE),
+        lanes, exact_row(lanes.owner, at), chosen, exact_row(chosen, _DEPTH), exact_row(chosen, _RATE),
         exact_row(chosen, _CONSTANT), guard, order, exact_row(lanes.reach, 0), fraction,
     )  # fmt: skip
     again = below(zero, exact_row(lanes.begin, 0))
@@ -402,7 +399,7 @@ def _write_chosen(lanes, at, order, full, fraction):
 
 @kernel()
 def _search(lanes, w, at, order, bits) -> None:
-    """Search the first root of each guard function. A function stays listed if a shorter step may change its root."""
+    """Search the first root of each guard function within the step of its lane."""
     guard = lanes.guard[at]
     single, several = isolate(lanes, guard, w, order, bits)
     if single != 0:
@@ -411,21 +408,18 @@ def _search(lanes, w, at, order, bits) -> None:
     while left != 0:
         i = lowest_bit(left)
         left &= left - 1
-        lane, has_one = lanes.owner[at, i], single >> i & 1 == 1
-        reach = lanes.step[lane] - lanes.begin[i]
-        if reach < lanes.reach[i]:
-            if has_one and lanes.root[i] > reach * _SURELY_LATER:
-                continue
-            lanes.todo[lane] |= 1 << lanes.guarded[at, i]
+        lane, begin, has_one = lanes.owner[at, i], lanes.begin[i], single >> i & 1 == 1
+        root, reach = lanes.root[i] + begin, lanes.step[lane] - begin
+        if reach <= 0.0:
             continue
         if not has_one:
             column = w.column[0]
             for k in range(order + 1):
                 column[k] = guard[k, i]
-            lanes.root[i] = first_root(column, order, reach, w)
-        if lanes.root[i] < reach:
+            root = first_root(column, order, reach, w) + begin
+        if root < lanes.step[lane]:
             lanes.counts[GUARD_ROOTS, lane] += 1
-            _note_root(lanes, lane, at, i, order)
+            _note_root(lanes, lane, lanes.guarded[at, i], root, has_one)
 
 
 @kernel()
@@ -469,7 +463,7 @@ def note_switches(lanes, order, viscous, fraction) -> None:
     if ending == 0:
         return
     for at in range(lanes.rounds[0]):
-        step = gathered(lanes.step, 0, places_of(lanes.owner[at]))
+        step = picked(lanes.step, 0, exact_row(lanes.owner, at))
         ended = _ends_with(lanes.guard[at], order, step, step * _AT_ONCE)
         while ended != 0:
             i = lowest_bit(ended)
