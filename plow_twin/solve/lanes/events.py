@@ -451,15 +451,14 @@ def _ends_with(guard, order, at, within):
 
 @kernel()
 def note_switches(lanes, order, viscous, fraction) -> None:
-    """Write the modes after the steps to `lanes.switch`, or -1 for pairs that keep their mode.
+    """Write the pairs that change their modes after the steps to `lanes.switching`, and the modes to `lanes.switch`.
 
     Events that differ only by rounding are simultaneous, so that a symmetric motion stays symmetric.
     """
     ending = 0
     for lane in range(WIDTH):
         ending |= 1 << lane if lanes.event[lane] >= 0 else 0
-        for pair in range(PAIR_COUNT):
-            lanes.switch[pair, lane] = -1
+        lanes.switching[lane] = 0
     if ending == 0:
         return
     for at in range(lanes.rounds[0]):
@@ -472,7 +471,7 @@ def note_switches(lanes, order, viscous, fraction) -> None:
             if lanes.event[lane] >= 0 and 0 <= guard < AGAIN:
                 pair = guard % PAIR_COUNT
                 # the first guard function of a pair takes precedence over the second
-                if lanes.switch[pair, lane] < 0 and lanes.parted[pair, lane] >= lanes.step[lane]:
+                if lanes.switching[lane] >> pair & 1 == 0 and lanes.parted[pair, lane] >= lanes.step[lane]:
                     _note_switch(lanes, lane, guard, viscous, fraction)
     for lane in range(WIDTH):
         if lanes.event[lane] >= 0:
@@ -490,3 +489,4 @@ def _note_switch(lanes, lane, guard, viscous, fraction) -> None:
     else:
         mode = _next_mode(lanes, lane, mode, viscous, fraction)
     lanes.switch[pair, lane] = mode
+    lanes.switching[lane] |= 1 << pair

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from plow_twin.kernel.arrays import unowned
 from plow_twin.kernel.compiler import kernel
-from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, magnitude, set_row
+from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, lowest_bit, magnitude, set_row
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.kinematics import pose_of, rate_at
 from plow_twin.solve.lanes.events import first_events, note_switches
@@ -158,13 +158,16 @@ def turn(out, first, second) -> None:
 
 
 @kernel()
-def _part(sums, lanes, lane) -> None:
-    """Set the CLIPPED and RELEASED pairs that separate from their walls within a lane's step to OFF."""
+def _part(sums, lanes, lane) -> bool:
+    """Set the pairs that separate from their walls within a lane's step to OFF, and return whether there are any."""
+    found = False
     for pair in range(PAIR_COUNT):
         if lanes.parted[pair, lane] < lanes.step[lane]:
             lanes.mode[pair, lane] = OFF
             lanes.counts[EVENTS, lane] += 1
             sums.logged += 1
+            found = True
+    return found
 
 
 @kernel()
@@ -196,10 +199,11 @@ def _touch_or_release(p, lanes, pair, lane) -> None:
 
 @kernel()
 def _switch(p, sums, lanes, lane, hysteretic, fraction) -> None:
-    for pair in range(PAIR_COUNT):
+    left = lanes.switching[lane]
+    while left != 0:
+        pair = lowest_bit(left)
+        left &= left - 1
         new, old = lanes.switch[pair, lane], lanes.mode[pair, lane]
-        if new < 0:
-            continue
         lanes.mode[pair, lane] = new
         lanes.counts[EVENTS, lane] += 1
         if old == OFF:
@@ -236,10 +240,7 @@ def complete(p, sums, lanes, lane, hysteretic, fraction) -> None:
     counts[STEPS, lane] += 1
     counts[EVALUATIONS, lane] += lanes.orders[lane]
     if lanes.parting[0] >> lane & 1:
-        for pair in range(PAIR_COUNT):
-            parted |= lanes.parted[pair, lane] < lanes.step[lane]
-    if parted:
-        _part(sums, lanes, lane)
+        parted = _part(sums, lanes, lane)
     end = end_of(lanes, lane, fraction)
     lanes.time[lane] = end
     at_once = end - begin <= ONE_INSTANT * (1.0 + abs(begin))

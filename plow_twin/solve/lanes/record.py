@@ -152,7 +152,8 @@ LANES: Final = np.dtype(
         ("kept", "f8", (3 * PAIR_COUNT + 3, WIDTH)),
         ("kept_counts", "i8", (COUNTS, WIDTH)),
         ("member", "i8", _LANES_OF),  # index of the scene in a lane, -1 for an empty lane
-        ("switch", "i8", _PAIRS),  # modes of the pairs after the step, -1 for no change
+        ("switching", "i8", _LANES_OF),  # bit mask of the pairs whose mode changes at the end of the step
+        ("switch", "i8", _PAIRS),  # modes of these pairs after the step
         ("event", "i8", _LANES_OF),  # number of the guard function that ends the step, or -1
         ("ends_at_stop", "i8", _LANES_OF),
         ("todo", "i8", _LANES_OF),  # bit mask of the guard functions that have not been searched yet

@@ -126,16 +126,14 @@ def _raise_peaks(totals, lanes, w, slot, order, full, on) -> int:
     The peak is increased to the larger end value of the force. A force whose maximum may be within the step is stored
     for `find_peaks`. Under sampled loads its maximum is computed at once, because each row needs its peak.
     """
-    h, zero, half, push = exact_row(lanes.step, 0), exact_splat(0.0), exact_splat(0.5), lanes.push[slot]
+    h, zero, push = exact_row(lanes.step, 0), exact_splat(0.0), lanes.push[slot]
     end = bend = slope = zero
     for k in range(order, -1, -1):
         term = exact_row(push, k)
         end = fused(end, h, term)
         if k > 1:
-            size = magnitude(term)
-            slope = fused(size, exact_splat(1.0 * k), slope) * h
             # a function exceeds its end values by at most h^2 / 8 times its largest downward curvature
-            bend = fused((size - term) * half, exact_splat(0.125 * k * (k - 1)), bend) * h
+            bend = fused(magnitude(term) - term, exact_splat(0.0625 * k * (k - 1)), bend) * h
     start, stiffness, peak = exact_row(push, 0), exact_row(lanes.stiffness, 0), exact_row(lanes.gained, 1)
     most = choose(below(start, end), end, start)
     exceeds = below(peak, stiffness * fused(bend, h, most) * _ROUNDED) & on
@@ -144,6 +142,8 @@ def _raise_peaks(totals, lanes, w, slot, order, full, on) -> int:
     reached = stiffness * most
     peak = choose(exceeds & below(peak, reached), reached, peak)
     set_row(lanes.gained, 1, peak)
+    for k in range(order, 1, -1):
+        slope = fused(magnitude(exact_row(push, k)), exact_splat(1.0 * k), slope) * h
     bulges = exceeds & below(magnitude(exact_row(push, 1)), slope)
     if totals is None:
         if bulges != 0:
