@@ -178,6 +178,7 @@ def test_random_scenes_move_as_in_the_loop_of_a_single_scene(powers: bool, frict
 
 
 @pytest.mark.stress
+@pytest.mark.timeout(1200)  # one test compiles the kernels of lanes and loop for four kinds of scenes
 @settings(max_examples=10)
 @given(st.integers(0, 2**32 - 1), st.booleans(), st.booleans())
 def test_many_random_scenes_move_as_in_the_loop_of_a_single_scene(seed: int, powers: bool, friction: bool) -> None:
