@@ -12,7 +12,7 @@ from scipy.stats import truncnorm
 
 from plow_twin.estimate import search
 from plow_twin.estimate.arrow import Arrow
-from plow_twin.estimate.fit import fit, link_weights
+from plow_twin.estimate.fit import fit, link_weights, unmoved_span
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.result import Interval, State
 from plow_twin.estimate.summary import summarise
@@ -31,6 +31,13 @@ def test_links_have_the_weight_of_white_noise_of_acceleration() -> None:
     for axis, density in enumerate(drift):
         covariance = np.linalg.inv(weights[np.ix_([axis, axis + 3], [axis, axis + 3])])
         assert covariance == pytest.approx(np.cov(added.T) * density, rel=0.05)
+
+
+@pytest.mark.parametrize("moment", [0.0, 0.5])
+def test_a_load_that_leaves_a_component_certain_bounds_the_swings_by_the_others(moment: float) -> None:
+    noise, drift = np.array([3e-4, 3e-4, 1e-3]), np.array([2.0, 0.5, moment])
+    assert 2.0 * unmoved_span(noise, drift) ** 3 / 3.0 == pytest.approx(9e-8)  # the variance after white noise
+    assert 0.0 < unmoved_span(noise, np.zeros(3)) < 10.0
 
 
 @pytest.mark.parametrize("swings", [1, 2, 9])

@@ -481,6 +481,11 @@ def _by_state(point: Point, other: Point, index: int, moved: float) -> tuple[Arr
     return np.nan_to_num((point.residual - other.residual) / moved), ends / moved
 
 
+def unmoved_span(noise: Array, drift: Array) -> float:
+    """Return the longest span in s in which white acceleration noise moves the head by no more than the noise."""
+    return float(np.cbrt(3.0 * noise**2 / np.maximum(drift, _LEAST_DRIFT)).min())
+
+
 def link_weights(spans: Array, drift: Array) -> Array:
     """Return the inverse covariance, (s, 6, 6), of pose and rate due to white acceleration noise over s spans."""
     drift = np.maximum(drift, _LEAST_DRIFT)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
-from plow_twin.estimate.fit import LAG, Fit, Problem, Window, fit
+from plow_twin.estimate.fit import LAG, Fit, Problem, Window, fit, unmoved_span
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.measurements import RESOLVING, Poses, filled
 from plow_twin.estimate.priors import UNSTATED
@@ -134,7 +134,7 @@ def refine(
     horizon = tuning.HARD_HORIZON if hard else np.inf
     if drift is not None and not hard:
         # the unknown part of the load may move the head by no more than the noise
-        shortest = min(max(shortest, float(np.cbrt(3.0 * noise**2 / drift).min()) / period), tuning.SHORTEST[1])
+        shortest = min(max(shortest, unmoved_span(noise, drift) / period), tuning.SHORTEST[1])
     shortest = max(shortest * period, rows[1], float(poses.t[-1] - poses.t[0]) / _MOST_SWINGS)
     horizon = max(horizon * period, rows[0])
     window = cut(unknowns.scene, poses, period, shortest)
