@@ -36,7 +36,7 @@ from plow_twin.errors import RecordingError
 from plow_twin.live import parameters
 from plow_twin.live.bridge.files import Files, StandardInput
 from plow_twin.live.bridge.source import BridgeError
-from plow_twin.live.control import call
+from plow_twin.live.control import Control, ControlError, call
 from plow_twin.live.front import BridgeFront
 from plow_twin.live.inputs import Inputs
 from plow_twin.live.load_model import read_load_model
@@ -549,6 +549,26 @@ def test_an_alarm_is_reported_once_with_value_pad_threshold_and_time_and_acknowl
     marks = [entry.text for entry in entries if isinstance(entry, Mark)]
     assert marks == ["alarm: force", "new pads"]
     assert [entry.name for entry in entries if isinstance(entry, Parameter)] == ["alarms_acknowledged"]
+
+
+def test_a_request_whose_client_has_given_up_is_not_performed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A busy twin performed a reset seconds after the client had reported that no twin answers."""
+    called: list[str] = []
+
+    class Recorder:
+        def call(self, name: str, text: str | None) -> tuple[bool, str]:
+            called.append(name)
+            return True, ""
+
+    monkeypatch.setattr("plow_twin.live.control._PATIENCE_S", 0.05)
+    path = Path(tempfile.mkdtemp(dir="/tmp")) / "twin.socket"
+    with Control(path) as control:
+        control.services = cast(Services, Recorder())
+        with pytest.raises(ControlError, match="no twin answers"):
+            call(path, "reset")
+        control.turn()
+    path.parent.rmdir()
+    assert not called
 
 
 def test_files_with_dates_are_waited_for_and_followed_from_one_to_the_next(

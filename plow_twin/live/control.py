@@ -66,6 +66,8 @@ class Control:
                 data, client = self._socket.recvfrom(_LARGEST)
             except BlockingIOError:
                 return
+            if client and not _waits(client):
+                continue  # the client has reported that no twin answers
             done, message = self._answer(data)
             try:
                 self._socket.sendto(json.dumps({"success": done, "message": message}).encode(), client or b"")
@@ -108,5 +110,16 @@ def _answers(path: Path) -> bool:
         try:
             client.connect(str(path))
         except ConnectionRefusedError:
+            return False
+    return True
+
+
+def _waits(client: bytes | str) -> bool:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(client)
+        except PermissionError:
+            return True  # an open client is connected to the twin and accepts no other peer
+        except OSError:
             return False
     return True
