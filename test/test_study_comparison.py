@@ -31,7 +31,7 @@ from plow_twin.stream.journal import Parameter, Sample
 from plow_twin.study.comparison.change import Change, Drawn, changes, with_neighbours
 from plow_twin.study.comparison.compare import Comparison, by_time, compare
 from plow_twin.study.comparison.report import _figure
-from plow_twin.study.comparison.windows import QUANTITIES, windows_of
+from plow_twin.study.comparison.windows import _PADS, QUANTITIES, windows_of
 
 pytestmark = pytest.mark.usefixtures("without_workers")
 SECONDS = 8
@@ -75,6 +75,26 @@ def test_a_window_without_a_message_of_the_clearance_has_that_of_its_neighbours(
     windows = windows_of(read_recording(runs[0].folder), 0.05)
     scene = load_scene("paper").clearance
     np.testing.assert_allclose(windows.clearance, [[scene.horizontal_m, scene.vertical_m]] * len(windows.start_ns))
+
+
+def test_new_pads_are_no_negative_wear(runs: tuple[Run, Run], monkeypatch: pytest.MonkeyPatch) -> None:
+    """After `set_wear` the mean wear of a run was negative, and no pad of the run had a change of wear."""
+    recording = read_recording(runs[0].folder)
+    batches = type(recording).batches
+
+    def grown(self: Any, *names: str) -> Any:
+        for found in batches(self, *names):
+            if "clearance" in found:
+                part = found["clearance"]
+                run_s = (part.stamp_ns - BASE_NS) * 1e-9
+                values = part.values.copy()
+                values[:, _PADS] = np.where(run_s < 1.55, 1e-3 + run_s * 1e-6, run_s * 1e-6)[:, None]
+                found = {**found, "clearance": replace(part, values=values)}
+            yield found
+
+    monkeypatch.setattr(type(recording), "batches", grown)
+    wear = windows_of(recording, 1.0).pairs["wear"]
+    assert len(wear) > 1 and (wear > 2e-3).all() and (wear < 3.7e-3).all()
 
 
 def test_windows_with_a_stretch_without_samples_are_left_out_and_named(runs: tuple[Run, Run], tmp_path: Path) -> None:

@@ -143,7 +143,7 @@ class _RunSums:
         self.messages, self.clearance, self._clearance_count = _Sums(1), _Sums(2), _Sums(1)
         self._load, self._peak, self._moved = _Sums(3), _Sums(PAIR_COUNT), _Sums(2 * PAIR_COUNT)
         self._contact = _Sums(2 * PAIR_COUNT + 1)
-        #: First and last wear depth of the pads in each window.
+        #: Newest wear depth of the pads in each window, and its growth. New pads reduce the depth, not the growth.
         self._pads: dict[int, tuple[Array, Array]] = {}
         #: Cumulative number of impacts of each pair in the newest message.
         self._impacts: Array | None = None
@@ -167,7 +167,9 @@ class _RunSums:
             self._clearance_count.add(window, np.ones((len(window), 1)))
             for number in np.unique(window).tolist():
                 rows = part.values[window == number][:, _PADS]
-                self._pads[number] = (self._pads[number][0] if number in self._pads else rows[0], rows[-1])
+                newest, grown = self._pads.get(number, (rows[0], np.zeros(PAIR_COUNT)))
+                steps = np.diff(rows, axis=0, prepend=newest[None])
+                self._pads[number] = rows[-1], grown + np.maximum(steps, 0.0).sum(axis=0)
 
     def _add_peaks(self, part: Batched, window: Indexes) -> None:
         total, impulse, largest = np.split(part.values, 3, axis=1)
@@ -201,7 +203,7 @@ class _RunSums:
         """Return the windows `numbers`; `silent` is the number of windows that were left out."""
         seconds = self._window_ns * 1e-9
         sums, touched, squares = self._moved.of(numbers), self._contact.of(numbers), self._load.of(numbers)
-        pads = [self._pads.get(number, (0.0, np.zeros(PAIR_COUNT))) for number in numbers]
+        none = np.zeros(PAIR_COUNT)
         return Windows(
             np.array(numbers, np.int64) * self._window_ns,
             {
@@ -210,7 +212,7 @@ class _RunSums:
                 "in_contact": touched[:, PAIR_COUNT : 2 * PAIR_COUNT] / np.maximum(touched[:, -1:], 1.0),
                 "impulse": sums[:, PAIR_COUNT:] / seconds,
                 "dissipation": touched[:, :PAIR_COUNT] / seconds,
-                "wear": np.array([end - begin for begin, end in pads]) * 3600.0 / seconds,
+                "wear": np.array([self._pads.get(number, (none, none))[1] for number in numbers]) * 3600.0 / seconds,
             },
             np.sqrt(squares[:, :2] / np.maximum(squares[:, 2:], 1.0)),
             _between(self.clearance, self._clearance_count, numbers),
