@@ -143,8 +143,10 @@ class _RunSums:
         self.messages, self.clearance, self._clearance_count = _Sums(1), _Sums(2), _Sums(1)
         self._load, self._peak, self._moved = _Sums(3), _Sums(PAIR_COUNT), _Sums(2 * PAIR_COUNT)
         self._contact = _Sums(2 * PAIR_COUNT + 1)
-        #: Newest wear depth of the pads in each window, and its growth. New pads reduce the depth, not the growth.
-        self._pads: dict[int, tuple[Array, Array]] = {}
+        #: Growth of the wear depths. New pads reduce the depth, not the growth.
+        self._grown = _Sums(PAIR_COUNT)
+        #: Wear depths of the pads in the newest message.
+        self._depth: Array | None = None
         #: Cumulative number of impacts of each pair in the newest message.
         self._impacts: Array | None = None
         #: Stamp and values of the newest message of contact forces.
@@ -165,11 +167,10 @@ class _RunSums:
         else:
             self.clearance.add(window, part.values[:, _TOTALS])
             self._clearance_count.add(window, np.ones((len(window), 1)))
-            for number in np.unique(window).tolist():
-                rows = part.values[window == number][:, _PADS]
-                newest, grown = self._pads.get(number, (rows[0], np.zeros(PAIR_COUNT)))
-                steps = np.diff(rows, axis=0, prepend=newest[None])
-                self._pads[number] = rows[-1], grown + np.maximum(steps, 0.0).sum(axis=0)
+            depth = part.values[:, _PADS]
+            before = depth[:1] if self._depth is None else self._depth
+            self._grown.add(window, np.maximum(np.diff(depth, axis=0, prepend=before), 0.0))
+            self._depth = depth[-1:]
 
     def _add_peaks(self, part: Batched, window: Indexes) -> None:
         total, impulse, largest = np.split(part.values, 3, axis=1)
@@ -203,7 +204,6 @@ class _RunSums:
         """Return the windows `numbers`; `silent` is the number of windows that were left out."""
         seconds = self._window_ns * 1e-9
         sums, touched, squares = self._moved.of(numbers), self._contact.of(numbers), self._load.of(numbers)
-        none = np.zeros(PAIR_COUNT)
         return Windows(
             np.array(numbers, np.int64) * self._window_ns,
             {
@@ -212,7 +212,7 @@ class _RunSums:
                 "in_contact": touched[:, PAIR_COUNT : 2 * PAIR_COUNT] / np.maximum(touched[:, -1:], 1.0),
                 "impulse": sums[:, PAIR_COUNT:] / seconds,
                 "dissipation": touched[:, :PAIR_COUNT] / seconds,
-                "wear": np.array([self._pads.get(number, (none, none))[1] for number in numbers]) * 3600.0 / seconds,
+                "wear": self._grown.of(numbers) * 3600.0 / seconds,
             },
             np.sqrt(squares[:, :2] / np.maximum(squares[:, 2:], 1.0)),
             _between(self.clearance, self._clearance_count, numbers),
