@@ -220,7 +220,7 @@ def test_without_an_estimate_poses_leave_the_median_twin_alone(truth: Truth, bef
             live.published.clear()
         live.take(later(machine, begin if before == "nothing" else 1.5, end))
     followed, nominal = with_poses.column("force"), without.column("force")
-    assert with_poses.twin.poses_used > without.twin.poses_used + 100
+    assert with_poses.twin.poses.used > without.twin.poses.used + 100
     assert _error(followed, nominal) < 1e-9
     assert before != "nothing" or _error(followed, run.force[: len(followed)]) < 0.08
 
@@ -304,6 +304,9 @@ def test_late_samples_and_poses_end_in_the_bits_of_those_in_order_and_replay_giv
     again = _again(late.journal, truth.nominal)
     assert again.twin.digest() == late.twin.digest()
     assert again.following is not None and again.following.added == late.twin.added
+    # a pose that is used again after a late sample counts once
+    poses = late.twin.poses
+    assert again.following.poses == poses and 0 < poses.used + poses.outlying <= len(_poses(truth, 0.0, 2.0))
     assert _again(ordered.journal, truth.nominal, 1000).twin.digest() == ordered.twin.digest()
     force, expected = (one.session.twin.advance(one.twin.time).force for one in (late, ordered))
     assert force == pytest.approx(expected, rel=0.02, abs=2e3)
@@ -413,12 +416,15 @@ def test_a_restored_motion_goes_on_with_what_is_known_now(truth: Truth, wear: We
     assert _again(live.journal, live.session.twin.scene).twin.digest() == live.twin.digest()
 
 
-def test_counts_of_poses_go_on_with_other_numbers_of_the_model(truth: Truth) -> None:
+def test_counts_of_poses_go_on_with_other_numbers_of_the_model_and_with_a_restored_motion(truth: Truth) -> None:
     live = Live(truth.nominal)
+    start = live.session.snapshot()
     live.take(_in_turn(truth, 0.0, 0.5))
-    used = live.twin.poses_used
+    used = live.twin.poses.used
+    live.take([Restore(_stamp(0.5), start.data)])
+    assert live.twin.poses.used == used > 0
     live.take([OTHER])
-    assert live.twin.poses_used == used > 0
+    assert live.twin.poses.used == used
 
 
 def test_each_mark_has_a_digest_as_of_a_twin_that_does_not_follow(truth: Truth) -> None:
@@ -433,7 +439,7 @@ def test_a_locked_degree_of_freedom_is_not_moved_by_measurements(truth: Truth) -
     live = Live(locked)
     change = SetModel(_stamp(0.7), json.dumps({"clearance.horizontal_m": 0.020}))
     live.take([*_in_turn(truth, 0.0, 0.5), _known(truth), *_in_turn(truth, 0.5, 0.7)])
-    assert live.twin.poses_used > 10 and live.twin.drawn == 1
+    assert live.twin.poses.used > 10 and live.twin.drawn == 1
     live.take([change, *_in_turn(truth, 0.7, 0.8)])
     q = live.poses()
     assert q[:, [0, 2]] == pytest.approx(np.tile([0.004, 0.01], (MEMBERS, 1)), abs=1e-12) and np.ptp(q[:, 1]) > 0.0
@@ -445,7 +451,7 @@ def test_a_single_wrong_pose_moves_nothing(truth: Truth, wrong: tuple[float, flo
     live, other = Live(truth.nominal), Live(truth.nominal)
     for one, poses in ((live, [Pose(_stamp(0.505), wrong)]), (other, [])):
         one.take([*_in_turn(truth, 0.0, 0.505), *poses, *_in_turn(truth, 0.505, 0.6)])
-    assert live.twin.poses_outlying == 1 and live.twin.digest() == other.twin.digest()
+    assert live.twin.poses.outlying == 1 and live.twin.digest() == other.twin.digest()
     value, low, high = live.clearance().T
     assert (low < value).all() and (value < high).all()
 
@@ -460,14 +466,14 @@ def test_a_jump_of_the_head_is_followed_and_angles_are_equal_up_to_full_turns(tr
             else entry
             for entry in entries
         )
-    assert live.twin.poses_outlying == 0
+    assert live.twin.poses.outlying == 0
     assert live.column("force")[-1] == pytest.approx(other.column("force")[-1], rel=1e-3, abs=1e3)
-    used = live.twin.poses_used
+    used = live.twin.poses.used
     side = -0.012 * np.sign(live.poses()[0, 0])
     for index in range(20):
         begin = 1.0 + 0.01 * index
         live.take([Pose(_stamp(begin), (side, 0.0, 0.0)), *_samples(truth, begin, begin + 0.01)])
-    assert live.twin.poses_outlying >= 1 and live.twin.poses_used >= used + 10
+    assert live.twin.poses.outlying >= 1 and live.twin.poses.used >= used + 10
     assert np.median(live.poses()[:, 0]) == pytest.approx(side, abs=3e-3)
 
 
@@ -488,7 +494,7 @@ def test_waiting_poses_are_bounded_dropped_ones_counted_and_no_estimate_is_dropp
     # a late sample would need all of these poses, so they are stored while the load is silent
     live.take([Pose(_stamp(0.51) + 100_000 * index, (0.0, 0.0, 0.0)) for index in range(more)])
     assert live.session.poses_dropped == 2 + before + more - 10_000
-    assert live.twin.poses_dropped == more - 10_000
+    assert live.twin.poses.dropped == more - 10_000
     live.twin.add_estimate(_known(truth).result, 0.505)
     live.take(_samples(truth, 0.5, 0.52))
     assert live.twin.estimate is not None

@@ -42,7 +42,7 @@ from plow_twin.model.scene import Scene
 from plow_twin.run.advance import Advance
 from plow_twin.run.twin import Advanced
 from plow_twin.solve.state import ROW
-from plow_twin.stream.driven import MOST_MEASURED
+from plow_twin.stream.driven import MOST_MEASURED, PoseCounts
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
@@ -158,8 +158,7 @@ class Follower:
         self._ends, self._begins = _NO_DIGESTS, False
         self._span_start = start
         self._wrench = np.zeros(3)
-        #: numbers of poses that have moved the members, of outliers, and of poses dropped from a full queue
-        self.poses_used = self.poses_outlying = self.poses_dropped = 0
+        self.poses = PoseCounts()
         #: number of times that members were drawn, and model time in s of the latest draw from an estimate
         self.drawn, self._since = 0, start
         self._draw("", start, self._unworn())
@@ -236,8 +235,7 @@ class Follower:
         """Return a follower of a scene with the settings and the counters of this follower."""
         found = Follower(scene, self._members, tol=self.tol, seed=self._seed)
         found.every_row, found.defers = self.every_row, self.defers
-        found.poses_used, found.poses_outlying = self.poses_used, self.poses_outlying
-        found.poses_dropped = self.poses_dropped
+        found.poses = self.poses
         return found
 
     def warm_up(self) -> float:
@@ -404,7 +402,7 @@ class Follower:
             "due": self._due, "used": list(self._used), "speed": self._speed, "cell": self._cell,
             "span": self._span_start, "since": self._since, "worn": self._ensemble.worn_before.tolist(),
             "random": random, "outlying": self._ensemble.outlying, "range": self._range.tolist(),
-            "sizes": [len(blob) for blob in blobs],
+            "poses": self.poses, "sizes": [len(blob) for blob in blobs],
         }  # fmt: skip
         head = json.dumps(facts).encode()
         return b"".join([_LENGTH.pack(len(head)), head, *blobs])
@@ -428,7 +426,7 @@ class Follower:
             self.drawn, self._members = int(facts["drawn"]), int(facts["members"])
             self._draw(facts["estimate"], 0.0, worn)
         self.added, self._cell, self._span_start = int(facts["added"]), int(facts["cell"]), float(facts["span"])
-        self._since = float(facts["since"])
+        self._since, self.poses = float(facts["since"]), PoseCounts(*facts["poses"])
         self._due = [(float(when), int(number), measured) for when, number, measured in facts["due"]]
         self._used = deque(facts["used"])
         *own, noise, clearance, wrench = blobs
@@ -464,7 +462,7 @@ class Follower:
         elif isinstance(measured, str) or len(self._due) < _MOST_DUE:
             insort(self._due, (t, self.added, measured), key=lambda due: due[:2])
         else:
-            self.poses_dropped += 1
+            self.poses = self.poses._replace(dropped=self.poses.dropped + 1)
 
     def _use(self, t: float, measured: list[float] | str) -> None:
         if not isinstance(measured, str):
@@ -537,9 +535,9 @@ class Follower:
         if noise is not None:
             before = self._ensemble.outlying
             used = self._ensemble.correct(t - delay, q, noise, self._load_error())
-            self.poses_used += used
+            self.poses = self.poses._replace(used=self.poses.used + used)
             if not used and self._ensemble.outlying > before:
-                self.poses_outlying += 1
+                self.poses = self.poses._replace(outlying=self.poses.outlying + 1)
                 return
         if newest and np.isfinite(q).all():
             self._noise_rows.append(q)

@@ -399,9 +399,9 @@ class Health:
             "source": "prior" if follower.estimate is None else "estimate",
             "members": str(follower.members),
             "members_lost": str(follower.lost),
-            "poses_used": str(follower.poses_used),
-            "poses_outlying": str(follower.poses_outlying),
-            "poses_dropped": str(follower.poses_dropped + runtime.driver.session.poses_dropped),
+            "poses_used": str(follower.poses.used),
+            "poses_outlying": str(follower.poses.outlying),
+            "poses_dropped": str(follower.poses.dropped + runtime.driver.session.poses_dropped),
             "taken_over": str(follower.drawn),
             "reduced": str(int(reduced)),
         }

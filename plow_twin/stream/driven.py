@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final, Protocol, Self, runtime_checkable
+from typing import Any, Final, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,6 +53,17 @@ class Driven(Protocol):
     def digest(self) -> str: ...
 
 
+class PoseCounts(NamedTuple):
+    """Numbers of measured poses since the start of the run."""
+
+    #: poses that have moved the members
+    used: int = 0
+    #: poses that were ignored, because they are too far from their predictions
+    outlying: int = 0
+    #: poses dropped from a full queue
+    dropped: int = 0
+
+
 @runtime_checkable
 class Following(Driven, Protocol):
     """A twin that is corrected by measured poses and by estimates.
@@ -62,6 +73,8 @@ class Following(Driven, Protocol):
 
     #: number of poses and estimates added so far
     added: int
+    #: part of the snapshot, so that a pose counts once if the motion is computed again
+    poses: PoseCounts
     #: whether a row that is published alone is returned before its intervals are computed; `catch_up` computes them
     defers: bool
 

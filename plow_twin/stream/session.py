@@ -23,7 +23,7 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import check_travel_speed
 from plow_twin.solve.samples import model_times
 from plow_twin.stream import journal
-from plow_twin.stream.driven import MOST_MEASURED, Driven, Following
+from plow_twin.stream.driven import MOST_MEASURED, Driven, Following, PoseCounts
 from plow_twin.stream.history import History
 from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
 from plow_twin.stream.outputs import NONE, NOTHING, THE_ONE, Outputs, Published, Rows, Stock
@@ -665,9 +665,9 @@ class Session:
         """Restore the motion from a snapshot, but neither the wear nor changed numbers of the scene."""
         state = SessionState.unpack(data)
         twin_data, changes = self._split_changes(state.twin)
-        known, steered, origin_ns = "", False, self.origin_ns
+        known, steered, poses, origin_ns = "", False, PoseCounts(), self.origin_ns
         if self.following is not None:
-            known, steered = self.following.known, self.following.steered
+            known, steered, poses = self.following.known, self.following.steered, self.following.poses
         self._end_motion()
         if changes == self.changes and (state.wear_depth == self.wear_depth).all():
             self.twin.restore(twin_data)
@@ -679,6 +679,7 @@ class Session:
             if self.following.steered and not steered:  # too many twins for this computer
                 self.following.follow_parameters()
             self.following.follow_estimate(known, origin_ns)
+            self.following.poses = poses
         if self._wears:
             self.twin.set_travel_speed(self._speed)
 
