@@ -141,7 +141,7 @@ def test_a_difference_that_explains_the_residuals_is_found_and_the_interval_hold
     truth = mismatched(KINDS[name], 84001)
     result = estimate(truth.nominal, truth.load, truth.poses)
     share, by, _ = result.differs[quantity]
-    assert share > 0.7 and abs(by) == pytest.approx(size, rel=0.35)
+    assert share > 0.5 and abs(by) == pytest.approx(size, rel=0.45)
     for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):
         assert abs(value.mean - true) < min(value.deviation, 1e-4)
 
