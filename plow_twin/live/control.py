@@ -41,7 +41,7 @@ class Control:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
-            if path.is_socket() and not _answers(path):
+            if path.is_socket() and not _is_open(str(path)):
                 path.unlink()
             before = os.umask(0o177)
             try:
@@ -105,21 +105,19 @@ def call(path: Path, service: str, text: str | None = None) -> tuple[bool, str]:
     return bool(answer["success"]), str(answer["message"])
 
 
-def _answers(path: Path) -> bool:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
+def _is_open(address: bytes | str) -> bool:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
         try:
-            client.connect(str(path))
+            probe.connect(address)
         except ConnectionRefusedError:
             return False
     return True
 
 
 def _waits(client: bytes | str) -> bool:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(client)
-        except PermissionError:
-            return True  # an open client is connected to the twin and accepts no other peer
-        except OSError:
-            return False
-    return True
+    try:
+        return _is_open(client)
+    except PermissionError:
+        return True  # an open client is connected to the twin and accepts no other peer
+    except OSError:
+        return False
