@@ -23,7 +23,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 
 from plow_twin.demo.comparison import COMPARED_S, Comparison, compare_forces
-from plow_twin.demo.run_summary import SENSES, RunSummary, corner_letters, summarise
+from plow_twin.demo.run_summary import SENSES, RunSummary, summarise
 from plow_twin.errors import PlowTwinError
 from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, PAIR_NAMES, corner_of
 from plow_twin.model.scene import Mark, Provenance, Wear
@@ -385,7 +385,7 @@ def _print_comparison(console: Console, beside: Comparison) -> None:
 
 def _force_table(summary: RunSummary) -> Table:
     table = Table(title="Contact forces in kN: largest, mean in contact, makes")
-    letters = corner_letters(summary.scene)
+    letters = summary.scene.frame.corner_labels
     table.add_column("corner", no_wrap=True)
     for sense in SENSES:
         for column in ("max", "mean", "makes"):

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, STOPS_COUNTER_CLOCKWISE, corner_of
+from plow_twin.model.pairs import PAIR_COUNT, STOPS_COUNTER_CLOCKWISE, corner_of
 from plow_twin.model.scene import Scene
 from plow_twin.record.estimated import left_by
 from plow_twin.record.reader import RunReader
@@ -46,11 +46,6 @@ class RunSummary:
     estimate: dict[str, Any] | None = None
 
 
-def corner_letters(scene: Scene) -> dict[str, str]:
-    """Return the letter of each corner, or its name if it has no letter."""
-    return {corner: scene.frame.letters.get(corner, corner) for corner in CORNER_NAMES}
-
-
 def summarise(path: Path) -> RunSummary:
     """Return the summary of a recording. Raise `RecordingError` if the file is not a recording."""
     recording = read_recording(path)
@@ -68,7 +63,7 @@ def summarise(path: Path) -> RunSummary:
         largest.max(axis=0, initial=0.0),
         mean,
         makes[-1] if len(makes) else np.zeros(PAIR_COUNT),
-        {sense: _shares(forces, mask, corner_letters(recording.scene)) for sense, mask in SENSES.items()},
+        {sense: _shares(forces, mask, recording.scene.frame.corner_labels) for sense, mask in SENSES.items()},
         {
             name: (clearance[name], clearance[f"{name}/p05"], clearance[f"{name}/p95"])
             for name in ("horizontal", "vertical")

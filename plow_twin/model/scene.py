@@ -121,6 +121,12 @@ class Frame:
         """Letter of each corner that has one."""
         return {corner: letter for letter, corner in self.labels.items()}
 
+    @property
+    def corner_labels(self) -> dict[str, str]:
+        """Letter of each corner, or its name if it has no letter."""
+        letters = self.letters
+        return {corner: letters.get(corner, corner) for corner in CORNER_NAMES}
+
 
 @dataclass(frozen=True)
 class Clearance:

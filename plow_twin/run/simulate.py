@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import ArgumentError, LimitError, RunInterrupted, SolverError, ToleranceWarning
-from plow_twin.model.pairs import CORNER_NAMES, PAIR_NAMES
+from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.run.energy_balance import EnergyBalance, energy_balance_of
 from plow_twin.run.motion import BUDGET, Motion, run_events, run_fixed
@@ -376,7 +376,7 @@ def statistics_of(totals: Totals, duration: float) -> dict[str, dict[str, float]
 
 def contact_sets_of(scene: Scene, totals: Totals) -> dict[str, dict[str, float]]:
     """Return the shares of contact time, as in `Result.contact_sets`, in descending order."""
-    labels = [scene.frame.letters.get(corner, corner) for corner in CORNER_NAMES]
+    labels = list(scene.frame.corner_labels.values())
     joint = "" if scene.frame.labels else "+"
     senses = {}
     # the force of a pair turns a block and a cavity in opposite senses

@@ -107,7 +107,7 @@ def statistic(scene: Scene, path: str) -> Statistic:
     head, _, last = path.rpartition(".")
     key = path if path in known else f"{head}.{''.join(sorted(last))}"
     if key not in known:
-        kinds = ", ".join(f"{name}.ccw.{_labels(scene)[0]}" for name in _OF_PAIRS)
+        kinds = ", ".join(f"{name}.ccw.{scene.frame.corner_labels[CORNER_NAMES[0]]}" for name in _OF_PAIRS)
         raise StudyError(
             f"statistic: got {path!r}, expected e.g. {kinds}, max.{PAIR_NAMES[0]}, contact_sets.ccw.<corners>, "
             f"contact_set_time.ccw.<corners>, contact_points.ccw.2, events, steps{nearest_of(path, known)}"
@@ -120,17 +120,13 @@ def unit_of(path: str) -> str:
     return UNITS[path.partition(".")[0]]
 
 
-def _labels(scene: Scene) -> list[str]:
-    return [scene.frame.letters.get(corner, corner) for corner in CORNER_NAMES]
-
-
 def _groups(scene: Scene) -> dict[str, list[int]]:
     """Return the pairs of each group. The key is the end of a path: empty for all pairs, or e.g. `.ccw`, `.ccw.a`."""
     ccw = [pair for pair in range(8) if STOPS_COUNTER_CLOCKWISE[pair]]
     cw = [pair for pair in range(8) if not STOPS_COUNTER_CLOCKWISE[pair]]
     groups: dict[str, list[int]] = {"": list(range(8)), ".ccw": ccw, ".cw": cw}
     groups |= {f".{name}": [pair] for pair, name in enumerate(PAIR_NAMES)}
-    for corner, label in enumerate(_labels(scene)):
+    for corner, label in enumerate(scene.frame.corner_labels.values()):
         both = [2 * corner, 2 * corner + 1]
         for name in {label, CORNER_NAMES[corner]}:
             groups[f".{name}"] = both
@@ -140,7 +136,7 @@ def _groups(scene: Scene) -> dict[str, list[int]]:
 
 
 def _sets(scene: Scene) -> dict[str, int]:
-    labels = _labels(scene)
+    labels = list(scene.frame.corner_labels.values())
     joint = "" if scene.frame.labels else "+"
     return {
         joint.join(sorted(labels[i] for i in corners)): sum(1 << i for i in corners)
