@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 import subprocess
 import threading
 import time
@@ -21,7 +22,10 @@ from test_live import Live, _csv, _free_port, _live
 from test_mqtt import STALE, _entries
 
 from plow_twin.stream.journal import Parameter
+from plow_twin.telemetry.access import AccessError, Credentials, influx_out, opcua_out
+from plow_twin.telemetry.influx import Influx
 from plow_twin.telemetry.opcua.model import NAMESPACE
+from plow_twin.telemetry.values import Group, Newest
 
 
 class Heard:
@@ -220,3 +224,44 @@ def test_influxdb_gets_lines_also_from_the_time_while_it_was_down(tmp_path: Path
     assert "horizontal=0.025," in fields and "horizontal/p05=" in fields
     assert int(stamp) == 1_000_000_000 + 499 * 1_000_000  # the time of the last sample
     assert any('stream="running"' in line for line in lines if line.startswith("plow_twin_flags"))
+
+
+def test_points_that_a_silent_or_absurd_database_has_not_confirmed_count_as_lost() -> None:
+    groups = {"peaks": Group(1.0, {"top_left_top": 1.0}), "wear": Group(1.0, {"top_left_top": 1.0})}
+
+    async def write(port: int) -> Any:
+        way = Influx(f"http://127.0.0.1:{port}", "mine", "face", "a-token", None)
+        await way.send(groups, Newest())
+        await way.turn()  # does not wait for the answer
+        await asyncio.sleep(0.2)
+        await way.close(0.2)
+        return way.state
+
+    for answer, said in (
+        (b"", "no connection yet"),
+        (b"HTTP/1.1 500 x\r\nContent-Length: %d\r\n\r\n" % 2**60, "Memory"),
+    ):
+        with socket.create_server(("127.0.0.1", 0)) as listening:
+            threading.Thread(target=_answer, args=(listening, answer), daemon=True).start()
+            state = asyncio.run(write(listening.getsockname()[1]))
+        assert (state.sent, state.lost, state.connected) == (0, 2, False) and said in state.trouble
+
+
+def _answer(listening: socket.socket, answer: bytes) -> None:
+    connection, _ = listening.accept()
+    with connection:
+        connection.recv(65536)
+        connection.sendall(answer)
+        time.sleep(1.0)
+
+
+def test_an_ipv6_address_keeps_its_brackets_and_a_bad_token_is_refused_unseen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PLOW_TWIN_INFLUX_TOKEN", "a-token")
+    assert influx_out("http://[::1]:8086/mine/face", Credentials(), plain=False).first["url"] == "http://[::1]:8086"
+    served = opcua_out("opc.tcp://[::1]:4841", Credentials(), plain=False, acknowledges=False)
+    assert served.address == served.first["endpoint"] == "opc.tcp://[::1]:4841"
+    for token in ("t\N{EURO SIGN}ken", "a-token\n"):
+        monkeypatch.setenv("PLOW_TWIN_INFLUX_TOKEN", token)
+        with pytest.raises(AccessError) as caught:
+            influx_out("http://localhost/mine/face", Credentials(), plain=False)
+        assert token.strip() not in str(caught.value)

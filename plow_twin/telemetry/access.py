@@ -105,7 +105,7 @@ def mqtt_out(url: str, credentials: Credentials, *, plain: bool, sparkplug: str 
     host, port, prefix, tls = _address("--mqtt-out", url, ("mqtt", "mqtts"), expected, plain=plain)
     if not (prefix or sparkplug) or re.search(_NO_TOPIC, prefix):
         raise AccessError("--mqtt-out", url, f"{expected}, the prefix without + and #")
-    address = f"{'mqtts' if tls else 'mqtt'}://{host}:{port}"
+    address = f"{'mqtts' if tls else 'mqtt'}://{_in_url(host)}:{port}"
     options = _broker_options(host, port, credentials, tls=tls)
     client_id, ways = options["client_id"], []
     if prefix:
@@ -126,13 +126,16 @@ def influx_out(url: str, credentials: Credentials, *, plain: bool) -> WayOut:
     org, _, bucket = path.partition("/")
     if not (org and bucket):
         raise AccessError("--influx", url, expected)
-    server = f"{'https' if encrypted else 'http'}://{host}:{port}"
+    server = f"{'https' if encrypted else 'http'}://{_in_url(host)}:{port}"
+    token = credentials.secret("influx", "token_file", "INFLUX_TOKEN")
+    if not (token.isascii() and token.isprintable()):  # the message must not contain the token
+        raise AccessError("the token of influx", f"{len(token)} characters", "ASCII, without line breaks")
     first = {
         "way": "influx",
         "url": server,
         "org": org,
         "bucket": bucket,
-        "token": credentials.secret("influx", "token_file", "INFLUX_TOKEN"),
+        "token": token,
         "ca": credentials.file("influx", "ca"),
     }
     return WayOut("influx", f"{server}/{org}/{bucket}", ("influxdb_client",), first)
@@ -150,7 +153,7 @@ def opcua_out(url: str, credentials: Credentials, *, plain: bool, acknowledges: 
         raise AccessError("--opcua", url, expected)
     if not (encrypted or plain or is_loopback(host)):
         raise AccessError("--opcua", url, "certificate and key in --out-access for other machines, or --plain")
-    address = f"opc.tcp://{host}:{port}"
+    address = f"opc.tcp://{_in_url(host)}:{port}"
     first = {
         "way": "opcua",
         "endpoint": address,
@@ -160,6 +163,10 @@ def opcua_out(url: str, credentials: Credentials, *, plain: bool, acknowledges: 
         **files,
     }
     return WayOut("opcua_out", address, ("asyncua",), first, may_acknowledge=acknowledges)
+
+
+def _in_url(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
 
 
 def _broker_options(host: str, port: int, credentials: Credentials, *, tls: bool) -> dict[str, Any]:

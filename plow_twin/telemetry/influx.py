@@ -9,8 +9,6 @@ from typing import Any, Final
 
 from influxdb_client import InfluxDBClient, Point, WritePrecision
 from influxdb_client.client.write_api import SYNCHRONOUS
-from influxdb_client.rest import ApiException
-from urllib3.exceptions import HTTPError
 
 from plow_twin.dashboard.link import Link
 from plow_twin.telemetry.values import Group, Newest
@@ -37,6 +35,9 @@ class Influx:
         self._client = InfluxDBClient(url, token, org=org, timeout=_ANSWER_MS, ssl_ca_cert=ca, enable_gzip=False)
         self._write, self._bucket = self._client.write_api(SYNCHRONOUS), bucket
         self._waiting: deque[str] = deque()
+        #: lines of the present request, and the task that writes them
+        self._asked: list[str] = []
+        self._writing: asyncio.Task[None] | None = None
         self._wait_s, self._again_s = 0.0, 0.0
 
     async def open(self, link: Link, newest: Newest) -> None:
@@ -48,45 +49,54 @@ class Influx:
             line = line_of(name, group, str(newest.facts.get("head", "")))
             if line:
                 self._waiting.append(line)
-        while len(self._waiting) > _WAITING:
-            self._waiting.popleft()
-            self.state.lost += 1
+        self._limit()
 
     async def turn(self) -> None:
-        """Write the queued lines, unless the wait after a failed attempt has not ended."""
-        while self._waiting and time.monotonic() >= self._again_s:
-            lines = [self._waiting[index] for index in range(min(len(self._waiting), _AT_ONCE))]
-            try:
-                await asyncio.to_thread(self._write.write, self._bucket, record="\n".join(lines))
-            except (ApiException, HTTPError, OSError) as error:
-                self._fail(error, len(lines))
-                return
-            self._drop(len(lines))
-            self.state.sent += len(lines)
-            self.state.connected, self.state.trouble, self._wait_s = True, "", 0.0
+        """Write the queued lines in the background, because a database may take long to answer."""
+        if self._writing is None or self._writing.done():
+            self._writing = asyncio.create_task(self._write_all())
 
     async def close(self, patience_s: float) -> None:
-        """Try to write the queued lines one last time. Lines that cannot be written are counted as lost."""
-        if self.state.connected and patience_s:
+        """Try to write the queued lines one last time. Lines that are not written in time are counted as lost."""
+        if patience_s:
             await self.turn()
-        self.state.lost += len(self._waiting)
+        if self._writing is not None:
+            await asyncio.wait([self._writing], timeout=patience_s)
+        self.state.lost += len(self._waiting) + len(self._asked)
         self._client.close()
 
-    def _fail(self, error: Any, count: int) -> None:
+    async def _write_all(self) -> None:
+        """Write the queued lines, unless the wait after a failed attempt has not ended."""
+        while self._waiting and time.monotonic() >= self._again_s:
+            self._asked = [self._waiting.popleft() for _ in range(min(len(self._waiting), _AT_ONCE))]
+            try:
+                await asyncio.to_thread(self._write.write, self._bucket, record="\n".join(self._asked))
+            except Exception as error:  # the type depends on the answer of the database
+                self._fail(error)
+            else:
+                self.state.sent += len(self._asked)
+                self.state.connected, self.state.trouble, self._wait_s = True, "", 0.0
+                self._asked = []
+
+    def _fail(self, error: Any) -> None:
         """Record a failure; drop the lines if the database has rejected their content."""
         self.state.connected = False
         status = getattr(error, "status", None)
-        reason = f"{status} {error.reason}" if status else str(error)
+        reason = f"{status} {error.reason}" if status else str(error) or type(error).__name__
         self.state.trouble = f"not written: {reason}"[:300]
+        asked, self._asked = self._asked, []
         if status in (400, 413, 422):
-            self._drop(count)
-            self.state.lost += count
+            self.state.lost += len(asked)
+        else:
+            self._waiting.extendleft(reversed(asked))
+            self._limit()
         self._wait_s = min(max(2.0 * self._wait_s, _FIRST_WAIT_S), _LONGEST_WAIT_S)
         self._again_s = time.monotonic() + self._wait_s
 
-    def _drop(self, count: int) -> None:
-        for _ in range(count):
+    def _limit(self) -> None:
+        while len(self._waiting) + len(self._asked) > _WAITING:
             self._waiting.popleft()
+            self.state.lost += 1
 
 
 def line_of(name: str, group: Group, head: str) -> str:
