@@ -22,6 +22,7 @@ MS = NS_PER_S // 1000
         (T0 + MS, -math.inf, T0, Verdict.NON_FINITE),
         (0, 1.0, T0, Verdict.UNSTAMPED),
         (-MS, 1.0, T0, Verdict.UNSTAMPED),
+        (2**31 * NS_PER_S, 1.0, T0, Verdict.UNSTAMPED),
         (T0, 1.0, T0, Verdict.DUPLICATE),
         (T0, 1.0, T0 + 5 * MS, Verdict.DUPLICATE),
         (T0 - MS, 1.0, T0, Verdict.OUT_OF_ORDER),

@@ -46,7 +46,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "queue_wait_ms": "longest wait in the input queue [ms]",
         "messages_lost": "messages of all inputs that never arrived",
         "dropped_non_finite": "samples with a number that is not finite",
-        "dropped_unstamped": "samples whose stamp is zero or negative",
+        "dropped_unstamped": "samples whose stamp is zero, negative or after January 2038",
         "dropped_duplicate": "samples with the stamp of another sample",
         "dropped_out_of_order": "samples older than the newest sample by more than rollback_span",
         "dropped_late": "samples older than the oldest stored state",

@@ -194,6 +194,11 @@ class BridgeFront:
                 f"{counts[Verdict.DUPLICATE]} samples have the stamp or number of another sample: "
                 "do the times have too few digits?"
             )
+        if counts[Verdict.UNSTAMPED]:
+            found.append(
+                f"{counts[Verdict.UNSTAMPED]} samples have a time that is zero, negative or after January 2038: "
+                "check the unit of the time, or set clock_offset"
+            )
         if counts[Verdict.NON_FINITE] > many:
             found.append(f"{counts[Verdict.NON_FINITE]} loads have a number that is not finite (nan or inf)")
         if counts[Verdict.IMPLAUSIBLE] > many:

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from plow_twin.stream.limits import Limits
 
 NS_PER_S = 1_000_000_000
+#: First stamp that no message can contain, because the seconds of a ROS message have 32 bits (in the year 2038).
+_END_NS = 2**31 * NS_PER_S
 
 
 class KnownStamps(Protocol):
@@ -168,7 +170,7 @@ class Intake:
     def jumps(self, stamp_ns: int, reached_ns: int | None = None) -> bool:
         """Return whether `judge` would treat a stamp as a jump."""
         newest_ns = self._newest_ns if self._newest_ns is not None else reached_ns
-        if newest_ns is None or stamp_ns <= 0:
+        if newest_ns is None or not 0 < stamp_ns < _END_NS:
             return False
         return not self.near(stamp_ns, newest_ns, reached_ns)
 
@@ -217,7 +219,7 @@ class Intake:
     ) -> Verdict:
         if not all(map(math.isfinite, values)):
             return Verdict.NON_FINITE
-        if stamp_ns <= 0:
+        if not 0 < stamp_ns < _END_NS:
             return Verdict.UNSTAMPED
         if self.limits is not None and self.limits.exceeded(values):
             return Verdict.IMPLAUSIBLE
