@@ -215,6 +215,7 @@ class Feeder:
             self._counts = True
             if self._number:  # the earlier messages had no numbers
                 self._begin_anew()
+            self._number = number - 1
         elif number == self._odd:
             return self._name, number, True
         elif self._goes_on(number):
