@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
 from typing import Any, cast
+from urllib.error import URLError
 from urllib.request import urlopen
 
 import forge
@@ -294,6 +295,7 @@ def test_the_senders_own_numbers_show_loss_repetition_and_a_new_start(tmp_path: 
     ("numbers", "lost"),
     [
         *((["1", "2", *map(str, range(3, 150)), stray, *map(str, range(151, 301))], 0) for stray in STRAY),
+        ([*map(str, range(150)), *map(str, range(150))], 0),  # from 0, with a new start
         # jumps after which the numbers continue: back to a new count, ahead, and ahead by too much for a loss
         ([*map(str, range(2000, 2150)), *map(str, range(2, 150))], 1),
         ([*map(str, range(1, 150)), *map(str, range(5000, 5150))], 4850),
@@ -800,9 +802,17 @@ def test_a_wrong_call_names_the_expectation(
 
 def test_prometheus_reads_the_numbers_of_the_diagnostics(tmp_path: Path) -> None:
     path, port = _csv(tmp_path / "load.csv", 100), _free_port()
+    url, first = f"http://127.0.0.1:{port}/metrics", b""
     with _live(str(path), "--follow", "--metrics", str(port), "--set", "excitation_timeout=3600") as live:
+        give_up = time.monotonic() + 120.0
+        while not first:
+            with suppress(URLError), urlopen(url, timeout=30.0) as page:
+                first = page.read()
+                assert b"plow_twin_state_level" in first  # already in the first answer
+            assert time.monotonic() < give_up
+            time.sleep(0.02)
         live.until_count("samples_used", 100)
-        with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=30.0) as page:
+        with urlopen(url, timeout=30.0) as page:
             found = dict(line.split() for line in page.read().decode().splitlines() if not line.startswith("#"))
         assert (found["plow_twin_input_samples_used"], found["plow_twin_state_level"]) == ("100.0", "0.0")
         assert "plow_twin_state_scene" not in found  # texts are not exported
@@ -815,8 +825,7 @@ def test_prometheus_reads_the_numbers_of_the_diagnostics(tmp_path: Path) -> None
 
 def test_readers_of_metrics_that_ask_nothing_are_bounded() -> None:
     port = _free_port()
-    with Metrics(port) as metrics, ExitStack() as opened:
-        metrics.update("state", (0, "", {"model_time_s": "1.5"}))
+    with Metrics(port, {"state": (0, "", {"model_time_s": "1.5"})}), ExitStack() as opened:
         idle = [opened.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(40)]
         closed: list[socket.socket] = []
         while len(closed) < 24:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,9 +29,8 @@ from plow_twin.cli.telemetry import telemetry_options, ways_of
 if TYPE_CHECKING:
     from plow_twin.live.bridge.access import Access
     from plow_twin.live.bridge.source import Bridge
-    from plow_twin.live.front import BridgeFront, Say
+    from plow_twin.live.front import BridgeFront
     from plow_twin.live.parameters import Settings
-    from plow_twin.live.part import Part
     from plow_twin.live.stop import StopSignals
 
 _PROGRESS_S = 0.2
@@ -127,11 +126,16 @@ def _live(
         with busy("preparing the solver", quiet or not error_console().is_terminal):
             prepared = Preparation(settings).result(lambda: stop.stopped)
 
-        with report, ExitStack() as opened:
+        with report, closing(bridge), ExitStack() as opened:
             control = opened.enter_context(Control(options["control"])) if options["control"] else None
-            say = _also_metrics(report.say, options["metrics"], opened)
-            front = BridgeFront(bridge, options["mapping"], settings, prepared, say, report.error, options["units"])
+            front = BridgeFront(
+                bridge, options["mapping"], settings, prepared, report.say, report.error, options["units"]
+            )
             _say_what_differs(front, settings)
+            if options["metrics"]:
+                from plow_twin.live.metrics import Metrics
+
+                front.attach(opened.enter_context(Metrics(options["metrics"], front.parts())))
             if control is not None:
                 control.services = Services(front.runtime, front.changed)
                 front.timers.append(Timer(TURN_S, control.turn))
@@ -187,20 +191,6 @@ def _say_pace(settings: Settings, quiet: bool) -> None:
             f"plow-twin: {settings.follow_members} twins follow the machine, which takes about as long as the "
             "measurement of the file; --set follow=parameters is faster, but gives no intervals of the forces"
         )
-
-
-def _also_metrics(say: Say, port: int | None, opened: ExitStack) -> Say:
-    if port is None:
-        return say
-    from plow_twin.live.metrics import Metrics
-
-    metrics = opened.enter_context(Metrics(port))
-
-    def both(name: str, part: Part) -> None:
-        metrics.update(name, part)
-        say(name, part)
-
-    return both
 
 
 def _show_estimate(front: BridgeFront) -> None:

@@ -17,6 +17,8 @@ from plow_twin.live.part import Part, number_of
 if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric
 
+    from plow_twin.stream.outputs import Published
+
 _OTHER: Final = re.compile(r"[^a-zA-Z0-9_]")
 _READERS: Final = 16
 _PATIENCE_S: Final = 10.0
@@ -29,11 +31,12 @@ class MetricsError(PlowTwinError):
 class Metrics:
     """Context manager that serves the page `http://127.0.0.1:PORT/metrics`, which Prometheus reads.
 
-    Each number in the last report is a gauge with the name `plow_twin_<part>_<key>`. Texts in the report are omitted.
+    The page shows `parts` until the twin sends reports. Each number in the last report is a gauge with the name
+    `plow_twin_<part>_<key>`. Texts in the report are omitted.
     """
 
-    def __init__(self, port: int) -> None:
-        self._parts: Mapping[str, Part] = {}
+    def __init__(self, port: int, parts: Mapping[str, Part]) -> None:
+        self._parts = parts
         registry = CollectorRegistry()
         registry.register(self)
         try:
@@ -50,7 +53,10 @@ class Metrics:
         self._server.server_close()
         self._thread.join()
 
-    def update(self, name: str, part: Part) -> None:
+    def publication(self, published: Published) -> None:
+        """Do nothing, because the diagnostics contain no motion."""
+
+    def part(self, name: str, part: Part) -> None:
         """Replace a part of the diagnostics."""
         self._parts = {**self._parts, name: part}
 
