@@ -90,7 +90,8 @@ setup(
         # the model and its solver use these three alone
         "numpy>=1.26",
         "scipy>=1.11",
-        "numba>=0.59",
+        # bounded, for kernel/linked.py and kernel/compiler.py use parts of numba that may change in any version
+        "numba>=0.59,<0.69",
         # scene files and the command line
         "click>=8.1",
         "jsonschema>=4.10",
