@@ -20,7 +20,7 @@ from record_support import BASE_NS, STEP_NS, paper_sample, record_run
 from rosbags.rosbag2 import StoragePlugin, Writer
 from scenes import ROOT
 
-from plow_twin import Initial, Wear
+from plow_twin import Initial, Support, Wear
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.bag import BagWriter, Topic
@@ -35,7 +35,7 @@ from plow_twin.stream.journal import Entry, Pose, Restore, SetModel, Travel
 from plow_twin.stream.session import Session
 from plow_twin.study.analysis import loads, thinned
 from plow_twin.study.analysis.analyse import Analysis, analyse
-from plow_twin.study.analysis.loads import reversals
+from plow_twin.study.analysis.loads import LoadTotals, reversals
 from plow_twin.study.analysis.report import _write_tables, write_report
 from plow_twin.study.analysis.signals import LARGEST_LAG_S, compare
 
@@ -254,7 +254,8 @@ def test_travel_makes_passes_of_the_face(tmp_path: Path) -> None:
         stream.write("t,fx,fy,m\n")
         stream.writelines(f"{t},{w[0]},{w[1]},{w[2]}\n" for t, w in zip(motion()[0], motion()[1], strict=True))
     (tmp_path / "travel.csv").write_text("t,speed\n0.5,2.0\n4.0,-2.0\n")
-    worn = replace(load_scene(PAPER), wear=Wear(1e-12, 0.015, 0.0, pad_length_m=0.3))
+    wear = Wear(1e-12, 0.015, 0.0, pad_length_m=0.3)
+    worn = replace(load_scene(PAPER), wear=wear)
     (scene := tmp_path / "worn.yaml").write_text(dump_scene(worn))
     prediction = analyse(tmp_path, scene=scene, out=tmp_path / "out").predictions[0]
     loads = prediction.loads
@@ -280,6 +281,16 @@ def test_travel_makes_passes_of_the_face(tmp_path: Path) -> None:
     _write_tables(prediction, tmp_path, "")
     table = parquet.read_table(tmp_path / "slide_wear.parquet")
     assert table.num_rows == len(loads.slide_wear)
+
+    # without measured speeds, the head travels at the speed in the scene
+    (alone := tmp_path / "alone").mkdir()
+    (tmp_path / "load.csv").rename(alone / "load.csv")
+    scene.write_text(dump_scene(replace(worn, wear=replace(wear, travel_speed_m_s=2.0))))
+    prediction = analyse(alone, scene=scene).predictions[0]
+    only = prediction.loads
+    assert [item.end_m for item in only.passes] == [pytest.approx(2.0 * only.duration_s)]
+    assert only.pad_wear[0] == pytest.approx(prediction.clearance.series()[1][-1][2:10], rel=0.03)
+    assert only.slide_wear and not only.pad_wear[1].any()
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.0203, -0.4])
@@ -387,6 +398,8 @@ def test_energy_stored_where_a_recording_begins_is_no_gain_of_the_contacts(tmp_p
     (tmp_path / "load.csv").write_text("t,fx,fy,m\n" + "".join(f"{0.002 * n},0,0,0\n" for n in range(200)))
     loads = analyse(tmp_path).predictions[0].loads
     assert loads.impulse.any() and loads.contact_loss_j == pytest.approx(0.0, abs=1e-3)
+    on_springs = replace(scene, support=Support(1e3, 1e2, 1e7, 1e7, 1e6))  # takes energy that the motion does not show
+    assert LoadTotals(on_springs).facts()["contact_loss_j"] is None
 
 
 @pytest.mark.parametrize(

@@ -83,10 +83,9 @@ class Feed:
     def _add(self, name: str, stamp_ns: int, values: dict[str, float], log_time_ns: int) -> None:
         if name == "travel":
             speed = values["speed"]
-            if math.isfinite(speed) and speed != self.walkers[0].speed_m_s:
+            if math.isfinite(speed) and any(speed != walker.session.travel_speed_m_s for walker in self.walkers):
                 self.flush()
                 for walker in self.walkers:
-                    walker.speed_m_s = speed
                     # a new speed takes effect at the stamp of the newest sample
                     walker.apply(Travel(self._reached_ns or 0, speed), max(0, log_time_ns))
         elif name == "excitation":

@@ -80,7 +80,6 @@ class Walker:
         self._log_time_ns = 0
         self.failures = 0
         self.on_reset: Callable[[], object] = lambda: None
-        self.speed_m_s = 0.0
         self._opening: journal.Snapshot | None = session.snapshot()
 
     def _open(self, log_time_ns: int) -> None:
@@ -114,7 +113,7 @@ class Walker:
         count = len(stamp_ns)
         numbers = self._advances + 1 + np.arange(count)
         marks = 1 + np.flatnonzero(numbers % DIGEST_INTERVAL == 0)
-        before = self.session.outputs.makes
+        before, speed = self.session.outputs.makes, self.session.travel_speed_m_s
         done = self.session.advance(stamp_ns, wrench, np.zeros(count, ROW), np.arange(count), marks)
         self._advances += count
         self.failures += done.failed
@@ -123,7 +122,7 @@ class Walker:
         rows = AdvanceSeries(done.rows)
         makes = np.diff(rows.makes, axis=0, prepend=before[None])
         scene = self.session.twin.scene
-        self._on_walked(Walked(stamp_ns, wrench, rows, done.published, makes, self.speed_m_s, scene))
+        self._on_walked(Walked(stamp_ns, wrench, rows, done.published, makes, speed, scene))
         if count >= _FAILURE_LIMIT and rows.status[-_FAILURE_LIMIT:].all():
             self.apply(journal.Reset(int(stamp_ns[-1]), f"{_FAILURE_LIMIT} failed advances"), int(log_ns[-1]))
 
@@ -218,7 +217,6 @@ class JournalWalk:
 
     def _speed(self, speed_m_s: float) -> None:
         for walker in self._all:
-            walker.speed_m_s = speed_m_s
             # if the stamp of the speed has already been reached, the speed takes effect immediately
             walker.apply(journal.Travel(max(0, self._reached_ns), speed_m_s))
 

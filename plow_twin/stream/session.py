@@ -156,7 +156,7 @@ class Session:
         self._largest_error_m = 0.0
         self.held = False
         self._wears = scene.wear is not None and scene.wear.coefficient_m2_n != 0.0
-        self._speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
+        self.travel_speed_m_s = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
         self._travels: list[journal.Travel] = []
         #: function that emits an entry; called by others only for an entry that does not change the motion
         self.emit = on_entry
@@ -389,8 +389,8 @@ class Session:
     def snapshot(self) -> journal.Snapshot:
         """Return the exact state of the twin, the outputs and the session."""
         state = SessionState(
-            self.origin_ns, self.stamp_ns, self._advances, self.held, self._speed, self._travels, self.wear_depth,
-            self.outputs.state(), with_changes(self.twin.snapshot(), self.changes),
+            self.origin_ns, self.stamp_ns, self._advances, self.held, self.travel_speed_m_s, self._travels,
+            self.wear_depth, self.outputs.state(), with_changes(self.twin.snapshot(), self.changes),
         )  # fmt: skip
         stamp_ns = self.stamp_ns if self.stamp_ns is not None else self.origin_ns or 0
         return journal.Snapshot(stamp_ns, state.pack())
@@ -565,13 +565,13 @@ class Session:
         """Resume the wear of the pads after a held load; return whether the load was held."""
         held, self.held = self.held, False
         if held and self._wears:
-            self.twin.set_travel_speed(self._speed)
+            self.twin.set_travel_speed(self.travel_speed_m_s)
         return held
 
     def _apply_travel(self, travel: journal.Travel) -> None:
         newest_ns, oldest_ns = self.history.newest_sample_ns, self.history.oldest_ns
         if not self._wears:
-            self._speed = travel.speed_m_s
+            self.travel_speed_m_s = travel.speed_m_s
         elif self.stamp_ns is None:
             # no advance has been made yet, so the speed takes effect at once
             self._use_speed(travel.speed_m_s)
@@ -591,9 +591,9 @@ class Session:
         self._use_speed(travel.speed_m_s)
 
     def _use_speed(self, speed_m_s: float) -> None:
-        self._speed = speed_m_s
+        self.travel_speed_m_s = speed_m_s
         if not self.held:
-            self.twin.set_travel_speed(self._speed)
+            self.twin.set_travel_speed(self.travel_speed_m_s)
 
     def _count(self, advances: int) -> None:
         before, self._advances = self._advances, self._advances + advances
@@ -635,7 +635,7 @@ class Session:
         return origin_ns
 
     def _change_model(self, changes: dict[str, float]) -> None:
-        before, speed = self.twin, 0.0 if self.held else self._speed
+        before, speed = self.twin, 0.0 if self.held else self.travel_speed_m_s
         self._use(self._changed_twin(changes))
         self._carry(before)
         self.changes = changes
@@ -651,7 +651,7 @@ class Session:
         Raise `ArgumentError` if the changes, or a present or waiting travel speed in the changed scene, are impossible.
         """
         found = changed_twin(self.twin, self._scene, changes)
-        for speed in (self._speed, *(travel.speed_m_s for travel in self._travels)):
+        for speed in (self.travel_speed_m_s, *(travel.speed_m_s for travel in self._travels)):
             check_travel_speed(found.scene, speed)
         return found
 
@@ -681,7 +681,7 @@ class Session:
             self.following.follow_estimate(known, origin_ns)
             self.following.poses = poses
         if self._wears:
-            self.twin.set_travel_speed(self._speed)
+            self.twin.set_travel_speed(self.travel_speed_m_s)
 
     def _split_changes(self, data: bytes) -> tuple[bytes, dict[str, float]]:
         size = len(self.twin.snapshot()) if self.following is None else self.following.snapshot_size(data)
@@ -700,7 +700,7 @@ class Session:
         if state.origin_ns is not None:
             self.origin_ns = state.origin_ns
         self.stamp_ns, self._advances = state.stamp_ns, state.advances
-        self.held, self._speed = state.held, state.travel_speed_m_s
+        self.held, self.travel_speed_m_s = state.held, state.travel_speed_m_s
 
 
 def _all_finite(rows: Rows | None) -> bool:

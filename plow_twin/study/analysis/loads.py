@@ -216,6 +216,8 @@ class LoadTotals:
     def facts(self) -> dict[str, Any]:
         """Return all sums for JSON."""
         total = max(1, self.sets.total())
+        # the motion is relative to a frame on springs, whose energy is not known
+        unknown = {} if self.scene.support is None else {"contact_loss_j": None}
         return {
             "duration_s": self.duration_s,
             "impacts": dict(zip(PAIR_NAMES, self.impacts.tolist(), strict=True)),
@@ -223,13 +225,14 @@ class LoadTotals:
             "impulse_n_s": dict(zip(PAIR_NAMES, self.impulse.tolist(), strict=True)),
             "duty": dict(zip(PAIR_NAMES, (self.contact_s / max(self.duration_s, 1e-300)).tolist(), strict=True)),
             "contact_loss_j": self.contact_loss_j,
-            "passes": [vars(item) for item in self.passes],
+            "passes": [vars(item) | unknown for item in self.passes],
             "wear": self.wear_facts(),
             "cycles": self.cycles(),
             "contact_sets": {
                 "+".join(PAIR_NAMES[pair] for pair in range(PAIR_COUNT) if mask >> pair & 1) or "none": count / total
                 for mask, count in self.sets.most_common()
             },
+            **unknown,
         }
 
 
