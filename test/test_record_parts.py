@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
 import resource
 import shutil
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +28,14 @@ from plow_twin.record import measured
 from plow_twin.record.bag import BagWriter, Topic
 from plow_twin.record.doctor import examine, repair
 from plow_twin.record.header import RunHeader
+from plow_twin.record.mcap_file import UnbufferedFile
 from plow_twin.record.measured import read_recording as read_measured
 from plow_twin.record.metadata_yaml import listed_parts
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.recorder import Recorder
 from plow_twin.record.replay import replay
 from plow_twin.record.sources import open_source
+from plow_twin.record.writer import RunWriter
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
@@ -86,16 +90,20 @@ def test_the_journal_alone_takes_less_than_75_bytes_a_sample(tmp_path: Path) -> 
     assert replay(run.folder).exit_code == 0
 
 
-@pytest.mark.parametrize("share", [0.4, 0.9])
-def test_a_recording_that_was_cut_off_is_repaired(share: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("share", "begun"), [(0.4, None), (0.9, 0), (0.9, 100)])
+def test_a_recording_that_was_cut_off_is_repaired(share: float, begun: int | None, tmp_path: Path) -> None:
+    """A recorder that is killed during a change of files leaves a second part, which has `begun` bytes."""
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), chunk_size=50_000)
     data = run.file.read_bytes()
     run.file.write_bytes(data[: int(len(data) * share)])
     (run.folder / "metadata.yaml").unlink()
+    begun_parts = [] if begun is None else [run.folder / "run_1.mcap"]
+    for part in begun_parts:
+        part.write_bytes(data[:begun])
     before = examine(run.folder)
     assert before.problems and before.status == FileStatus.TRUNCATED.value
     found = list(records_of(run.folder))
-    assert repair(run.folder) == [run.file]
+    assert RunReader(run.folder).damaged_chunks == 0 and repair(run.folder) == [run.file, *begun_parts]
     after = examine(run.folder)
     assert after.problems == [] and after.status == FileStatus.COMPLETE.value
     # the repaired file contains every record that could be read before, but not always in the same order
@@ -271,6 +279,32 @@ def test_a_full_disk_is_named_and_a_repair_leaves_nothing_half_done(tmp_path: Pa
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert error.value.filename == f"{run.file}.partial" and sorted(run.folder.iterdir()) == there
+
+
+def test_a_change_of_files_on_a_full_disk_is_undone_and_done_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = RunWriter(tmp_path / "run", RunHeader(dump_scene(load_scene(scene_path("paper")))), 50_000, 0)
+    writer.write_entry(0, 0, paper_sample(0))
+    writer.flush()
+    write, writes = UnbufferedFile.write, 0
+
+    def write_or_fail(file: UnbufferedFile, data: bytes) -> None:
+        nonlocal left
+        left -= 1
+        write(file, data if left >= 0 else data[: len(data) // 2])
+        if left < 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(UnbufferedFile, "write", write_or_fail)
+    while len(os.listdir(tmp_path / "run")) == 1:  # the disk becomes full at each write of the change in turn
+        left, writes = writes, writes + 1
+        with suppress(OSError):
+            writer.split({})
+    left = 100
+    writer.close({})
+    assert writes == 9 and examine(tmp_path / "run").problems == []
+    assert listed_parts(tmp_path / "run") == ["run_0.mcap", "run_1.mcap"]
 
 
 def test_a_full_disk_ends_the_writing_of_a_replay_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

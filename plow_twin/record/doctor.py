@@ -261,7 +261,7 @@ def repair(path: Path) -> list[Path]:
         for file in files:
             _put_aside(file, ending)
             rewritten.append(file)
-    rewritten += _mend(reader.parts, whole.parts[-1])
+    rewritten += _mend(reader.parts, _end(whole.parts))
     if path.is_dir() or reader.parts[0] in whole.parts:
         wrong = _metadata_problems(whole)
         if rewritten or wrong:
@@ -269,20 +269,31 @@ def repair(path: Path) -> list[Path]:
             _list_parts(folder, whole.parts, [*(part.name for part in rewritten), *texts])
     for beside in besides:
         parts = run_parts(beside)
-        mended = _mend(parts, parts[-1])
+        mended = _mend(parts, _end(parts))
         if mended:
             _list_parts(beside, parts, [part.name for part in mended])
         rewritten += mended
     return rewritten
 
 
-def _mend(parts: Sequence[Path], last: Path) -> list[Path]:
+def _end(parts: Sequence[Path]) -> Sequence[Path]:
+    """Return the last part with messages, and the parts after it.
+
+    If the recorder is killed while it starts a part, the new part has no messages, and the part before has no end.
+    """
+    empty = 0
+    while empty < len(parts) - 1 and not (is_mcap(parts[-1 - empty]) and any(map(len, ChunkReader(parts[-1 - empty])))):
+        empty += 1
+    return parts[-1 - empty :]
+
+
+def _mend(parts: Sequence[Path], end: Sequence[Path]) -> list[Path]:
     mended = []
     for part in parts:
         if not is_mcap(part):
             _put_aside(part, "damaged")
         elif not _part(part).healthy:
-            _rewrite(part, last=part == last)
+            _rewrite(part, last=part in end)
         else:
             continue
         mended.append(part)
@@ -306,7 +317,7 @@ def _list_parts(folder: Path, parts: Sequence[Path], repaired: Sequence[str]) ->
 def _rewrite(part: Path, *, last: bool) -> None:
     """Replace a file by a new file with the readable messages and a note of damage at each gap.
 
-    A truncated part has a gap at its end, unless it is the last part.
+    A truncated part has a gap at its end, unless only parts without messages follow.
     """
     target = part.with_name(f"{part.name}.partial")
     target.unlink(missing_ok=True)

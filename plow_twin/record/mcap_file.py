@@ -9,13 +9,14 @@ from __future__ import annotations
 import os
 import struct
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 import numpy as np
 
-from plow_twin.errors import RecordingError, TakenError
+from plow_twin.errors import TakenError
 from plow_twin.record.chunks import MAGIC, MESSAGE_HEAD, crc32
 from plow_twin.record.durable import naming
 from plow_twin.record.follow import claim
@@ -139,7 +140,8 @@ class McapFile:
     """Writer of an MCAP file to the stream `out`.
 
     Every method raises `OSError` if the disk is full. After a failed call of `chunk`, the messages of the chunk are
-    lost, and the file is as before the call. After a failed call of any method except `chunk`, `out` must be closed.
+    lost, and the file is as before the call. After a failed call of any other method outside the context `undone`,
+    `out` must be closed.
     """
 
     def __init__(self, out: ByteFile, library: str) -> None:
@@ -206,11 +208,18 @@ class McapFile:
         if not builder.size:
             return
         content, index = builder.pop()
-        whole = self.size
-        try:
+        with self.undone():
             self._chunk(builder.compression, content, index)
+
+    @contextmanager
+    def undone(self) -> Iterator[None]:
+        """Restore the file to its content at the start of this context if the context raises `OSError`."""
+        size, metadata = self.size, len(self._metadata)
+        try:
+            yield
         except OSError:
-            self.out.truncate(whole)
+            self.out.truncate(size)
+            del self._metadata[metadata:]
             raise
 
     def _chunk(self, compression: str, content: Bytes, index: dict[int, Any]) -> None:
@@ -327,8 +336,6 @@ class UnbufferedFile:
             self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         except FileExistsError as error:
             raise TakenError(f"{path}: exists already, expected a new file for the recording") from error
-        except OSError as error:
-            raise RecordingError(f"{path}: cannot be made: {error.strerror}") from error
         claim(self._descriptor)
         self._offset = 0
         self._open = True
@@ -360,7 +367,7 @@ class UnbufferedFile:
         """Return whether the file still exists at its path."""
         try:
             return os.path.samestat(os.fstat(self._descriptor), os.stat(self._path))
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return False
 
     def close(self) -> None:
@@ -368,6 +375,11 @@ class UnbufferedFile:
         if self._open:
             self._open = False
             os.close(self._descriptor)
+
+    def remove(self) -> None:
+        """Close and remove the file."""
+        self._path.unlink(missing_ok=True)
+        self.close()
 
 
 class MemoryFile:
@@ -396,6 +408,9 @@ class MemoryFile:
         return True
 
     def close(self) -> None:
+        """Do nothing."""
+
+    def remove(self) -> None:
         """Do nothing."""
 
 

@@ -189,13 +189,11 @@ class RunReader:
     def _batches(self, outputs: bool) -> Iterator[Batch]:
         merger = _Merger(self, outputs)
         size, before = self.size(), 0
-        finished, cut = True, False
+        finished, cut = True, 0
         for part in self._parts_to_read():
-            self.damaged_chunks += cut  # the last records of a truncated part may be missing
-            cut = False
             begins = is_mcap(part) if len(self.parts) > 1 else True
             if self.tail is None and begins is None:
-                finished, cut = False, True
+                finished, cut = False, cut + 1
                 continue
             if begins is False:
                 self.damaged_chunks += 1
@@ -209,12 +207,14 @@ class RunReader:
             merger.begin(part, reader)
             for messages in reader:
                 self.position = min(1.0, (before + reader.position) / max(1, size))
+                if len(messages):  # between these and the messages of a truncated part before, some may be missing
+                    self.damaged_chunks, cut = self.damaged_chunks + cut, 0
                 yield from merger.add(messages)
                 if self.tail is not None and not len(messages):
                     yield from merger.finish()
                     yield Batch(NO_ENTRIES, [])
             before += reader.position
-            finished, cut = finished and reader.finished, not reader.finished
+            finished, cut = finished and reader.finished, cut + (not reader.finished)
             self.damaged_chunks += reader.damaged
             merger.end()
         yield from merger.finish()

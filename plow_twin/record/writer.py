@@ -61,9 +61,8 @@ class RunWriter:
     Journal entries and outputs are written to separate chunks. A chunk of entries precedes the chunk of the outputs
     that were sent after these entries.
 
-    Every method raises `OSError` if the disk is full. After a failed write or `flush`, the file contains all data up to
-    the previous flush, and more data can be written. After a failed call of any method except a write or `flush`, only
-    `abandon` may be called.
+    Every method raises `OSError` if the disk is full. After a failed write, `flush` or `split`, the file contains all
+    data up to the previous flush, and more data can be written. After a failed `close`, only `abandon` may be called.
     """
 
     def __init__(
@@ -84,7 +83,7 @@ class RunWriter:
         warm_up()
         self._prepare(folder)
         self._number = 0
-        self._part = self._open()
+        self._part = self._open(self._number)
 
     def _prepare(self, folder: Path) -> None:
         make_folder(folder)
@@ -92,13 +91,18 @@ class RunWriter:
     def _make(self, path: Path) -> ByteFile:
         return UnbufferedFile(path)
 
-    def _open(self) -> _Part:
-        path = self.folder / f"{self.folder.name}_{self._number}.mcap"
-        file = McapFile(self._make(path), f"plow_twin {self.header.package_version}")
-        file.metadata(HEADER_RECORD, {**self.header.to_record(), "part": str(self._number)})
-        if self._sync:
-            file.out.sync()
-            sync_path(self.folder, self.folder.parent)
+    def _open(self, number: int) -> _Part:
+        path = self.folder / f"{self.folder.name}_{number}.mcap"
+        out = self._make(path)
+        try:
+            file = McapFile(out, f"plow_twin {self.header.package_version}")
+            file.metadata(HEADER_RECORD, {**self.header.to_record(), "part": str(number)})
+            if self._sync:
+                out.sync()
+                sync_path(self.folder, self.folder.parent)
+        except OSError:
+            out.remove()
+            raise
         return _Part(path, file)
 
     @property
@@ -272,9 +276,13 @@ class RunWriter:
         `keep_bytes`, the oldest completed parts are removed until their total size [B] is at most `keep_bytes`.
         """
         self._close_chunks()
-        old, self._number = self._part, self._number + 1
-        self._part = self._open()
-        self._finish(old, {topic: str(count) for topic, count in loss.items()})
+        new = self._open(self._number + 1)
+        try:
+            self._finish(self._part, {topic: str(count) for topic, count in loss.items()})
+        except OSError:
+            new.file.out.remove()
+            raise
+        self._part, self._number = new, self._number + 1
         if keep_bytes:
             self._remove_oldest(keep_bytes)
 
@@ -286,10 +294,11 @@ class RunWriter:
             (self.folder / self._done.pop(0).name).unlink(missing_ok=True)
 
     def _finish(self, part: _Part, record: Mapping[str, str]) -> None:
-        part.file.metadata(LOSS_RECORD, record)
-        part.file.finish()
-        if self._sync:
-            part.file.out.sync()
+        with part.file.undone():
+            part.file.metadata(LOSS_RECORD, record)
+            part.file.finish()
+            if self._sync:
+                part.file.out.sync()
         part.file.out.close()
         self._bytes_before += part.file.size
         self._done.append(part.facts())
