@@ -17,6 +17,7 @@ from record_support import BASE_NS, STEP_NS, paper_sample, record_run
 from rerun.chunk import RrdReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from plow_twin.cli.app import run as run_cli
 from plow_twin.errors import RecordingError
@@ -301,6 +302,24 @@ def test_of_a_bag_with_a_damaged_or_missing_part_the_others_are_used(kind: Stora
         part.write_bytes(b"no recording at all")
     with pytest.raises(RecordingError, match=str(tmp_path / "bag")):
         analyse(tmp_path / "bag", scene=PAPER)
+
+
+@pytest.mark.parametrize("kind", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def test_a_type_that_only_the_bag_defines_is_read(kind: StoragePlugin, tmp_path: Path) -> None:
+    store, name = get_typestore(Stores.ROS2_JAZZY), "plant_msgs/msg/Load"
+    store.register(get_types_from_msg("builtin_interfaces/Time at\nfloat32 fx\nfloat64[2] f", name))
+    with BagWriter(tmp_path / "bag", version=9, storage_plugin=kind) as writer:
+        connection = writer.add_connection("/load", name, typestore=store)
+        for index in range(10):
+            time_ns = BASE_NS + index * STEP_NS
+            time = store.types["builtin_interfaces/msg/Time"](*divmod(time_ns, 10**9))
+            message = store.types[name](time, 5e3 * index, np.array([1e4, 2e4]))
+            writer.write(connection, time_ns, store.serialize_cdr(message, name))
+    (tmp_path / "map.yaml").write_text(
+        "excitation: {topic: /load, fields: {fx: fx, fy: 'f[0]', m: 'f[1]'}, stamp: log}\n"
+    )
+    found = analyse(tmp_path / "bag", scene=PAPER, mapping=tmp_path / "map.yaml")
+    assert found.input == {"samples_in": 10, "samples_used": 10} and not found.lossy
 
 
 def test_a_bag_of_another_program_is_drawn_by_its_mapping(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

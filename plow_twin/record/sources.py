@@ -37,10 +37,12 @@ _LARGEST_MESSAGE: Final = 2**26
 #: table may never end.
 _COMPUTED: Final = """
     SELECT 1 FROM sqlite_master
-    WHERE name COLLATE NOCASE IN ('topics', 'messages') AND (type != 'table' OR rootpage = 0)
+    WHERE name COLLATE NOCASE IN ('topics', 'messages', 'message_definitions') AND (type != 'table' OR rootpage = 0)
     UNION ALL SELECT 1 FROM pragma_table_xinfo('messages') WHERE hidden
+    UNION ALL SELECT 1 FROM pragma_table_xinfo('message_definitions') WHERE hidden
     UNION ALL SELECT 1 FROM pragma_table_xinfo('topics') WHERE hidden LIMIT 1
 """
+_SCHEMA: Final = "SELECT encoded_message_definition FROM message_definitions WHERE topic_type = ? LIMIT 1"
 _MESSAGES: Final = "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
 #: Errors that sqlite3 raises for a damaged file, for text that is not UTF-8, and for table cells of invalid length.
 _SQLITE_ERRORS: Final = (sqlite3.Error, UnicodeDecodeError, MemoryError)
@@ -338,7 +340,9 @@ class SqliteSource:
                     hole = True
                     continue
                 named = {
-                    number: (name, kind) for number, name, kind in topics if wanted(name) and decoder.knows(name, kind)
+                    number: (name, kind)
+                    for number, name, kind in topics
+                    if wanted(name) and decoder.knows(name, kind, _schema(connection, kind))
                 }
                 try:
                     for number, stamp_ns, data in connection.execute(_MESSAGES):
@@ -355,6 +359,13 @@ class SqliteSource:
                 except (*_SQLITE_ERRORS, OverflowError):
                     self.losses.counts["truncated_files"] += 1
                     hole = True
+
+
+def _schema(connection: sqlite3.Connection, message_type: str) -> str:
+    """Return the text of a message type, or an empty text if the file has none, as before ROS 2 Iron."""
+    with suppress(*_SQLITE_ERRORS):
+        return str((connection.execute(_SCHEMA, (message_type,)).fetchone() or ("",))[0])
+    return ""
 
 
 class CsvSource:
