@@ -13,11 +13,14 @@ makes the tables of the pages from the seeds in `estimate_pages.TRUTHS`.
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")  # one thread, as in `Worker`
 
 import click
 import numpy as np

@@ -13,7 +13,7 @@ from scipy.stats import truncnorm
 from plow_twin.estimate import search
 from plow_twin.estimate.arrow import Arrow
 from plow_twin.estimate.fit import fit, link_weights, unmoved_span
-from plow_twin.estimate.forward import Forward
+from plow_twin.estimate.forward import Forward, Start
 from plow_twin.estimate.result import Interval, State
 from plow_twin.estimate.summary import summarise
 from plow_twin.estimate.unknowns import GAIN, GX, LEAST_CLEARANCE, MOVING, SIZE, SOFTNESS, Unknowns
@@ -118,6 +118,23 @@ def test_a_change_without_effect_on_the_motion_has_no_derivative() -> None:
     by_mass = np.nan_to_num(moved.predicted - point.predicted)
     left = by_mass + problem.with_fine_steps().linearise(point).rows[:, :, :SIZE] @ step
     assert (np.linalg.norm(left, axis=0) < 0.02 * np.linalg.norm(by_mass, axis=0)).all()
+
+
+def test_motions_in_lanes_agree_with_motions_alone() -> None:
+    """A motion that leaves the range of the model has no poses, and does not change the others."""
+    truth = draw(replace(GROUPS["plain"], periods=1.0), 2)
+    forward, unknowns, times = Forward(truth.nominal, truth.load), Unknowns(truth.nominal), truth.poses.t
+    starts = []
+    for stiffness in (3e9, 1e3, 1e7):
+        scene = unknowns.scene_of(unknowns.nominal())
+        scene = replace(scene, contact=replace(scene.contact, stiffness=stiffness))
+        starts.append(Start(scene, np.array([1.0, 0.9, 1.1]), np.array([1e-3, 0.0, 0.0, 0.1, 0.0, 0.0])))
+    together, edges = forward.run_many(starts, 0.0, times), np.array([0, len(times)])
+    alone = [forward.run(one.scene, one.gain, np.zeros(1), one.state[None], edges, times) for one in starts]
+    assert together[1] is None and alone[1] is None
+    assert together[2] == pytest.approx(alone[2].q, abs=1e-5)
+    early = times < 0.3  # a hard contact forgets its start
+    assert together[0][early] == pytest.approx(alone[0].q[early], abs=1e-5)
 
 
 @pytest.mark.parametrize(("group", "least", "most"), [("plain", 3, 4), ("noisy", 8, 11)])

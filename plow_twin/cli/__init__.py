@@ -18,6 +18,8 @@ from typing import NoReturn
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line, and exit with its exit code."""
     _open_what_is_closed()
+    # the matrices of an estimate are so small that several threads would mostly wait for each other
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
         sys.exit("plow-twin: NUMBA_DISABLE_JIT is set, expected it unset, because the solver must be compiled")
     with _ending_at_once():

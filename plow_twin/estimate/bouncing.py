@@ -16,6 +16,7 @@ References: Beaumont, Zhang and Balding, Genetics 162 (2002) 2025; Fearnhead and
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -23,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate import priors, tuning
-from plow_twin.estimate.forward import Forward
+from plow_twin.estimate.forward import Forward, Start
 from plow_twin.estimate.laws import Draws, log_odds
 from plow_twin.estimate.likely import Seen, likeliest
 from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER, Poses, filled
@@ -74,6 +75,8 @@ _LONGER = 2.0
 _HARD_BOUNDS, _FIRM_BOUNDS = (8e-7, 6e-4), (2e-6, 2e-2)
 #: Upper bound on the number of iterations in which the noise of a simulated motion is adjusted.
 _NOISE_ROUNDS = 3
+#: Time in s between the start of a simulated motion and the first pose.
+_BEFORE: Final = 0.1
 #: Smallest number of draws, derived from the twenty features of a regression, and smallest number of complete poses,
 #: derived from their 99 % quantile.
 _FEWEST, _FEWEST_WHOLE = 30, 100
@@ -376,25 +379,35 @@ class _Drawn:
         self.changes: list[Array] = []
         self.by_phase: list[Array] = []
         self.q: list[Array] = []
+        #: number of motions drawn so far, and their work
+        self.drawn = self.work = 0
 
     def add(self, count: int, centre: Array, about: float, delay: float, most_work: int) -> None:
         """Add up to `count` motions, observed with a delay of `delay` s, until the work reaches `most_work`.
 
         The clearances have the mean `centre` and the standard deviation `about`, both in m.
         """
-        for _ in range(count):
-            if self.forward.work > most_work:
-                return
-            numbers = self._numbers()
-            clearance = np.maximum(centre + about * self.rng.standard_normal(2), LEAST_CLEARANCE)
-            q = self.eye.look(self.forward, self.unknowns, clearance, numbers, delay, self.rng)
+        before = self.forward.work
+        if self.drawn:  # as many motions as the work allows, if each takes as many steps as those before
+            count = min(count, max(int((most_work - before) * self.drawn / max(self.work, 1)), 0))
+        motions = [self._draw(centre, about) for _ in range(count)]
+        runs = self.eye.run(self.forward, [start for *_, start in motions], delay)
+        self.drawn += count
+        self.work += self.forward.work - before
+        for q, (clearance, numbers, _) in zip(runs, motions, strict=True):
             if q is not None:
+                q = self.eye.seen(q, self.rng)
                 seen = self.eye.features(q)
                 self.features.append(seen)
                 self.targets.append(np.concatenate([clearance - seen[:2], -seen[2:5], numbers]))
                 self.changes.append(self.eye.changes(q))
                 self.by_phase.append(self.eye.changes_by_phase(q))
                 self.q.append(q)
+
+    def _draw(self, centre: Array, about: float) -> tuple[Array, Array, Start]:
+        numbers = self._numbers()
+        clearance = np.maximum(centre + about * self.rng.standard_normal(2), LEAST_CLEARANCE)
+        return clearance, numbers, self.eye.start(self.unknowns, clearance, numbers, self.rng)
 
     def _numbers(self) -> Array:
         mean = np.concatenate([self.spread.mean, np.ones(3)])
@@ -641,6 +654,19 @@ class _Phases:
     size: NDArray[np.int64]
     known: NDArray[np.bool_]
 
+    @staticmethod
+    def of(rows: NDArray[np.int64], phase: NDArray[np.int64], parts: int) -> _Phases:
+        """Return the division of `rows` by the part of the period of every pose, `phase`."""
+        count = np.bincount(phase[rows], minlength=parts)
+        return _Phases(rows, phase[rows], np.maximum(count, 1), count >= _FEWEST_OF_PHASE)
+
+    def moments(self, values: Array) -> tuple[Array, Array]:
+        """Return the mean of `values` in each part minus the mean over all parts, and the variance in each part."""
+        value = values[self.rows] - values[self.rows].mean()
+        mean = np.bincount(self.inside, value, len(self.size)) / self.size
+        square = np.bincount(self.inside, (value - mean[self.inside]) ** 2, len(self.size)) / self.size
+        return mean, square
+
 
 class MotionFeatures:
     """Features of motions that are observed with the times, the gaps and the noise of the sensor."""
@@ -659,11 +685,7 @@ class MotionFeatures:
         self._smooth = max(min(smooth_width(poses, tuning.AVERAGED), int(self._whole.sum()) // 8), 1)
         self._reach_phase = ((poses.t[self._whole] - poses.t[0]) / period % 1.0 * tuning.PATH_PHASES).astype(int)
         phase = np.minimum(((poses.t - poses.t[0]) / period % 1.0 * self._parts).astype(int), self._parts - 1)
-        #: rows of each component in each part of a period, without parts of few rows
-        self._parts_of = [
-            [rows for k in range(self._parts) if len(rows := np.flatnonzero((phase == k) & there)) > 8]
-            for there in self._there.T
-        ]
+        self._scattered = [_Phases.of(np.flatnonzero(there), phase, self._parts) for there in self._there.T]
         self._phases: dict[float, list[_Phases]] = {}
 
     def look(
@@ -671,6 +693,21 @@ class MotionFeatures:
         rng: np.random.Generator,
     ) -> Array | None:  # fmt: skip
         """Return a simulated motion as a sensor with a delay of `delay` s would measure it; None after a failure.
+
+        `clearance` and `numbers` are those of `start`.
+        """
+        one = self.start(unknowns, clearance, numbers, rng)
+        edges, t = np.array([0, len(self._t)]), self._t - delay
+        run = forward.run(one.scene, one.gain, t[:1] - _BEFORE, one.state[None], edges, t)
+        return None if run is None else self.seen(run.q, rng)
+
+    def run(self, forward: Forward, starts: Sequence[Start], delay: float) -> list[Array | None]:
+        """Return simulated poses at the times of the measurements minus `delay` s; None after a failure."""
+        t = self._t - delay
+        return forward.run_many(starts, float(t[0]) - _BEFORE, t)
+
+    def start(self, unknowns: Unknowns, clearance: Array, numbers: Array, rng: np.random.Generator) -> Start:
+        """Return scene, load gains and random initial state of a motion.
 
         `clearance`, shape (2,), is in m. `numbers` contains the logarithms of penetration and damping, and three load
         gains.
@@ -681,12 +718,9 @@ class MotionFeatures:
         scene = unknowns.scene_of(vector)
         # `scene_of` limits the stiffness, but the decay of bounces depends on larger values
         contact = replace(scene.contact, stiffness=unknowns.force / math.exp(numbers[0]) ** scene.contact.exponent)
-        start = np.concatenate([self.q[0], np.zeros(3)])
-        start += np.array([1e-3, 1e-3, 4e-3, 0.05, 0.05, 0.2]) * rng.standard_normal(6)
-        white = rng.standard_normal(self.q.shape)
-        edges, t = np.array([0, len(self._t)]), self._t - delay
-        run = forward.run(replace(scene, contact=contact), vector[GAIN], t[:1] - 0.1, start[None], edges, t)
-        return None if run is None else self._seen(run.q, white)
+        state = np.concatenate([self.q[0], np.zeros(3)])
+        state += np.array([1e-3, 1e-3, 4e-3, 0.05, 0.05, 0.2]) * rng.standard_normal(6)
+        return Start(replace(scene, contact=contact), vector[GAIN], state)
 
     def paths(self, q: Array, lags_s: Array) -> Array:
         """Return the path of a motion for each lag, shape (lags, 240)."""
@@ -701,10 +735,8 @@ class MotionFeatures:
         for i, phases in enumerate(self._phases_at(lag_s)):
             if not phases.known.any():
                 continue
-            inside, known, size = phases.inside, phases.known, phases.size
-            value = q[phases.rows, i] - q[phases.rows, i].mean()
-            mean = np.bincount(inside, value, len(size)) / size
-            square = np.bincount(inside, (value - mean[inside]) ** 2, len(size)) / size
+            mean, square = phases.moments(q[:, i])
+            known = phases.known
             out[0, known, i] = mean[known] - mean[known].mean()
             out[1, known, i] = 0.5 * np.log(square[known] + _NO_SCATTER)
         return out.ravel()
@@ -713,21 +745,19 @@ class MotionFeatures:
         if lag_s not in self._phases:
             if len(self._phases) > 2 * len(_OF_DRAWN_S):
                 self._phases.clear()
-            parts, found = tuning.PATH_PHASES, []
+            parts = tuning.PATH_PHASES
             phase = ((self._t - self._t[0] - lag_s) / self._period % 1.0 * parts).astype(int) % parts
-            for there in self._there.T:
-                rows = np.flatnonzero(there & self._settled)
-                count = np.bincount(phase[rows], minlength=parts)
-                found.append(_Phases(rows, phase[rows], np.maximum(count, 1), count >= _FEWEST_OF_PHASE))
-            self._phases[lag_s] = found
+            self._phases[lag_s] = [
+                _Phases.of(np.flatnonzero(there & self._settled), phase, parts) for there in self._there.T
+            ]
         return self._phases[lag_s]
 
-    def _seen(self, q: Array, white: Array) -> Array:
+    def seen(self, q: Array, rng: np.random.Generator) -> Array:
         """Add noise to a motion so that its estimated noise level equals that of the measurement.
 
         Bounces raise the estimated noise level, so the added noise is smaller than the measured level.
         """
-        noise = self.noise
+        noise, white = self.noise, rng.standard_normal(self.q.shape)
         for _ in range(_NOISE_ROUNDS):
             noise = noise * self.noise / np.maximum(noise_level(self._bridged(q + noise * white)), 1e-12)
         return self._bridged(q + noise * white)
@@ -747,10 +777,13 @@ class MotionFeatures:
         averaged = np.concatenate([self._averaged(whole), self._by_phase(whole)])
         averaged = averaged[:, [0, 2]] + averaged[:, [1, 3]] - sums
         scatter = []
-        for i in range(3):
-            parts = np.array([q[rows, i].std() for rows in self._parts_of[i]])
+        for i, phases in enumerate(self._scattered):
+            if not phases.known.any():
+                scatter += [0.0, 0.0]
+                continue
+            parts = np.sqrt(phases.moments(q[:, i])[1][phases.known])
             calm = np.sort(parts)[: max(len(parts) // 3, 1)]
-            scatter += [math.log(calm.mean() + 1e-9), math.log(parts.mean() + 1e-9)] if len(parts) else [0.0, 0.0]
+            scatter += [math.log(calm.mean() + 1e-9), math.log(parts.mean() + 1e-9)]
         like = [reach[2] - reach[0], reach[2] - reach[1], scatter, averaged.ravel()]
         return np.concatenate([sums, bias, *like])
 

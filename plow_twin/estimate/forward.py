@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +14,9 @@ from plow_twin.estimate.measurements import EstimateError, Load
 from plow_twin.model.geometry import body_states
 from plow_twin.model.loads import Pieces
 from plow_twin.model.scene import Scene
+from plow_twin.run.batch import TwinBatch
 from plow_twin.solve.compiled_scene import compile_scene, inertias
+from plow_twin.solve.lanes.record import WIDTH, fits_lanes
 from plow_twin.solve.method.implicit import new_implicit
 from plow_twin.solve.restarts import run_restarts
 from plow_twin.solve.state import EVENT, SEGMENT, TOTALS, Parts, Status, new_records, new_work, state_type
@@ -23,6 +26,8 @@ Array = NDArray[np.float64]
 #: Upper bounds on one simulation: `_STEPS` plus `_STEPS_PER_SECOND` for each second, and rows of the event log.
 _STEPS_PER_SECOND, _STEPS = 20_000, 2_000
 _LOG_SIZE = 4096
+#: Number of samples that a vector of motions passes in one call. The rows of a call take 21 MB.
+_SAMPLES = 4096
 #: Cost of an implicit step in series steps.
 _IMPLICIT_WORK = 10
 
@@ -34,6 +39,15 @@ class Motions:
     q: Array
     v: Array
     contact: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """A scene, the gains of its load, shape (3,), and its state at the start (x, y, theta and their rates)."""
+
+    scene: Scene
+    gain: Array
+    state: Array
 
 
 class Forward:
@@ -133,6 +147,55 @@ class Forward:
         if code != Status.OK or not np.isfinite(q).all():
             return None
         return Motions(q, v, np.array(totals["time_in_contact"]))
+
+    def run_many(self, starts: Sequence[Start], start: float, times: Array) -> list[Array | None]:
+        """Return the poses of many scenes at the times `times`, shape (n, 3) each; None as in `run`.
+
+        Scenes that fit share SIMD vectors. The results agree with those of `run` within the tolerance.
+
+        Parameters
+        ----------
+        starts : sequence of Start
+            Scenes with the terms of the nominal scene.
+        start : float
+            Time in s at which all motions begin.
+        times : ndarray, shape (n,)
+            Times in s, which rise and are not before `start`.
+        """
+        found: list[Array | None] = [None] * len(starts)
+        edges, begin, fitting = np.array([0, len(times)]), np.array([start]), []
+        for place, one in enumerate(starts):
+            if fits_lanes(compile_scene(one.scene, tuning.TOLERANCE, sampled=True), sampled=True):
+                fitting.append(place)
+                continue
+            run = self.run(one.scene, one.gain, begin, one.state[None], edges, times)
+            found[place] = None if run is None else run.q
+        # a vector ends with its slowest motion, and harder contacts take more steps
+        fitting.sort(key=lambda place: starts[place].scene.contact.stiffness)
+        for first in range(0, len(fitting), WIDTH):
+            places = fitting[first : first + WIDTH]
+            for place, q in zip(places, self._in_lanes([starts[i] for i in places], start, times), strict=True):
+                found[place] = q
+        return found
+
+    def _in_lanes(self, starts: Sequence[Start], start: float, times: Array) -> list[Array | None]:
+        knots = self._knots
+        t = np.union1d(knots[(knots > start) & (knots < times[-1])], times)
+        asked, out = np.isin(t, times), []
+        states, gains = np.array([one.state for one in starts]), np.array([one.gain for one in starts])[:, None]
+        batch = TwinBatch([one.scene for one in starts], tol=tuning.TOLERANCE, start=start, max_steps=_STEPS)
+        batch.move(range(len(starts)), states[:, :3], states[:, 3:])
+        batch.set_wrench((self.load.at(np.array([start])) * gains)[:, 0])
+        good = np.ones(len(starts), np.bool_)
+        for part in range(0, len(t), _SAMPLES):
+            inside = slice(part, part + _SAMPLES)
+            rows = batch.advance_samples(t[inside], self.load.at(t[inside]) * gains)
+            self.work += int(rows.steps.sum())
+            good &= (rows.status == Status.OK).all(axis=1)
+            out.append(rows.q[:, asked[inside]])
+        q = np.concatenate(out, axis=1)
+        good &= np.isfinite(q).all(axis=(1, 2))
+        return [q[i] if good[i] else None for i in range(len(starts))]
 
     def _compiled(
         self, scene: Scene, gain: Array, depth: Array | None, push: Array | None, stiffness: Array | None
