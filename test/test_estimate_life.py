@@ -104,6 +104,8 @@ def test_quantiles_scale_with_the_coefficient_and_the_horizon_cuts(tmp_path: Pat
     assert now == pytest.approx([0.025, 0.030], abs=1e-9)
     late = life.clearances(np.array([0.99 * p50]))[1, 0]
     assert max(late - [0.028, 0.034]) == pytest.approx(0.0, abs=3e-4)
+    # after the limit is reached, the clearances are those at the end of the path
+    assert (life.clearances(np.array([1e3 * p90])) < [0.0285, 0.0347]).all()
 
 
 def test_scenarios_are_forecasts_of_their_own_from_the_same_draws() -> None:

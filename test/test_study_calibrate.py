@@ -20,7 +20,7 @@ from plow_twin.study.calibration.calibrate import Calibration, Search, calibrate
 from plow_twin.study.calibration.objective import RecordingObjective, TargetObjective
 from plow_twin.study.calibration.pose_recording import PoseRecording, load_poses
 from plow_twin.study.calibration.targets import Target, TargetSet, load_targets
-from plow_twin.study.calibration.uniqueness import identifiability, near_optimal
+from plow_twin.study.calibration.uniqueness import Cluster, identifiability, near_optimal, near_optimal_ends
 from plow_twin.study.calibration.unknowns import Space, parse_unknown
 from plow_twin.study.parameters import StudyError, with_parameters
 from plow_twin.study.statistics import statistic
@@ -77,6 +77,8 @@ def test_known_parameters_are_recovered_from_every_random_start() -> None:
     assert sum(value**2 for value in known.weakest.values()) == pytest.approx(1.0)
     clusters = near_optimal(space(), found, excess=1e-6)
     assert len(clusters) == 1 and clusters[0].members >= 3 and clusters[0].values["loads.fx2.sign"] == -1.0
+    two = [Cluster(2, 1.0, {}, {"x": (1.0, 2.0)}), Cluster(1, 1.05, {}, {"x": (5.0, 6.0)})]
+    assert near_optimal_ends(two, "x") == (1.0, 6.0) and near_optimal_ends(two, "law") is None
 
 
 @pytest.mark.stress

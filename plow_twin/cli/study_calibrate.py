@@ -210,6 +210,8 @@ def _run(
 
 
 def _show(fit: Fit, space: Space, out: Path) -> None:
+    from plow_twin.study.calibration.uniqueness import near_optimal_ends
+
     console = output_console()
     found = fit.calibration
     before = "" if fit.before is None else f" (before the fit: {fit.before:.4g})"
@@ -219,7 +221,7 @@ def _show(fit: Fit, space: Space, out: Path) -> None:
     shown.add_column("near-optimal", justify="right")
     for unknown in space.unknowns:
         value = found.best.values[unknown.path]
-        low_high = fit.clusters[0].spread.get(unknown.path)
+        low_high = near_optimal_ends(fit.clusters, unknown.path)
         spread = "" if low_high is None else f"{low_high[0]:.5g} .. {low_high[1]:.5g}"
         shown.add_row(unknown.path, value if isinstance(value, str) else f"{value:.6g}", spread)
     console.print(shown)

@@ -132,14 +132,11 @@ class Forecast:
     def clearances(self, hours: Array) -> Array:
         """Return the 10 %, 50 % and 90 % quantiles of both clearances in m after `hours`, shape (n,), as (3, n, 2).
 
-        A quantile beyond the end of the path, at which a limit has been reached, is infinite.
+        At the end of the path, where a limit is reached, the clearances stop.
         """
         grown = self.path.clearance_growth()
         exposure = np.multiply.outer(self.rate, hours)
-        each = [
-            self.now[:, axis, None] + np.interp(exposure, self.path.exposure, grown[:, axis], right=np.inf)
-            for axis in range(2)
-        ]
+        each = [self.now[:, axis, None] + np.interp(exposure, self.path.exposure, grown[:, axis]) for axis in range(2)]
         return np.quantile(np.stack(each, axis=2), (0.1, 0.5, 0.9), axis=0, method="lower")
 
     def as_dict(self) -> dict[str, Any]:

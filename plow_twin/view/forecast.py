@@ -32,11 +32,10 @@ def draw_forecast(found: Forecast, path: FilePath, title: str) -> None:
     growing = 1e3 * found.clearances(hours)
     limits = (plan.limit_horizontal_m, plan.limit_vertical_m)
     for axis, (name, limit, colour) in enumerate(zip(("horizontal", "vertical"), limits, _COLOURS, strict=True)):
-        # the forecast is infinite from the time at which the limit is reached
         low, middle, high = np.minimum(growing[:, :, axis], 1e3 * limit)
-        middle[~np.isfinite(growing[1, :, axis])] = np.nan
         left.fill_between(hours, low, high, color=colour, alpha=0.2, linewidth=0.0)
-        left.plot(hours, middle, color=colour, label=f"{name}: P50,\nshaded P10 to P90")
+        until = hours <= (found.quantile(0.5) or end)
+        left.plot(hours[until], middle[until], color=colour, label=f"{name}: P50,\nshaded P10 to P90")
         left.axhline(1e3 * limit, color=colour, linestyle="--", linewidth=1.0, label=f"its limit, {1e3 * limit:g} mm")
     left.set(xlabel="hours of operation", ylabel="clearance [mm]", title="Until a limit is reached", xlim=(0.0, end))
     legend_beside(left)
@@ -48,7 +47,7 @@ def draw_forecast(found: Forecast, path: FilePath, title: str) -> None:
             right.plot([at, at], [0.0, 100.0 * quantile], color="grey", linewidth=1.0)
             side, offset = ("right", -4.0) if at > 0.8 * end else ("left", 4.0)
             right.annotate(
-                f"{name} {at:.0f} h",
+                f"{name} {at:.4g} h",
                 (at, 100.0 * quantile),
                 xytext=(offset, -10.0),
                 textcoords="offset points",

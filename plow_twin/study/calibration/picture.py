@@ -10,6 +10,7 @@ from typing import Any, Final
 from plow_twin.estimate.result import Motion
 from plow_twin.study.calibration.fit import Fit, TargetRow
 from plow_twin.study.calibration.objective import RecordingObjective
+from plow_twin.study.calibration.uniqueness import near_optimal_ends
 from plow_twin.study.calibration.unknowns import Space, Unknown
 from plow_twin.study.statistics import unit_of
 from plow_twin.study.words import parameter_words
@@ -35,7 +36,7 @@ def draw_motion(fit: Fit, space: Space, objective: RecordingObjective, title: st
 def _value(unknown: Unknown, fit: Fit) -> FittedValue:
     value = fit.calibration.best.values[unknown.path]
     assert isinstance(value, float)
-    low, high = fit.clusters[0].spread.get(unknown.path, (value, value)) if fit.clusters else (value, value)
+    low, high = near_optimal_ends(fit.clusters, unknown.path) or (value, value)
     middle = math.sqrt(unknown.low * unknown.high) if unknown.log else 0.5 * (unknown.low + unknown.high)
     label, factor = parameter_words(unknown.path)
     return FittedValue(

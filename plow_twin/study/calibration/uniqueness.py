@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -76,6 +77,12 @@ def near_optimal(space: Space, found: Calibration, excess: float) -> list[Cluste
         for rows in _linked(points, np.array(members))
     ]
     return sorted(clusters, key=lambda cluster: cluster.objective)
+
+
+def near_optimal_ends(clusters: Sequence[Cluster], path: str) -> tuple[float, float] | None:
+    """Return the smallest and largest value of an unknown in all clusters, or None for an unknown with choices."""
+    ends = [cluster.spread[path] for cluster in clusters if path in cluster.spread]
+    return (min(low for low, _ in ends), max(high for _, high in ends)) if ends else None
 
 
 def _linked(points: Array, rows: NDArray[np.int64]) -> list[NDArray[np.int64]]:
