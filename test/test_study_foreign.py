@@ -81,7 +81,7 @@ def test_a_bag_compressed_by_message_is_read_and_one_compressed_as_a_whole_is_na
     source = open_source(tmp_path / "MESSAGE")
     found = [arrived.content.wrench.force.x for arrived in source.messages(lambda topic: True)]
     assert found == [paper_sample(1).wrench[0]] * 2 and source.losses.counts == {"undecodable": 1}
-    for read in (open_source, lambda path: expand([path])):
+    for read in (open_source, lambda path: expand([path]), replay):
         with pytest.raises(RecordingError, match=r"FILE\.db3\.zstd is compressed as a whole"):
             read(tmp_path / "FILE")
 

@@ -459,11 +459,17 @@ def run_parts(path: Path) -> list[Path]:
     if path.is_dir():
         files = sorted(path.glob("*.mcap"), key=part_number)
         if not files:
-            raise RecordingError(f"{path}: got no .mcap file, expected a recording")
+            raise RecordingError(f"{path}: got no .mcap file, expected a recording{packed(path)}")
         return files
     if not path.is_file():
         raise RecordingError(f"{path}: no such recording, expected an .mcap file or its folder")
     return [path]
+
+
+def packed(path: Path) -> str:
+    """Return a hint if a file cannot be read because rosbag2 has compressed it as a whole, or an empty string."""
+    files = sorted(path.glob("*.zstd")) if path.is_dir() else [path] if path.suffix == ".zstd" else []
+    return f" ({files[0].name} is compressed as a whole: unpack it with zstd -d)" if files else ""
 
 
 def mcap_path(path: Path) -> Path:

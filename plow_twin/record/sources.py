@@ -24,7 +24,7 @@ from plow_twin.errors import RecordingError
 from plow_twin.record.chunks import MAGIC, Channel, ChunkReader, is_mcap
 from plow_twin.record.merging import StampOf, merged
 from plow_twin.record.metadata_yaml import missing_files
-from plow_twin.record.reader import part_number, run_parts
+from plow_twin.record.reader import packed, part_number, run_parts
 from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, time_ns
 from plow_twin.scene_file.csv_rows import csv_rows, open_csv, tables
 from plow_twin.scene_file.parquet_lines import is_parquet
@@ -142,12 +142,6 @@ def open_source(path: Path) -> Source:
     raise RecordingError(
         f"{path}: got neither MCAP nor sqlite3 nor .csv nor .parquet, expected a recording{packed(path)}"
     )
-
-
-def packed(path: Path) -> str:
-    """Return a hint if a file cannot be read because rosbag2 has compressed it as a whole, or an empty string."""
-    files = sorted(path.glob("*.zstd")) if path.is_dir() else [path] if path.suffix == ".zstd" else []
-    return f" ({files[0].name} is compressed as a whole: unpack it with zstd -d)" if files else ""
 
 
 def _decompressed(data: bytes) -> bytes:

@@ -9,8 +9,7 @@ from typing import Final
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.bag import beside_folders
-from plow_twin.record.reader import mcap_path, read_header
-from plow_twin.record.sources import packed
+from plow_twin.record.reader import mcap_path, packed, read_header
 from plow_twin.scene_file.parquet_lines import SUFFIX
 
 _KINDS: Final = ("*.mcap", "*.db3", "*.csv")
