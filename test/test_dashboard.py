@@ -37,6 +37,7 @@ from plow_twin.dashboard.history import SPAN_S, History
 from plow_twin.dashboard.link import Link, pair
 from plow_twin.dashboard.run import RunFeed
 from plow_twin.dashboard.screen import Screen
+from plow_twin.dashboard.server import MOST_PAGES, TOO_MANY
 from plow_twin.record.entries import EntryRecord
 from plow_twin.record.reader import RunReader
 from plow_twin.record.recording import read_recording
@@ -222,7 +223,8 @@ def test_who_has_no_token_comes_from_another_page_or_asks_for_another_name_sees_
         url = screen.url
         assert _status(url) == 200 and _status(url + "screen.js") == 200
         assert _status(url + "../server.py") == _status(url + "%2e%2e/server.py") == 404
-        assert _status(url, Host="evil.example") == _status(url, Origin="http://evil.example") == 403
+        foreign = ({"Host": "evil.example"}, {"Origin": "http://evil.example"}, {"Origin": "http://["})
+        assert [_status(url, **headers) for headers in foreign] == [403] * 3
         with pytest.raises(InvalidStatus, match="403"):
             _data(url, origin="http://evil.example")
         for given in ({"token": TOKEN[:-1]}, {"token": ["x"]}, {}, []):
@@ -230,9 +232,16 @@ def test_who_has_no_token_comes_from_another_page_or_asks_for_another_name_sees_
                 page.send(json.dumps(given))
                 page.recv(timeout=10)
             assert closed.value.rcvd is not None and closed.value.rcvd.code == 4401
-        with _data(url, origin=url.rstrip("/")) as page:
-            page.send(json.dumps({"token": TOKEN}))
-            assert json.loads(page.recv(timeout=10))["facts"]["scene"] == "paper"
+        with ExitStack() as opened:
+            # connections without a token take no page from those who have it
+            pages = [opened.enter_context(_data(url, origin=url.rstrip("/"))) for _ in range(MOST_PAGES + 1)]
+            for page in reversed(pages):
+                page.send(json.dumps({"token": TOKEN}))
+                if page is not pages[0]:
+                    assert json.loads(page.recv(timeout=10))["facts"]["scene"] == "paper"
+            with pytest.raises(ConnectionClosed) as closed:
+                pages[0].recv(timeout=10)
+            assert closed.value.rcvd is not None and closed.value.rcvd.code == TOO_MANY
         told = (
             Path(f"/proc/{screen.process.pid}/cmdline").read_bytes()
             + Path(f"/proc/{screen.process.pid}/environ").read_bytes()

@@ -77,7 +77,10 @@ class PageAccess:
 
     def is_own(self, origin: str | None, host: str) -> bool:
         """Return whether a request comes from the page itself, or from a program that is not a browser."""
-        return origin is None or urlsplit(origin).netloc.lower() == host.lower()
+        try:
+            return origin is None or urlsplit(origin).netloc.lower() == host.lower()
+        except ValueError:
+            return False
 
 
 def listening(access: PageAccess) -> socket.socket:

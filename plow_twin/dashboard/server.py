@@ -86,19 +86,13 @@ class Pages:
     async def page(self, socket: WebSocket) -> None:
         """Serve a page until it is closed."""
         await socket.accept()
-        if self._board.pages >= MOST_PAGES:
-            await socket.close(TOO_MANY, f"{MOST_PAGES} pages are open")
-            return
-        self._board.pages += 1
-        try:
+        with suppress(WebSocketDisconnect, TimeoutError, RuntimeError):  # the page is closed, or reads no messages
             if self._access.token and not await self._is_admitted(socket):
                 await socket.close(NO_TOKEN, "a token is needed")
-                return
-            await self._serve(socket)
-        except (WebSocketDisconnect, TimeoutError, RuntimeError):
-            return  # the page has been closed, or does not read messages
-        finally:
-            self._board.pages -= 1
+            elif self._board.pages >= MOST_PAGES:
+                await socket.close(TOO_MANY, f"{MOST_PAGES} pages are open")
+            else:
+                await self._serve(socket)
 
     async def _is_admitted(self, socket: WebSocket) -> bool:
         """Receive the token of a page. After a wrong token, wait one second."""
@@ -109,12 +103,14 @@ class Pages:
         return False
 
     async def _serve(self, socket: WebSocket) -> None:
+        self._board.pages += 1
         tasks = [asyncio.ensure_future(work) for work in (self._send_updates(socket), self._listen(socket))]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 task.result()
         finally:
+            self._board.pages -= 1
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
