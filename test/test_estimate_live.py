@@ -39,7 +39,7 @@ from plow_twin.record.reader import RunReader
 from plow_twin.record.replay import replay
 from plow_twin.ros.messages import set_stamp
 from plow_twin.scene_file import dump_scene
-from plow_twin.stream.journal import Sample, SetModel, SetWear
+from plow_twin.stream.journal import Sample, SetModel, SetWear, Spread
 from plow_twin.stream.outputs import CLEARANCE_NAMES
 from plow_twin.stream.session import Session
 
@@ -299,10 +299,13 @@ def test_an_estimate_stays_until_it_is_withdrawn_or_the_pads_are_changed() -> No
 
 
 class _Finished:
-    """A worker without a process. The test sets its results."""
+    """A worker without a process. The test sets its results and its error."""
 
     def __init__(self, *_: Any) -> None:
         self.found: list[Found] = []
+        self.error, self.ended = "", None
+        self.deviations: list[tuple[float, ...]] = []
+        self.closed = False
 
     def poll(self) -> Found | None:
         return self.found.pop() if self.found else None
@@ -310,8 +313,43 @@ class _Finished:
     def add_load(self, *_: Any) -> None:
         pass
 
+    def set_load_deviation(self, deviation: tuple[float, ...]) -> None:
+        self.deviations.append(deviation)
+
     def restart(self) -> None:
         self.found.clear()
+
+    def finish(self) -> None:
+        pass
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_an_estimator_that_ends_after_an_estimate_is_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("plow_twin.live.estimation.Worker", _Finished)
+    scene = preset("paper")
+    estimation = Estimation(settings({"estimate": True}), scene)
+    session = Session(Twin(scene, excitation="sampled"), on_entry=estimation.add)
+    session.apply(Sample(START_NS, (0.0, 0.0, 0.0)))
+    session.apply(Spread(START_NS, (1.0, 2.0, 3.0)))
+
+    def after_end(*, estimates: int, finish: bool = False) -> str:
+        estimation.worker.error = ""
+        if finish:
+            estimation.finish()
+        estimation.worker.found += [_found(State.ESTIMATED, State.ESTIMATED)] * estimates
+        for _ in range(estimates):
+            assert estimation.poll(session) and not estimation.revive()
+        estimation.worker.error = "the estimator ended with code -9"
+        return estimation.revive()
+
+    first = estimation.worker
+    assert after_end(estimates=2).startswith("the estimator ended with code -9 and is started again")
+    assert first.closed and estimation.worker.deviations == [(1.0, 2.0, 3.0)] and not estimation.done
+    # not before its first estimate, nor after the end of the input
+    assert after_end(estimates=0) == after_end(estimates=1, finish=True) == ""
+    assert estimation.done and estimation.restarts == 1
 
 
 def test_other_pads_and_other_model_numbers_discard_earlier_estimates(

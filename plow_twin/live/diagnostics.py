@@ -101,6 +101,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "window_age_s": "time since the end of the last estimated window [s]",
         "wall_s": "computing time of the last estimate [s]",
         "reasons": "reasons why the model or the sensor is suspect",
+        "restarts": "times that the process of the estimator has ended and was started again",
         "error": "reason why the estimation has ended",
     },
     "follow": {
@@ -382,6 +383,7 @@ class Health:
             "window_age_s": "" if age_s is None else f"{age_s:.3f}",
             "wall_s": f"{found.wall_s:.3f}" if found.count else "",
             "reasons": "; ".join(found.reasons),
+            "restarts": str(found.restarts),
             "error": found.worker.error,
         }
         trouble = found.worker.error or values["reasons"]

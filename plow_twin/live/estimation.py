@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -11,6 +12,7 @@ from plow_twin.estimate.answer import Asked
 from plow_twin.estimate.forces import FEWEST
 from plow_twin.estimate.forecast import HOUR_S, Plan, Scenario, check_prior
 from plow_twin.estimate.life import LifeError
+from plow_twin.estimate.measurements import Deviation
 from plow_twin.estimate.result import State
 from plow_twin.estimate.window import Windows
 from plow_twin.estimate.worker import Found, Worker
@@ -35,7 +37,12 @@ class Estimation:
         span = (settings.estimate_window, settings.estimate_interval, settings.rollback_span)
         windows = Windows(*span, settings.head_pose_deviation, settings.excitation_deviation, settings.gaps_deviation)
         asked = asked_of(settings)
-        self.worker = Worker(scene, windows, asked)
+        self._start = partial(Worker, scene, windows, asked)
+        self.worker = self._start()
+        #: number of times that the process was started again
+        self.restarts = 0
+        self._proven = self._finishing = False  # whether the process has sent an estimate, and whether the input ended
+        self._spread: Deviation | None = None
         sent = {ESTIMATE: True, WINDOW_FORCES: bool(asked.members), FORECAST: asked.plan is not None}
         self._topics = [topic for topic, wanted in sent.items() if wanted]
         #: stamp [ns] at which the wear of the pads was set; None after empty messages have withdrawn the old estimate
@@ -77,6 +84,7 @@ class Estimation:
             case journal.Gaps(stamp_ns, pairs, gaps):
                 self.worker.add_gaps(stamp_ns, pairs, gaps)
             case journal.Spread(_, deviation):
+                self._spread = deviation
                 self.worker.set_load_deviation(deviation)
             case journal.SetWear(stamp_ns):
                 self.worker.restart()
@@ -98,6 +106,29 @@ class Estimation:
         for stamp_ns, wrench in zip(series.stamps.tolist(), series.wrench.tolist(), strict=True):
             self.worker.add_load(stamp_ns, tuple(wrench))
 
+    def finish(self) -> None:
+        """Request the estimate of the last window at the end of the input, after which `done` is true."""
+        self._finishing = True
+        self.worker.finish()
+
+    def revive(self) -> str:
+        """Start the process again if it has ended after an estimate. Return a text about it, otherwise an empty text.
+
+        A process that ends before its first estimate is not started again, because it would probably end again. After
+        the end of the input, a new process would have no measurements.
+        """
+        if not self.worker.error or not self._proven or self._finishing:
+            return ""
+        try:
+            ended, self.worker = self.worker, self._start()
+        except OSError:  # the next call tries again
+            return ""
+        ended.close()
+        if self._spread is not None:
+            self.worker.set_load_deviation(self._spread)
+        self.restarts, self._proven = self.restarts + 1, False
+        return f"{ended.error} and is started again; its windows begin with the measurements from now on"
+
     def poll(self, session: Session) -> dict[str, plain.JointState]:
         """Apply a finished estimate to the session, and return its messages by topic.
 
@@ -109,6 +140,7 @@ class Estimation:
         if found is None:
             topics = self._topics if stamp_ns is not None else ()
             return {topic: plain.JointState(stamp_ns or 0, self._frame_id, ()) for topic in topics}
+        self._proven = True
         self.count += 1
         self.skipped += found.skipped
         self.wall_s, self.end_ns = found.wall_s, found.end_ns

@@ -251,7 +251,7 @@ class BridgeFront:
         estimation = self.runtime.estimation
         if estimation is not None and bridge.finished and not stop_asked():
             inputs.ended = True
-            estimation.worker.finish()
+            estimation.finish()
             while not (estimation.done or stop_asked() or time.monotonic() >= give_up):
                 time.sleep(_POLL_S)
                 for timer in periodic:

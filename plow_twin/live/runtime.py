@@ -256,6 +256,8 @@ class Runtime:
         self.deactivate()
         lost = []
         if self.estimation:
+            restarts = self.estimation.restarts
+            lost += [f"the estimator has ended and was started again: {restarts} times"] if restarts else []
             lost += [self.estimation.worker.error] if self.estimation.worker.error else []
             self.estimation.worker.close()
         if self.wear_keeper:
@@ -447,6 +449,8 @@ class Runtime:
     def _look_for_estimate(self) -> None:
         assert self.estimation is not None
         messages = self.estimation.poll(self.driver.session)
+        if revived := self.estimation.revive():
+            self._front.say_error(revived)
         for topic, message in messages.items():
             self._front.send(topic, message)
             if self.recording:
