@@ -227,19 +227,19 @@ def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool)
 
 def _followed(given: _Given, members: int, dt: float | None) -> tuple[list[str], Any]:
     from plow_twin.estimate import followed as offline
+    from plow_twin.live.parameters import SPECS
 
     if not len(given.measured.load):
         raise click.UsageError("--follow: got no load, expected its samples")
     apart = float(max(given.load.t[1:] - given.load.t[:-1], default=0.0))
-    if apart > _LONGEST_GAP_S:
-        raise click.UsageError(f"--follow: got {apart:g} s between two samples, expected at most {_LONGEST_GAP_S:g} s")
+    longest = SPECS["jump_forward"].metadata["high"]
+    if apart > longest:
+        raise click.UsageError(f"--follow: got {apart:g} s between two samples, expected at most {longest:g} s")
     check_rows(float(given.load.t[-1] - given.load.t[0]), dt, "--follow-dt")
     stretch = offline.follow(given.measured.scene, given.load, given.poses, members, dt, gaps=given.gaps)
     return offline.table(stretch.rows)
 
 
-#: Longest time without load through which twins are advanced [s], the largest `jump_forward` of a live twin.
-_LONGEST_GAP_S: Final = 3600.0
 #: Advice to a user whose numbers are not in SI units.
 _REMEDY: Final = "convert the file, or state the unit in a mapping (--map)"
 

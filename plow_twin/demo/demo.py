@@ -131,7 +131,7 @@ def _run(
     speed: str, seconds: float, folder: Path, console: Console, quiet: bool, screen: list[str] | None
 ) -> tuple[Watch, int]:
     """Run all processes until they end. Return the last diagnostics of the node, and the number of sent samples."""
-    from plow_twin.demo.excitation_publisher import QUEUE
+    from plow_twin.demo.excitation_publisher import QUEUE, while_progress
 
     parameters = {
         "scene": _worn_scene(folder),
@@ -172,7 +172,8 @@ def _run(
             _follow(source, twin, watch, spin, bar, task)
             sent = int(json.loads(source.output().splitlines()[-1])["sent"])
         bar.update(task, description="using the last samples", total=None)
-        _catch_up(watch, sent, spin, twin)
+        # on a busy machine, the node falls behind, and samples at the end may never arrive
+        while_progress(lambda: watch.accounted, sent, lambda: _wait(spin, twin), _STUCK_S)
         if estimating:
             bar.update(task, description="estimating", total=None)
             until("estimate", lambda: watch.number("estimate", "estimates") or watch.text("estimate", "error"))
@@ -180,6 +181,12 @@ def _run(
         until("report of the node", lambda: watch.reports > reports, timeout_s=_STOP_TIMEOUT_S)
         twin.stop()
     return watch, sent
+
+
+def _wait(spin: Callable[[], object], twin: Child) -> bool:
+    spin()
+    twin.check()
+    return True
 
 
 def _follow(source: Child, twin: Child, watch: Watch, spin: Any, bar: Progress, task: TaskID) -> None:
@@ -195,19 +202,6 @@ def _follow(source: Child, twin: Child, watch: Watch, spin: Any, bar: Progress, 
             raise DemoError(f"no progress for {patience:g} s at model time {reached:g} s\n{twin.output()}")
         bar.update(task, completed=reached)
     source.check(allowed=(0, 3))
-
-
-def _catch_up(watch: Watch, sent: int, spin: Callable[[], object], twin: Child) -> None:
-    """Wait until the node has used all samples, because it falls behind on a busy machine.
-
-    If samples at the end never arrived, the wait ends after `_STUCK_S` without progress.
-    """
-    moved, before = time.monotonic(), watch.accounted
-    while watch.accounted < sent and time.monotonic() - moved < _STUCK_S:
-        spin()
-        twin.check()
-        if watch.accounted > before:
-            moved, before = time.monotonic(), watch.accounted
 
 
 def _until(name: str, reached: Callable[[], Any], spin: Callable[[], Any], child: Child, timeout_s: float) -> None:

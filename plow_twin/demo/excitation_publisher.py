@@ -16,7 +16,7 @@ import math
 import struct
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -157,13 +157,14 @@ class ExcitationPublisher(WithoutEvents):
         When a publisher ends, the middleware discards the samples that a slow twin has not read.
         """
         self._samples.wait_for_all_acked(Duration(nanoseconds=round(_STALL_S * NS_PER_S)))
-        moved, before = time.monotonic(), self._answered_ns
-        while self._answered_ns < self._last_ns and not self._stop.stopped and time.monotonic() - moved < _SILENT_S:
-            if not self.count_publishers("contact_peaks"):
-                return  # no twin is there
-            self._executor.spin_once(timeout_sec=0.05)
-            if self._answered_ns > before:
-                moved, before = time.monotonic(), self._answered_ns
+        while_progress(lambda: self._answered_ns, self._last_ns, self._hear_twin, _SILENT_S)
+
+    def _hear_twin(self) -> bool:
+        """Wait briefly for an answer. Return False if there is no twin, or a stop was requested."""
+        if self._stop.stopped or not self.count_publishers("contact_peaks"):
+            return False
+        self._executor.spin_once(timeout_sec=0.05)
+        return True
 
     def _wait_for_answer(self, stamp_ns: int) -> None:
         give_up = time.monotonic() + _STALL_S
@@ -199,6 +200,14 @@ class ExcitationPublisher(WithoutEvents):
     def _on_answer(self, data: bytes) -> None:
         sec, nanosec = _STAMP.unpack_from(data)
         self._answered_ns = max(self._answered_ns, sec * NS_PER_S + nanosec)
+
+
+def while_progress(reached: Callable[[], int], target: int, wait: Callable[[], bool], longest_s: float) -> None:
+    """Call `wait` until `reached()` is `target` or has not changed for `longest_s`, or `wait` returns False."""
+    moved, before = time.monotonic(), reached()
+    while reached() < target and time.monotonic() - moved < longest_s and wait():
+        if reached() > before:
+            moved, before = time.monotonic(), reached()
 
 
 def plan(

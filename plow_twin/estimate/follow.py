@@ -42,7 +42,7 @@ from plow_twin.model.scene import Scene
 from plow_twin.run.advance import Advance
 from plow_twin.run.twin import Advanced
 from plow_twin.solve.state import ROW
-from plow_twin.stream.driven import MOST_MEASURED, PoseCounts
+from plow_twin.stream.driven import MOST_MEASURED, Learned, PoseCounts
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
@@ -487,20 +487,22 @@ class Follower:
             return False
         return all(other.known for own, other in pairs if own.known)
 
-    @property
-    def known(self) -> str:
-        """The followed estimate (JSON); empty for the prior."""
-        return self._text
+    def learned(self, origin_ns: int | None) -> Learned:
+        """Return the estimate, the steering and the counts, which `learn` sets after a change of the motion.
 
-    def follow_estimate(self, known: str, origin_ns: int | None) -> None:
-        """Follow the estimate `known` (JSON), whose model time began at the stamp `origin_ns` [ns].
-
-        The harmonics of the load wait for `begin_at`, because their phases depend on the new origin.
+        The harmonics of the load in the estimate wait for `begin_at`, because their phases depend on the model time,
+        which began at the stamp `origin_ns` [ns].
         """
-        known = _waiting(known, origin_ns)
-        if known != self._text:
+        return Learned(_waiting(self._text, origin_ns), self.steered, self.poses)
+
+    def learn(self, learned: Learned) -> None:
+        """Continue from the present motion with the estimate, the steering and the counts of an earlier state."""
+        if self.steered and not learned.steered:  # too many twins for this computer
+            self.follow_parameters()
+        if learned.estimate != self._text:
             self.catch_up()
-            self._begin_anew(known)
+            self._begin_anew(learned.estimate)
+        self.poses = learned.poses
 
     def begin_at(self, origin_ns: int) -> None:
         """Set the stamp [ns] of model time 0, and use harmonics of the load that wait for it."""

@@ -122,7 +122,7 @@ class Ensemble:
         #: sum of the squared normalised innovations of each member
         self.square = np.zeros(members)
         # whether each degree of freedom is free, and number of consecutive outliers
-        self._free = np.array([name not in scene.locked for name in DOF_NAMES])
+        self._free = np.array(scene.free)
         self.outlying = 0
         # `_path`: recent times in s and poses (m, 3) in order of time
         # `_v`, `worn`, `_depth`: present rates (m, 3), wear depths (m, 8) and penetrations (m, 8)

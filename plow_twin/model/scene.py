@@ -405,6 +405,11 @@ class Scene:
         if problems:
             raise SceneError(problems)
 
+    @property
+    def free(self) -> tuple[bool, ...]:
+        """Whether x, y and theta are free, shape (3,)."""
+        return tuple(name not in self.locked for name in DOF_NAMES)
+
 
 #: Parts that every scene has.
 SECTIONS: Final[Mapping[str, type]] = {

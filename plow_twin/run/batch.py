@@ -276,10 +276,10 @@ class TwinBatch:
         q : array_like, shape (k, 3)
             Poses x, y [m], theta [rad]. If a contact continues, the damping factor from its first touch remains valid.
         v : array_like, shape (k, 3)
-            Rates of the poses in m/s, m/s and rad/s.
+            Rates of the poses in m/s, m/s and rad/s; rates of locked degrees of freedom are set to 0.
         """
         index = np.asarray(which, dtype=np.int64)
-        poses, rates = np.asarray(q, dtype=np.float64), np.asarray(v, dtype=np.float64)
+        poses, rates = np.asarray(q, dtype=np.float64), np.where(self.scenes[0].free, v, 0.0)
         places = geometry.states_of(self.scenes[0], np.concatenate([poses, rates], axis=1))
         settle_moved(self._params, self._states, index, places, self.time, self._stick)
         self._reload()

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from plow_twin.errors import ArgumentError, SceneError, SolverError
 from plow_twin.model import geometry
-from plow_twin.model.scene import DOF_NAMES, Load, Scene, Table
+from plow_twin.model.scene import Load, Scene, Table
 from plow_twin.run.motion import BUDGET, Motion, next_slice, run_events
 from plow_twin.run.tangent_columns import columns_beside, fits_tangents, is_curved
 from plow_twin.solve.compiled_scene import TOLERANCE_RANGE, CompiledScene, compile_scene
@@ -414,8 +414,7 @@ def displacement_beside(
 
 def free_places(scene: Scene) -> NDArray[np.int64]:
     """Return the indices of the free coordinates, followed by the indices of their rates."""
-    places = [index for index, name in enumerate(DOF_NAMES) if name not in scene.locked]
-    return np.array(places + [3 + index for index in places], dtype=np.int64)
+    return np.flatnonzero(scene.free * 2)
 
 
 def _beside(

@@ -16,7 +16,7 @@ from plow_twin.errors import ArgumentError, LimitError, RunInterrupted
 from plow_twin.kernel.compiler import for_arguments
 from plow_twin.model import geometry
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
-from plow_twin.model.scene import DOF_NAMES, Initial, Scene, check_travel_speed
+from plow_twin.model.scene import Initial, Scene, check_travel_speed
 from plow_twin.run.advance import Advance, AdvanceSeries, check_times
 from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, Pace, check_limits
 from plow_twin.solve import loop
@@ -319,7 +319,7 @@ class Twin:
             q, v = (np.asarray(part, dtype=np.float64) for part in pose)
             if q.shape != (3,) or v.shape != (3,) or not np.isfinite([q, v]).all():
                 raise ArgumentError(f"pose: got {pose!r}, expected two times 3 finite numbers")
-            v = np.where([name in self.scene.locked for name in DOF_NAMES], 0.0, v)
+            v = np.where(self.scene.free, v, 0.0)
             initial = Initial((q[0], q[1], q[2]), (v[0], v[1], v[2]))
             begin = replace(begin, scene=replace(self.scene, initial=initial))
         self._states[0] = begin.initial_state(t, depth)
@@ -333,9 +333,9 @@ class Twin:
         q : array_like, shape (3,)
             Pose x, y [m], theta [rad]. If a contact continues, the damping factor from its first touch remains valid.
         v : array_like, shape (3,)
-            Rates of the pose in m/s, m/s and rad/s.
+            Rates of the pose in m/s, m/s and rad/s; rates of locked degrees of freedom are set to 0, as by `reset`.
         """
-        place = geometry.states_of(self.scene, np.concatenate([q, v])[None])
+        place = geometry.states_of(self.scene, np.concatenate([q, np.where(self.scene.free, v, 0.0)])[None])
         settle_moved(self._params, self._states, _THE_ONE, place, self.time, self._parts.terms.stick)
 
     def set_travel_speed(self, speed_m_s: float) -> None:

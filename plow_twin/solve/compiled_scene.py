@@ -18,7 +18,7 @@ from plow_twin.model import geometry
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.loads import LoadSet, Pieces, compile_loads
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
-from plow_twin.model.scene import DOF_NAMES, Contact, Head, Scene, Table, Wear
+from plow_twin.model.scene import Contact, Head, Scene, Table, Wear
 from plow_twin.solve.method.implicit import OVERDAMPED_RATIO, new_implicit
 from plow_twin.solve.modes import settle_modes
 from plow_twin.solve.state import (
@@ -238,7 +238,7 @@ def _unchanged(scene: Scene, sampled: bool, shared: _Shared) -> _Unchanged:
         radius=geometry.half_diagonal(scene),
         wear_per_impulse=_wear_rates(scene.wear),
         offset=scene.head.com_offset_m,
-        free=[float(name not in scene.locked) for name in DOF_NAMES],
+        free=scene.free,
         fastest=float(loads.omega.max(initial=0.0)),
         leverage=float(np.hypot(rows[0], rows[1]).max()),
         max_events=MAX_EVENTS_AT_ONCE,

@@ -64,6 +64,16 @@ class PoseCounts(NamedTuple):
     dropped: int = 0
 
 
+class Learned(NamedTuple):
+    """Part of the state of a following twin that does not belong to its motion."""
+
+    #: the followed estimate (JSON), whose load waits for a new model time; empty for the prior
+    estimate: str
+    #: whether poses move the twins
+    steered: bool
+    poses: PoseCounts
+
+
 @runtime_checkable
 class Following(Driven, Protocol):
     """A twin that is corrected by measured poses and by estimates.
@@ -90,16 +100,11 @@ class Following(Driven, Protocol):
     def add_estimate(self, text: str, t: float, start: float = ...) -> None:
         """Add an estimate (JSON) with effect from model time `t` [s]; its window begins at `start` [s]."""
 
-    @property
-    def known(self) -> str:
-        """The estimate (JSON) that the twin follows; empty while it follows the prior."""
+    def learned(self, origin_ns: int | None) -> Learned:
+        """Return the part of the state that `learn` sets. `origin_ns` is the stamp of model time 0, if there is any."""
 
-    @property
-    def steered(self) -> bool:
-        """Whether poses move the twins."""
-
-    def follow_estimate(self, known: str, origin_ns: int | None) -> None:
-        """Continue from the present state with the estimate `known` (JSON), whose model time began at `origin_ns`."""
+    def learn(self, learned: Learned) -> None:
+        """Continue from the present motion with the estimate, the counts and the steering of an earlier state."""
 
     def begin_at(self, origin_ns: int) -> None:
         """Set the stamp [ns] of model time 0."""

@@ -23,7 +23,7 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import check_travel_speed
 from plow_twin.solve.samples import model_times
 from plow_twin.stream import journal
-from plow_twin.stream.driven import MOST_MEASURED, Driven, Following, PoseCounts
+from plow_twin.stream.driven import MOST_MEASURED, Driven, Following
 from plow_twin.stream.history import History
 from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
 from plow_twin.stream.outputs import NONE, NOTHING, THE_ONE, Outputs, Published, Rows, Stock
@@ -665,9 +665,7 @@ class Session:
         """Restore the motion from a snapshot, but neither the wear nor changed numbers of the scene."""
         state = SessionState.unpack(data)
         twin_data, changes = self._split_changes(state.twin)
-        known, steered, poses, origin_ns = "", False, PoseCounts(), self.origin_ns
-        if self.following is not None:
-            known, steered, poses = self.following.known, self.following.steered, self.following.poses
+        learned = None if self.following is None else self.following.learned(self.origin_ns)
         self._end_motion()
         if changes == self.changes and (state.wear_depth == self.wear_depth).all():
             self.twin.restore(twin_data)
@@ -675,11 +673,8 @@ class Session:
             saved = self.twin.like(changed_scene(self._scene, changes))
             saved.restore(twin_data)
             self._carry(saved)
-        if self.following is not None:
-            if self.following.steered and not steered:  # too many twins for this computer
-                self.following.follow_parameters()
-            self.following.follow_estimate(known, origin_ns)
-            self.following.poses = poses
+        if self.following is not None and learned is not None:
+            self.following.learn(learned)
         if self._wears:
             self.twin.set_travel_speed(self.travel_speed_m_s)
 
