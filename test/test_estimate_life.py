@@ -171,6 +171,11 @@ def test_of_a_run_the_pads_as_it_left_them_count_and_no_estimate_of_others(tmp_p
     scene, newest = left_by(RunReader(tmp_path / "kept"))
     assert newest == of_old_pads
     assert scene.wear is not None and scene.wear.initial_depth_m == pytest.approx(depth, abs=1e-12)
+    # the wear of the run itself, as last published
+    run = record_run(tmp_path / "worn", map(paper_sample, range(300)), wear=Wear(1e-9, 0.015, 2.0))
+    depths = [message.position[2:10] for topic, message in run.outputs if topic.endswith("clearance")]
+    worn, _ = left_by(RunReader(run.folder))
+    assert worn.wear is not None and max(depths[-1]) > 0.0 and worn.wear.initial_depth_m == tuple(depths[-1])
 
 
 def test_a_scene_without_wear_or_period_is_refused() -> None:

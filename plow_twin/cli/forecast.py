@@ -130,7 +130,7 @@ def forecast(
         draw_forecast(found, plot, f"Forecast of {Path(scene).name}, drawn {datetime.now(UTC):%Y-%m-%d}")
     facts["lost"] = lost
     if lost:
-        say_error(f"plow-twin: {scene}: lost {counts(lost)}; there may be a newer estimate")
+        say_error(f"plow-twin: {scene}: lost {counts(lost)}; there may be a newer estimate and more wear")
     if as_json:
         click.echo(json.dumps(facts, indent=2, allow_nan=False))
     elif not quiet:
@@ -156,7 +156,7 @@ def _check_limits(limits_m: tuple[float, float], scene: Scene) -> None:
 def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
     """Return a scene, or the scene at the end of a run, with its last estimate and the losses of its journal."""
     from plow_twin.record.estimated import left_by
-    from plow_twin.record.reader import RunReader, own_run
+    from plow_twin.record.reader import FileStatus, RunReader, own_run
     from plow_twin.scene_file import load_scene
 
     if not Path(name).exists() or own_run(Path(name)) is None:
@@ -164,6 +164,7 @@ def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
     reader = RunReader(Path(name))
     left, newest = left_by(reader)
     counts = {"journal": reader.lost.get("journal", 0), "damaged_chunks": reader.damaged_chunks, **reader.lost_parts}
+    counts["truncated_files"] = int(reader.status is FileStatus.TRUNCATED)
     lost = {topic: count for topic, count in counts.items() if count}
     return left, None if newest is None else json.loads(newest.result), lost
 

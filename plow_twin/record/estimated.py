@@ -6,13 +6,20 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from mcap.exceptions import McapError
+
+from plow_twin.errors import RecordingError
 from plow_twin.estimate.measurements import UNSTATED, Deviation
 from plow_twin.estimate.window import Window, Windows
+from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
-from plow_twin.record.reader import RunReader
+from plow_twin.record.cdr import decode
+from plow_twin.record.messages import JointState
+from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.stream import journal
 from plow_twin.stream.model_changes import changed_scene, read_changes
 from plow_twin.stream.snapshot import SessionState
+from plow_twin.stream.topics import JOINT_STATE
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,25 +74,46 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
 def left_by(reader: RunReader) -> tuple[Scene, journal.Estimated | None]:
     """Return the scene at the end of a run, including wear and changes of the model, and the last estimate.
 
-    An estimate before the last setting of the wear is not returned.
+    An estimate before the last setting of the wear is not returned. Without outputs, the wear is that of the last entry
+    that contains it.
     """
     scene, newest = reader.header.scene(reader.path), None
-    depth, changes = None, dict[str, float]()
+    depth, changes, sequence = None, dict[str, float](), 0
     for batch in reader.batches(outputs=False):
-        for _, entry in sorted(batch.entries.others.items()):
+        for index, entry in sorted(batch.entries.others.items()):
             match entry:
                 case journal.Estimated():
                     newest = entry
                 case journal.SetWear(_, set_depth):
-                    newest, depth = None, set_depth
+                    newest, depth, sequence = None, set_depth, int(batch.entries.sequence[index])
                 case journal.SetModel(_, text):
                     changes = read_changes(text)
                 case journal.Snapshot(_, data):
                     depth = tuple(SessionState.unpack(data).wear_depth.tolist())
+                    sequence = int(batch.entries.sequence[index])
+    if reader.status is not FileStatus.TRUNCATED:
+        depth = _last_published_depth(reader, sequence) or depth
     scene = changed_scene(scene, changes)
     if depth is not None and scene.wear is not None:
         scene = replace(scene, wear=replace(scene.wear, initial_depth_m=depth))
     return scene, newest
+
+
+def _last_published_depth(reader: RunReader, after: int) -> tuple[float, ...] | None:
+    """Return the wear depths [m] in the last message on `clearance`, or None if it precedes entry number `after`."""
+    from mcap.reader import make_reader
+
+    topic = reader.header.topic("clearance")
+    try:
+        with reader.parts[-1].open("rb") as stream:
+            _, _, message = next(make_reader(stream).iter_messages([topic], reverse=True))
+        numbers = decode(message.data, JOINT_STATE)
+    except (OSError, StopIteration, McapError, RecordingError):
+        return None
+    assert isinstance(numbers, JointState)
+    if (message.sequence - after) % 2**32 >= 2**31:
+        return None
+    return tuple(map(float, numbers.position[2 : 2 + PAIR_COUNT]))
 
 
 def stated(parameters: Mapping[str, Any]) -> tuple[Deviation, Deviation]:
