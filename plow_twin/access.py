@@ -46,3 +46,8 @@ def read_secret(path: Path) -> str:
         expected = f"a password or token, at most {_LONGEST_SECRET} printable bytes"
         raise InputError([Problem("line 1", f"{len(line)} bytes", expected)], str(path))
     return text
+
+
+def key_format(data: bytes) -> str:
+    """Return the format of a certificate or key, `pem` or `der`. A name such as `twin.key` does not tell it."""
+    return "pem" if b"-----BEGIN" in data else "der"

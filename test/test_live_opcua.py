@@ -417,6 +417,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
              "-keyout", str(folder / f"{name}.key.pem"), "-out", str(folder / f"{name}.pem")],
             check=True, capture_output=True,
         )  # fmt: skip
+        (folder / f"{name}.key").symlink_to(f"{name}.key.pem")  # a usual name of a key in PEM
     return folder
 
 
@@ -431,7 +432,7 @@ def secured(certificates: Path) -> Iterator[tuple[Plant, Access]]:
             password="s3cret",
             ca=certificates / "server.pem",
             certificate=certificates / "client.pem",
-            key=certificates / "client.key.pem",
+            key=certificates / "client.key",
         ),
     )
     plant.close()
@@ -464,7 +465,7 @@ def test_a_user_signs_in_by_certificate_and_no_other_one_does(
     plant, access = secured
     access = replace(access, user="", password="")
     for name, admitted in (("user", True), ("other", False)):
-        files = {"user_certificate": certificates / f"{name}.pem", "user_key": certificates / f"{name}.key.pem"}
+        files = {"user_certificate": certificates / f"{name}.pem", "user_key": certificates / f"{name}.key"}
         bridge = OpcUa(replace(access, **files), roles)
         if not admitted:
             with pytest.raises(BridgeError, match="refused"):
@@ -497,6 +498,7 @@ def test_untrusted_and_unencrypted_connections_are_refused(
     for wrong, said in (
         ({"password": "guess"}, "refused"),
         ({"ca": certificates / "other.pem"}, "certificate verify failed"),
+        ({"key": certificates / "other.key"}, "the key does not belong to the certificate"),
         ({"certificate": None, "key": None, "ca": None}, "refused|No matching"),
         ({"url": f"opc.tcp://127.0.0.1:{server.port}/plant"}, "offers no encryption"),
         ({"url": "opc.tcp://localhost:1"}, "no server at localhost:1"),

@@ -18,6 +18,7 @@ from asyncua.server.user_managers import UserManager
 from asyncua.ua.status_codes import StatusCodes
 from cryptography import x509
 
+from plow_twin.access import key_format
 from plow_twin.dashboard.link import Link
 from plow_twin.telemetry.opcua.conditions import Conditions
 from plow_twin.telemetry.opcua.model import Model
@@ -122,10 +123,12 @@ class OpcUaServer:
     async def _encrypt(self, certificate: str, key: str) -> None:
         try:
             data, private = Path(certificate).read_bytes(), Path(key).read_bytes()
-            await self._server.load_certificate(data, _format(data))
-            await self._server.load_private_key(private, format=_format(private))
-            loaded = self._server.iserver.certificate
-            assert loaded is not None
+            await self._server.load_certificate(data, key_format(data))
+            await self._server.load_private_key(private, format=key_format(private))
+            loaded, own_key = self._server.iserver.certificate, self._server.iserver.private_key
+            assert loaded is not None and own_key is not None
+            if own_key.public_key() != loaded.public_key():
+                raise ValueError("the key does not belong to the certificate")
             uri = _uri(loaded)
             if uri:
                 await self._server.set_application_uri(uri)
@@ -148,10 +151,6 @@ def _data(value: Value, group: Group) -> ua.DataValue:
     kind = ua.VariantType.Int32 if isinstance(value, int) else kind
     status = _HELD if group.held and isinstance(value, float) else _GOOD
     return ua.DataValue(ua.Variant(value, kind), status, stamp, datetime.now(UTC))
-
-
-def _format(data: bytes) -> str:
-    return "pem" if b"-----BEGIN" in data else "der"
 
 
 def _uri(certificate: x509.Certificate) -> str:

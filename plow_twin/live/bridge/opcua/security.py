@@ -9,10 +9,11 @@ from typing import Final
 from asyncua import ua
 from asyncua.client.client import Client
 from asyncua.crypto import security_policies
-from asyncua.crypto.uacrypto import CertProperties
+from asyncua.crypto.uacrypto import CertProperties, load_private_key
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 
+from plow_twin.access import key_format
 from plow_twin.live.bridge.access import Access
 from plow_twin.live.bridge.source import BridgeError
 
@@ -42,12 +43,16 @@ async def secure(client: Client, access: Access, host: str) -> None:
         raise BridgeError(f"{access.url}: got a server that offers no encryption, expected one of {expected}")
     server = _first(offered[policy.URI].ServerCertificate)
     _check_trust(x509.load_der_x509_certificate(server), _read(access.ca), host, access)
-    client.application_uri = _application_uri(_read(access.certificate), client.application_uri)
+    own = _read(access.certificate)
+    client.application_uri = _application_uri(own, client.application_uri)
     try:
+        key = await load_private_key(access.key, extension=_format(access.key))
+        if key.public_key() != own.public_key():  # the server would not answer
+            raise ValueError("the key does not belong to the certificate")
         await client.set_security(
             policy,
-            CertProperties(str(access.certificate)),
-            CertProperties(str(access.key)),
+            CertProperties(str(access.certificate), _format(access.certificate)),
+            CertProperties(str(access.key), _format(access.key)),
             server_certificate=CertProperties(server, "der"),
             mode=_MODE,
         )
@@ -57,10 +62,11 @@ async def secure(client: Client, access: Access, host: str) -> None:
 
 async def identify(client: Client, access: Access) -> None:
     """Configure a client to log in with the certificate of a user."""
-    assert access.user_key, "checked with the address"
+    certificate, key = access.user_certificate, access.user_key
+    assert certificate and key, "checked with the address"
     try:
-        await client.load_client_certificate(str(access.user_certificate))
-        await client.load_private_key(access.user_key)
+        await client.load_client_certificate(str(certificate), _format(certificate))
+        await client.load_private_key(key, extension=_format(key))
     except (OSError, ValueError, TypeError) as error:
         raise BridgeError(f"user: --user-cert and --user-key cannot be used: {error}") from error
 
@@ -70,21 +76,25 @@ def _first(chain: bytes) -> bytes:
     return chain[: int.from_bytes(chain[2:4], "big") + 4]
 
 
+def _format(path: Path) -> str:
+    return key_format(path.read_bytes())
+
+
 def _read(path: Path) -> x509.Certificate:
     try:
         data = path.read_bytes()
-        return x509.load_pem_x509_certificate(data) if b"-----BEGIN" in data else x509.load_der_x509_certificate(data)
+        return (
+            x509.load_pem_x509_certificate(data) if key_format(data) == "pem" else x509.load_der_x509_certificate(data)
+        )
     except (OSError, ValueError) as error:
         raise BridgeError(f"{path}: got no certificate, expected PEM or DER: {error}") from error
 
 
 def _check_trust(server: x509.Certificate, trusted: x509.Certificate, host: str, access: Access) -> None:
     """Raise a `BridgeError` unless the certificate is `trusted` itself, or `trusted` issued it for the host."""
-    now = datetime.now(UTC)
-    if not server.not_valid_before_utc <= now <= server.not_valid_after_utc:
-        raise BridgeError(
-            f"{access.url}: the server's certificate is not valid now: until {server.not_valid_after_utc}"
-        )
+    begin, end = server.not_valid_before_utc, server.not_valid_after_utc
+    if not begin <= datetime.now(UTC) <= end:
+        raise BridgeError(f"{access.url}: the server's certificate is not valid now, but from {begin} to {end}")
     if server == trusted:
         return
     try:
