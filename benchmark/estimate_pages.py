@@ -77,7 +77,8 @@ def right_models() -> str:
             f"{one['h_range_rmse_mm']:.1f}, {one['v_range_rmse_mm']:.1f} | "
             f"{one['cpu_s']:.1f}, {one['cpu_s_most']:.1f} |"
         )
-    lines += ["", f"Of {total} truths with the right model, {flagged} are flagged as suspect ({flagged / total:.1%})."]
+    share = f"{flagged / total:.1%}"
+    lines += ["", f"Of {total} truths with the correct model, {flagged} are flagged as suspect ({share})."]
     return "\n".join(lines)
 
 
@@ -105,7 +106,7 @@ def right_now() -> str:
     return (
         f"By the present code, {len(error)} clearances of the first two groups have an RMS error of "
         f"{1e3 * np.sqrt(np.mean(error**2)):.3f} mm and a median width of "
-        f"{2e3 * NORMAL_P95 * np.median(deviation):.2f} mm; {inside.sum()} intervals hold."
+        f"{2e3 * NORMAL_P95 * np.median(deviation):.2f} mm; {inside.sum()} intervals contain the truth."
     )
 
 

@@ -248,7 +248,7 @@ def test_a_lost_message_is_seen_by_its_number_and_filled_from_the_history(server
 def test_the_server_s_grants_are_compared_with_the_requests() -> None:
     assert Revised(10.0, 1.0, 100).complaint(1.0) == ""
     assert Revised(10.0, 10.0, 100).complaint(0.0) == ""
-    assert "samples every 100 ms, asked every 1 ms" in Revised(100.0, 100.0, 1000).complaint(1.0)
+    assert "samples every 100 ms, requested every 1 ms" in Revised(100.0, 100.0, 1000).complaint(1.0)
     assert "keeps 1 values, 100 come" in Revised(100.0, 1.0, 1).complaint(1.0)
 
 

@@ -48,7 +48,7 @@ class PageAccess:
         except ValueError:
             host, port = "", None
         if not host or port is None or parts.path or parts.username:
-            raise DashboardError("--listen", listen, "HOST:PORT, as 127.0.0.1:8070; port 0: a free one")
+            raise DashboardError("--listen", listen, "HOST:PORT, such as 127.0.0.1:8070; port 0 selects a free port")
         token = os.environ.get(TOKEN_VARIABLE, "").strip() if token_file is None else read_secret(token_file).strip()
         if token and (len(token) < _SHORTEST or not token.isascii() or not token.isprintable()):
             raise DashboardError("token", f"{len(token)} characters", f"at least {_SHORTEST} of ASCII, without spaces")

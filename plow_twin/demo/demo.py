@@ -371,7 +371,7 @@ def _print_comparison(console: Console, beside: Comparison) -> None:
     shares = ", ".join(f"{name} {share:.1%}" for name, share in beside.error.items())
     console.print(f"error of the forces against the synthetic machine: {shares} of their RMS", highlight=False)
     came = ", ".join(f"{time_s:.1f}" for time_s in beside.estimates_s)
-    text = f"estimates came at {came} s of the run" if came else "no estimate came during the run"
+    text = f"estimates were made at {came} s of the run" if came else "no estimate was made during the run"
     if not came or beside.estimates_s[0] > beside.since_s:
         text += ", too late for these forces: before the first estimate, the twin uses the values of the scene"
     console.print(text, highlight=False)

@@ -51,8 +51,8 @@ class History:
         positive = (self.clearance > 0.0).all() and (self.deviation > 0.0).all()
         if not (finite and positive and (np.diff(self.travel) >= 0.0).all()):
             raise LifeError(
-                "history: got a row that is not finite, has a value not above zero or goes back in travel, expected "
-                "no such row"
+                "history: got an impossible row, expected finite numbers, clearances and deviations above 0, and a "
+                "travel that does not decrease"
             )
 
 

@@ -121,7 +121,7 @@ def fit_jointly(problem: Problem, found: Fit, forces: ContactForces, widened: fl
     if against:
         return replace(not_used("a cell contradicts the motion"), sensor=tuple(against))
     if cells is None:
-        return not_used("no cell is where the head touches")
+        return not_used("the head touches no wall with a load cell")
     return _Joint(problem, found, feeling, cells, widened).solve()
 
 

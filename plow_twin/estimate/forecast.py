@@ -58,7 +58,7 @@ class Scenario:
                 numbers[key.strip()] = math.nan
         good = bool(name.strip()) and numbers.keys() <= {"load", "coefficient"}
         if not good or not all(0.0 < value < math.inf for value in numbers.values()):
-            raise LifeError(f"scenario: got {text!r}, expected NAME:load=X,coefficient=Y, one or both, above 0")
+            raise LifeError(f"scenario: got {text!r}, expected NAME:load=X,coefficient=Y, one or both factors, above 0")
         return Scenario(name.strip(), **numbers)
 
 

@@ -72,7 +72,7 @@ class Forward:
                 f"scene: got head.carries {scene.head.carries}, expected walls, because the fit cannot use a block"
             )
         if scene.support is not None:
-            raise EstimateError(f"scene: got {scene.support}, expected no support, whose place the fit does not know")
+            raise EstimateError(f"scene: got {scene.support}, expected none: the fit assumes a fixed frame")
         nominal = compile_scene(replace(scene, loads=(), wear=None), tuning.TOLERANCE, sampled=True)
         self._terms = nominal.parts.terms
         self._implicit = nominal.parts.implicit

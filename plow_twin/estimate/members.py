@@ -46,7 +46,7 @@ _MOST_OUTLYING: Final = 5
 #: Lower bound on the number of members that adopt parameters in one call, which costs as much as three members.
 _AT_ONCE: Final = 8
 _ALL: Final = slice(None)
-#: Probability of a difference from which members have it, by definition of the median probability model.
+#: Smallest probability of a difference that members have, by definition of the median probability model.
 _PROBABLE: Final = 0.5
 #: Lower bound on the friction coefficient of a member, because all members must have the same terms.
 _LEAST_FRICTION: Final = 1e-3

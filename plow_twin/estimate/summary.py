@@ -448,7 +448,7 @@ def not_observable(unknowns: Unknowns, poses: Poses, lost: int, reasons: tuple[s
 
 
 def without_fit(
-    unknowns: Unknowns, poses: Poses, lost: int, why: str = "no motion of the model comes near the measured one"
+    unknowns: Unknowns, poses: Poses, lost: int, why: str = "no motion of the model is near the measured motion"
 ) -> Estimate:
     """Return the prior as a withdrawn estimate."""
     return replace(

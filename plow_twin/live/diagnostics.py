@@ -121,7 +121,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "queued": "items in the queue",
         "lost": "items that were lost, by topic",
         "marks": "rings that were written",
-        "marks_lost": "rings that could not be written",
+        "marks_lost": "recordings in memory (record_ring) that could not be written",
         "error": "reason why data were lost or the recording has stopped",
     },
 }

@@ -35,7 +35,7 @@ class OutputPublishers:
         self._senders = {topic: Sender(self._publishers[topic], data) for topic, data in memory.items()}
 
     def send(self, topic: str, message: memoryview | Message) -> None:
-        """Send a message, or the content of the buffer of the topic if `message` is a buffer."""
+        """Send a message. If `message` is the topic's buffer, its bytes are sent."""
         if isinstance(message, memoryview):
             self._senders[topic].send()
         else:

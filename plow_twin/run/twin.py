@@ -318,7 +318,7 @@ class Twin:
         if pose is not None:
             q, v = (np.asarray(part, dtype=np.float64) for part in pose)
             if q.shape != (3,) or v.shape != (3,) or not np.isfinite([q, v]).all():
-                raise ArgumentError(f"pose: got {pose!r}, expected two times 3 finite numbers")
+                raise ArgumentError(f"pose: got {pose!r}, expected pose and rates, 3 finite numbers each")
             v = np.where(self.scene.free, v, 0.0)
             initial = Initial((q[0], q[1], q[2]), (v[0], v[1], v[2]))
             begin = replace(begin, scene=replace(self.scene, initial=initial))

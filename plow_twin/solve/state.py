@@ -80,7 +80,7 @@ _STATUS_TEXT: Final = {
     Status.OK: "done",
     Status.OUT_OF_RANGE: "the head left the model's range: |theta| above 45 degrees or half the cavity penetrated",
     Status.NON_FINITE: "the motion became non-finite; load, stiffness or damping is too large for double precision",
-    Status.BUDGET: "the budget of steps was used up before the time asked for",
+    Status.BUDGET: "the largest number of steps was reached before the target time",
     Status.LOG_FULL: "the event log is full",
     Status.PAUSED: "a slice of the work is done",
 }

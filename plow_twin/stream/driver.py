@@ -53,7 +53,7 @@ class StreamState(Enum):
 
 @dataclass
 class Policy:
-    """Settings for silences and failures, which may change at run time."""
+    """Treatment of silences and failures. The settings may change at run time."""
 
     #: time without a sample [s] after which the model follows the steady clock; the model lags behind the clock by
     #: `excitation_timeout_s`, so that a sample with a smaller delay can still be used

@@ -481,9 +481,9 @@ class Session:
     def _check_late(self, stamp_ns: int) -> None:
         oldest_ns = self.history.oldest_ns
         if oldest_ns is None or stamp_ns <= oldest_ns:
-            limit = "the time reached" if oldest_ns is None else "later than the oldest state kept"
-            bound_ns = self.stamp_ns if oldest_ns is None else oldest_ns
-            raise ValueError(f"stamp: got {stamp_ns} ns, expected at least {limit}, {bound_ns} ns")
+            reached, stored = f"the time reached, {self.stamp_ns} ns", f"the oldest stored state, {oldest_ns} ns"
+            expected = f"at least {reached}" if oldest_ns is None else f"a stamp after {stored}"
+            raise ValueError(f"stamp: got {stamp_ns} ns, expected {expected}")
 
     def _work_in(self, stamp_ns: int, late: Sequence[journal.Sample], *travels: journal.Travel) -> Applied:
         """Go back to a state before a late stamp, and compute the motion again with late samples and travel speeds.

@@ -82,7 +82,7 @@ class Section:
     def corners(self, pose: Iterable[float] = (0.0, 0.0, 0.0)) -> Array:
         """Corners of the frame, or of a block at a pose, in the order of `CORNER_NAMES`, shape (4, 2).
 
-        The corners of a block are named by their present place, also when it has turned by more than 45 degrees.
+        The corners of a block are named by their present place, even after a turn by more than 45 degrees.
         """
         # distance of the middle of a rounded corner from the intersection of its sides, along each axis
         within = self.radius * (1.0 - math.sqrt(0.5))

@@ -55,9 +55,9 @@ class Revised:
     def complaint(self, sampling_ms: float) -> str:
         """Return a text about requests that the server does not grant, or an empty string if it grants all requests."""
         slow = self.sampling_ms > max(1.01 * sampling_ms, self.publishing_ms if sampling_ms == 0.0 else 0.0)
-        found = [f"samples every {self.sampling_ms:g} ms, asked every {sampling_ms:g} ms"] * slow
+        found = [f"samples every {self.sampling_ms:g} ms, requested every {sampling_ms:g} ms"] * slow
         needed = self.publishing_ms / sampling_ms if sampling_ms else 1.0
-        found += [f"keeps {self.queue} values, {needed:.0f} come between two messages"] * (self.queue < needed)
+        found += [f"queues {self.queue} values, but {needed:.0f} arrive between two messages"] * (self.queue < needed)
         return f"the server {'; '.join(found)}" if found else ""
 
 
