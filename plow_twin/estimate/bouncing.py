@@ -75,7 +75,7 @@ _LONGER = 2.0
 _HARD_BOUNDS, _FIRM_BOUNDS = (8e-7, 6e-4), (2e-6, 2e-2)
 #: Upper bound on the number of iterations in which the noise of a simulated motion is adjusted.
 _NOISE_ROUNDS = 3
-#: Time in s between the start of a simulated motion and the first pose.
+#: Time in s from the start of a simulated motion to the first pose, by definition.
 _BEFORE: Final = 0.1
 #: Smallest number of draws, derived from the twenty features of a regression, and smallest number of complete poses,
 #: derived from their 99 % quantile.

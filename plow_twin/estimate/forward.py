@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 #: Upper bounds on one simulation: `_STEPS` plus `_STEPS_PER_SECOND` for each second, and rows of the event log.
 _STEPS_PER_SECOND, _STEPS = 20_000, 2_000
 _LOG_SIZE = 4096
-#: Number of samples that a vector of motions passes in one call. The rows of a call take 21 MB.
+#: Upper bound on the number of samples in one call for a vector of motions, whose rows take 21 MB.
 _SAMPLES = 4096
 #: Cost of an implicit step in series steps.
 _IMPLICIT_WORK = 10
