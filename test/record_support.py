@@ -117,7 +117,7 @@ def rewrite(
     *,
     metadata_last: bool = False,
 ) -> Path:
-    """Copy an MCAP file with third-party tools; `change` may replace the bytes of a message."""
+    """Copy an MCAP file with third-party tools; `change` may replace the bytes of a message; no bytes omit it."""
     with source.open("rb") as stream, target.open("wb") as out:
         writer = Writer(out, chunk_size=64 * 1024)
         writer.start(profile="ros2", library="test")
@@ -134,6 +134,8 @@ def rewrite(
                 number = writer.register_channel(channel.topic, "cdr", schemas[schema.id], channel.metadata)
                 channels[channel.id] = number
             data = change(channel.topic, message)
+            if data == b"":
+                continue
             writer.add_message(
                 channels[channel.id],
                 message.log_time,

@@ -351,6 +351,12 @@ def _walker(prediction: Prediction, session: Session, writer: Any = None) -> Wal
     return walker
 
 
+def _failures(walkers: Sequence[Walker]) -> dict[str, int]:
+    """Return the number of failed advances, if there are any, as a loss."""
+    count = sum(walker.failures for walker in walkers)
+    return {"solver_failures": count} if count else {}
+
+
 def _walk_own(
     reader: RunReader,
     path: Path,
@@ -378,6 +384,7 @@ def _walk_own(
             losses["journal"] = max(walk.missing, losses.get("journal", 0))
         if walk.late:
             losses["samples_too_late"] = walk.late
+        losses.update(_failures(walkers))
         if reader.status not in (FileStatus.COMPLETE, FileStatus.UNREAD):
             losses[reader.status.value] = 1
         measured, unknown, unused = _measured_beside(path, mapping, header.node)
@@ -461,8 +468,7 @@ def _walk_other(
     }
     losses = {**source.losses.counts, **dropped}
     losses |= {f"{UNFIT}{why}": count for why, count in feed.unfit.items()}
-    if walkers[0].failures:
-        losses["solver_failures"] = walkers[0].failures
+    losses |= _failures(walkers)
     if writer is not None:
         writer.close({})
     counted = {"samples_in": intake.arrived, "samples_used": intake.used, **dropped}
