@@ -19,7 +19,8 @@ import numpy as np
 import pytest
 from commands import plow_twin, plow_twin_here
 
-from plow_twin import PAIR_NAMES, simulate
+from plow_twin import PAIR_NAMES, Gravity, simulate
+from plow_twin.cli import scene_facts
 from plow_twin.record.durable import whole_file
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
@@ -238,6 +239,10 @@ def test_info_lists_marks_and_versions() -> None:
     derived = {fact["quantity"]: fact["value"] for fact in facts["derived"]}
     assert derived["constant moment of gravity"] == pytest.approx(-2430 * 9.81 * 0.255)
     assert derived["fx1: amplitude of the moment"] == pytest.approx(-66240)
+    rigid = load_scene("bench_kv")
+    rigid = replace(rigid, head=replace(rigid.head, rotation="consistent", com_offset_m=(0.1, 0.0)), gravity=Gravity())
+    moments = [fact["value"] for fact in scene_facts.derived(rigid) if "moment of gravity" in fact["quantity"]]
+    assert moments == pytest.approx([-rigid.head.mass_kg * 9.81 * 0.1])
     environment = plow_twin_here("info", "--json")
     assert environment.returncode == 0, environment.stderr
     versions = json.loads(environment.stdout)

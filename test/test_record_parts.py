@@ -436,6 +436,8 @@ def test_estimate_and_forecast_report_missing_parts_and_rows_beyond_the_limit(
     assert cli(forecast) == 3
     said = capsys.readouterr()
     assert json.loads(said.out)["lost"] == {"missing_parts": 1} and "there may be a newer estimate" in said.err
+    (empty := tmp_path / "empty").mkdir()
+    assert cli(["forecast", str(empty), *forecast[2:]]) == 1 and "got no .mcap file" in capsys.readouterr().err
 
 
 def test_an_estimate_draws_no_load_over_a_damaged_chunk(tmp_path: Path) -> None:

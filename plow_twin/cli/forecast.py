@@ -159,9 +159,10 @@ def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
     from plow_twin.record.reader import FileStatus, RunReader, own_run
     from plow_twin.scene_file import load_scene
 
-    if not Path(name).exists() or own_run(Path(name)) is None:
+    path = Path(name)
+    reader = RunReader(path) if path.is_dir() else own_run(path) if path.exists() else None
+    if reader is None:
         return load_scene(name), None, {}
-    reader = RunReader(Path(name))
     left, newest = left_by(reader)
     counts = {"journal": reader.lost.get("journal", 0), "damaged_chunks": reader.damaged_chunks, **reader.lost_parts}
     counts["truncated_files"] = int(reader.status is FileStatus.TRUNCATED)

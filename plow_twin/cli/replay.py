@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 @click.option(
     "--write",
     type=FOLDER,
-    help="New folder for a recording with the journal and all outputs after each advance.",
+    help="New folder for a recording with the journal and all outputs after each advance; only digests are compared.",
 )
 @json_option
 @quiet_option

@@ -61,7 +61,9 @@ def derived(scene: Scene) -> list[Fact]:
         _fact("cavity width", scene.frame.width_m + scene.clearance.horizontal_m, "m"),
         _fact("cavity height", scene.frame.height_m + scene.clearance.vertical_m, "m"),
         _fact("weight", weight, "N"),
-        _fact("constant moment of gravity", -weight * gravity.arm_m, "N m"),
+        _fact("constant moment of gravity", -weight * gravity.arm_m, "N m")
+        if scene.head.rotation == "paper"
+        else _fact("moment of gravity at angle 0", -weight * scene.head.com_offset_m[0], "N m"),
     ]
     if scene.friction is not None:
         least = float(painleve_coefficients(scene).min())
@@ -96,4 +98,4 @@ def _load_facts(scene: Scene) -> Iterator[Fact]:
 
 
 def _fact(quantity: str, value: float, unit: str) -> Fact:
-    return {"quantity": quantity, "value": float(value), "unit": unit}
+    return {"quantity": quantity, "value": float(value) + 0.0, "unit": unit}  # adding 0.0 makes -0.0 positive
