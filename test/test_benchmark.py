@@ -58,7 +58,7 @@ def test_random_scenes_stay_within_ten_tolerances_of_their_references(rows: list
         assert 0.0 < float(row["value"]) <= 10.0, row["scene"]
 
 
-def test_the_ensemble_ends_at_the_tolerance_that_every_pair_needs(rows: list[dict[str, str]]) -> None:
+def test_the_ensemble_uses_the_tolerance_that_every_pair_needs(rows: list[dict[str, str]]) -> None:
     timed = [row for row in rows if row["section"] == "ensemble" and row["solver"] == OURS and row["wall_ms"]]
     pairs = [row for row in rows if row["section"] == "ensemble" and not row["wall_ms"]]
     assert float(timed[-1]["error"]) <= 1e-4 and float(timed[-1]["value"]) == 0.0
@@ -106,7 +106,7 @@ def test_time_at_an_error_lies_between_neighbouring_settings() -> None:
     assert float(between) == pytest.approx(20.0, rel=1e-12)
 
 
-def test_a_target_is_reached_when_the_peer_takes_so_many_times_as_long() -> None:
+def test_a_target_is_reached_if_the_peer_takes_a_multiple_of_the_time() -> None:
     code = LADDER + (
         "for wall in (0.66, 0.67):\n"
         "    own = row(w.OURS_BARE, 'tol', wall, 1e-10)\n"
@@ -121,7 +121,7 @@ def test_a_target_is_reached_when_the_peer_takes_so_many_times_as_long() -> None
     assert without == "[]" and contenders == "[0, 1, 2]"
 
 
-def test_a_peer_that_is_missing_is_named() -> None:
+def test_a_missing_peer_is_named() -> None:
     code = (
         "sys.modules['sksundae'] = None; sys.modules['sksundae.cvode'] = None; "
         "import work_precision as w; from cases import measure; "
@@ -133,7 +133,7 @@ def test_a_peer_that_is_missing_is_named() -> None:
     assert status.startswith("not run: ") and "sksundae" in status
 
 
-def test_a_stopped_benchmark_goes_on_where_it_ended(tmp_path: Path) -> None:
+def test_a_stopped_benchmark_continues(tmp_path: Path) -> None:
     code = (
         "from pathlib import Path; from estimate import completed\n"
         "def one(name, seed): print('run', name, seed); return {'seed': seed, 'name': name, 'twice': 2 * seed}\n"
@@ -146,7 +146,7 @@ def test_a_stopped_benchmark_goes_on_where_it_ended(tmp_path: Path) -> None:
     assert run(f"exec({code!r})", str(tmp_path / "rows.jsonl")).splitlines() == [*ran, "2 2 4 4"]
 
 
-def test_the_independent_reference_agrees_with_the_shipped_one(tmp_path: Path) -> None:
+def test_the_independent_reference_agrees_with_the_stored_reference(tmp_path: Path) -> None:
     """For both bench scenes, `reference.c` agrees with trajectories that another program has computed."""
     code = (
         "import numpy as np, random_scenes as r, bench_scenes as b\n"

@@ -117,7 +117,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["dashboard", "own.csv"], 1, "own.csv: not an MCAP file"),
     ],
 )
-def test_a_stranger_s_mistake_is_named_in_a_message(
+def test_a_mistake_in_a_command_is_reported_in_a_message(
     arguments: list[str],
     code: int,
     said: str,
@@ -148,7 +148,7 @@ def test_rows_that_an_estimate_cannot_use_are_counted_in_its_losses(
     assert "twice: lost unreadable_rows: 1, unusable_rows: 1" in shown.err
 
 
-def test_a_load_that_looks_like_kilonewtons_is_named_before_it_is_estimated(
+def test_a_load_that_seems_to_be_in_kilonewtons_is_reported_before_the_estimate(
     desk: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(desk)

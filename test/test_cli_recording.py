@@ -42,7 +42,7 @@ SAMPLES = 600
         (["analyse", "RUN/..", "--workers", "2", "--dask", "tcp://127.0.0.1:1"], "--workers cannot be combined"),
     ],
 )
-def test_options_that_would_be_left_out_are_refused(
+def test_options_without_effect_are_refused(
     given: list[str], expected: str, run: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli([word.replace("RUN", str(run.folder)) for word in given]) == 2
@@ -55,7 +55,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 @pytest.mark.usefixtures("without_workers")
-def test_an_analysis_of_runs_without_measurements_shows_the_model_and_no_empty_table(
+def test_an_analysis_without_measurements_shows_only_the_model(
     run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     copy, made = shutil.copytree(run.folder, tmp_path / "copy"), tmp_path / "again"
@@ -69,7 +69,7 @@ def test_an_analysis_of_runs_without_measurements_shows_the_model_and_no_empty_t
     assert "bias" not in said.out and said.out.count("no measured values to compare") == 2
 
 
-def test_replay_of_an_untouched_recording_ends_with_0(run: Run) -> None:
+def test_replay_of_an_unchanged_recording_exits_with_0(run: Run) -> None:
     done = plow_twin("replay", run.folder, "--json")
     assert (done.returncode, done.stderr) == (0, "")
     facts = json.loads(done.stdout)
@@ -79,7 +79,7 @@ def test_replay_of_an_untouched_recording_ends_with_0(run: Run) -> None:
     assert (quiet.returncode, quiet.stdout, quiet.stderr) == (0, "", "")
 
 
-def test_replay_of_a_flipped_sample_ends_with_1_and_names_the_step(run: Run, tmp_path: Path) -> None:
+def test_replay_of_a_changed_sample_exits_with_1_and_names_the_step(run: Run, tmp_path: Path) -> None:
     flipped = 321
     seen = 0
 
@@ -113,7 +113,7 @@ def test_replay_of_another_build_warns(run: Run, tmp_path: Path) -> None:
     )
 
 
-def test_a_cut_recording_ends_with_3_in_every_verb(run: Run, tmp_path: Path) -> None:
+def test_every_verb_exits_with_3_for_a_truncated_recording(run: Run, tmp_path: Path) -> None:
     data = run.file.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
     to_csv = ("--to", "csv", "--out", tmp_path / "tables")
@@ -124,7 +124,7 @@ def test_a_cut_recording_ends_with_3_in_every_verb(run: Run, tmp_path: Path) -> 
     assert (tmp_path / "cut.rrd").stat().st_size > 10_000
 
 
-def test_a_recording_stopped_early_ends_with_3_in_every_verb(tmp_path: Path) -> None:
+def test_every_verb_exits_with_3_for_a_recording_that_stopped_early(tmp_path: Path) -> None:
     stopped = record_run(tmp_path / "run", map(paper_sample, range(100)), min_free_bytes=2**62)
     assert stopped.loss.closed and not stopped.loss.complete
     for verb in ("replay", "view", "info"):
@@ -134,7 +134,7 @@ def test_a_recording_stopped_early_ends_with_3_in_every_verb(tmp_path: Path) -> 
         assert verb == "view" or f"expected at least {2**62} B" in done.stdout
 
 
-def test_a_recording_with_counted_loss_ends_with_3_in_every_verb(tmp_path: Path) -> None:
+def test_every_verb_exits_with_3_for_a_recording_with_losses(tmp_path: Path) -> None:
     lossy = record_run(tmp_path / "run", map(paper_sample, range(400)), queue_size=40, pause_every=200)
     assert lossy.loss.closed and lossy.loss.lost and lossy.loss.error is None
     for verb in ("replay", "view", "info"):
@@ -143,9 +143,7 @@ def test_a_recording_with_counted_loss_ends_with_3_in_every_verb(tmp_path: Path)
         assert "lost" in done.stdout + done.stderr
 
 
-def test_the_duration_is_that_of_the_advances_in_info_and_doctor(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_info_and_doctor_state_the_duration_of_the_advances(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     end_ns = paper_sample(99).stamp_ns
     entries: list[Entry] = [*map(paper_sample, range(100)), Mark(end_ns + 60 * NS_PER_S, "long after")]
     folder = record_run(tmp_path / "run", entries).folder
@@ -189,7 +187,7 @@ def test_view_refuses_recordings_that_cannot_be_drawn(run: Run, tmp_path: Path) 
     assert refused.returncode == 1 and "excitation_source" in refused.stderr
 
 
-def test_view_names_a_port_that_is_taken(run: Run, tmp_path: Path) -> None:
+def test_view_reports_a_port_in_use(run: Run, tmp_path: Path) -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -218,7 +216,7 @@ def served(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     assert not any(map(answers, ports_of(address[0]))), "the server has outlived the command"
 
 
-def test_view_serves_a_page_on_the_loopback_address_alone(served: str) -> None:
+def test_view_serves_a_page_only_on_the_loopback_address(served: str) -> None:
     assert b"Rerun" in urllib.request.urlopen(served, timeout=60).read()
     listening = {line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines()[1:]}
     for port in ports_of(served):
@@ -226,7 +224,7 @@ def test_view_serves_a_page_on_the_loopback_address_alone(served: str) -> None:
 
 
 @pytest.mark.skipif(browser.CHROMIUM is None, reason="no Chromium is installed")
-def test_a_browser_shows_the_run_at_the_address_that_view_names(served: str, tmp_path: Path) -> None:
+def test_a_browser_shows_the_run_at_the_printed_address(served: str, tmp_path: Path) -> None:
     with browser.page(tmp_path, served) as page:
         # the cross-sections have a dark background; other pages of the viewer have not
         until(lambda: _dark(page.picture()) >= 0.15, f"a picture: {page.errors}, {page.requests}", pause_s=0.5)

@@ -55,7 +55,7 @@ def test_csv_and_json_keep_the_contract(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".npz"])
-def test_a_file_is_the_one_before_or_whole_when_the_disk_is_full(suffix: str, tmp_path: Path) -> None:
+def test_on_a_full_disk_a_file_keeps_its_old_content_or_is_complete(suffix: str, tmp_path: Path) -> None:
     out = tmp_path / f"run{suffix}"
     arguments = ("simulate", "bench_kv", "--t-end", "1", "--quiet", "--out", str(out))
     assert plow_twin_here(*arguments).returncode == 0
@@ -70,13 +70,13 @@ def test_a_file_is_the_one_before_or_whole_when_the_disk_is_full(suffix: str, tm
     assert out.read_bytes() == before and [*tmp_path.iterdir()] == [out]
 
 
-def test_messages_of_a_library_about_a_file_are_kept(tmp_path: Path) -> None:
+def test_messages_of_a_library_about_a_file_are_preserved(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="no such codec"), whole_file(tmp_path / "table"):
         raise OSError("no such codec")
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_device_is_written_to_in_place(tmp_path: Path) -> None:
+def test_a_device_is_written_directly(tmp_path: Path) -> None:
     pipe, other = tmp_path / "pipe.csv", tmp_path / "other.csv"
     os.mkfifo(pipe)
     (tmp_path / "link.csv").symlink_to(other)
@@ -164,7 +164,7 @@ def test_wrong_usage_and_wrong_scenes_exit_with_2(arguments: list[str], said: st
     assert done.stdout == ""
 
 
-def test_a_closed_standard_output_is_no_traceback() -> None:
+def test_a_closed_standard_output_causes_no_traceback() -> None:
     command = [sys.executable, "-m", "plow_twin", "info", "paper"]
     done = subprocess.run(["sh", "-c", '"$@" >&-', "sh", *command], capture_output=True, text=True, timeout=100)
     assert (done.returncode, done.stderr) == (0, "")
@@ -184,7 +184,7 @@ def test_failures_exit_with_1(tmp_path: Path) -> None:
         assert "Traceback" not in done.stderr
 
 
-def test_too_little_memory_is_one_line_and_exits_with_1() -> None:
+def test_too_little_memory_gives_one_line_and_exit_code_1() -> None:
     code = """
 import resource, sys
 from plow_twin import simulate
@@ -203,7 +203,7 @@ main(["simulate", "paper", "--t-end", "1", "--output-dt", "1.1e-7", "--quiet"])
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_stop_signal_while_the_interpreter_ends_changes_nothing(number: int) -> None:
+def test_a_stop_signal_at_the_end_of_the_interpreter_has_no_effect(number: int) -> None:
     code = f"""
 import atexit, os
 from plow_twin.cli import main
@@ -267,7 +267,7 @@ def test_the_energy_balance_closes() -> None:
     assert "balance of energy" in shown and "largest imbalance" in shown
 
 
-def test_words_of_the_paper_scene_name_their_evidence_in_a_comment() -> None:
+def test_comments_of_the_paper_scene_state_the_evidence_for_words() -> None:
     text = scene_path("paper").read_text(encoding="utf-8")
     words = re.findall(r"^ *(rotation|labels|law|locked|pairs|wear): (?:[^#\n]*)(.*)$", text, re.MULTILINE)
     assert {key for key, _ in words} == {"rotation", "labels", "law", "locked", "pairs", "wear"}

@@ -47,7 +47,7 @@ def printed(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
     return lines
 
 
-def test_a_scene_s_numbers_stand_in_one_line_each(printed: Callable[..., list[str]]) -> None:
+def test_each_number_of_a_scene_is_printed_on_one_line(printed: Callable[..., list[str]]) -> None:
     lines = printed("info", "paper")
     assert max(map(len, lines)) <= WIDTH and not any("…" in line for line in lines)
     assert any(re.fullmatch(r"│ +impact_speed_floor_m_s │ +0\.001 │ +m/s │ +assumed +\d+ │", line) for line in lines)
@@ -61,13 +61,13 @@ def test_a_scene_s_numbers_stand_in_one_line_each(printed: Callable[..., list[st
     assert any("paper, parameters of the model" in line for line in lines)
 
 
-def test_the_statistics_of_a_run_stand_in_one_line_each(printed: Callable[..., list[str]]) -> None:
+def test_each_statistic_of_a_run_is_printed_on_one_line(printed: Callable[..., list[str]]) -> None:
     lines = printed("simulate", "paper", "--t-end", "1")
     assert max(map(len, lines[:-1])) <= WIDTH and not any("…" in line for line in lines)
     assert sum(bool(re.match(r"│ (top|bottom)_\w+ +│", line)) for line in lines) == 8
 
 
-def test_a_recording_and_its_replay_are_shown_as_words(printed: Callable[..., list[str]], tmp_path: Path) -> None:
+def test_a_recording_and_its_replay_are_described_in_words(printed: Callable[..., list[str]], tmp_path: Path) -> None:
     made = record_run(tmp_path / "run", map(paper_sample, range(50)))
     shown = printed("info", made.folder)
     columns = {found.end() for line in shown if (found := re.match(r" *\S+ +(?=\S)", line))}
@@ -81,7 +81,7 @@ def test_a_recording_and_its_replay_are_shown_as_words(printed: Callable[..., li
     assert all(str(tmp_path) in line for line in long)  # a path that users may copy is not broken
 
 
-def test_numbers_that_are_estimated_or_compared_have_their_units_and_are_whole(
+def test_estimates_and_comparisons_are_printed_in_full_with_units(
     printed: Callable[..., list[str]], tmp_path: Path
 ) -> None:
     entries = [
@@ -108,7 +108,7 @@ def test_numbers_that_are_estimated_or_compared_have_their_units_and_are_whole(
         assert any(head in line for line in lines)
 
 
-def test_no_verb_s_summary_is_cut() -> None:
+def test_no_summary_of_a_verb_is_truncated() -> None:
     for arguments in (["--help"], ["study", "--help"]):
         assert "..." not in plow_twin_here(*arguments).stdout.replace("[ARGS]...", "")
 

@@ -80,7 +80,7 @@ def test_a_feed_without_a_reader_does_not_wait_and_keeps_the_peaks() -> None:
     link.close()
 
 
-def test_each_second_of_a_file_has_its_update_on_the_screen_and_a_way_out_keeps_its_rate() -> None:
+def test_the_screen_gets_each_second_of_a_file_and_an_output_keeps_its_rate() -> None:
     for by_second, expected in ((True, [float(second) for second in range(1, 30)]), (False, [])):
         link, theirs = pair()
         feed = Feed(link, FACTS, by_second=by_second)
@@ -94,7 +94,7 @@ def test_each_second_of_a_file_has_its_update_on_the_screen_and_a_way_out_keeps_
         link.close()
 
 
-def test_the_hour_is_bounded_has_each_second_once_and_is_cleared_where_stamps_step_back() -> None:
+def test_the_history_has_each_second_of_an_hour_once_and_is_cleared_when_stamps_step_back() -> None:
     history = History()
     motion = {"load_low": [0, -1, None], "load_high": [0, 1, None], "was_held": False}
     for version in range(1, 2 * SPAN_S + 1):
@@ -111,7 +111,7 @@ def test_the_hour_is_bounded_has_each_second_once_and_is_cleared_where_stamps_st
     assert history.since(0)[0][22:] == [2.0] * 8 + [4.0] * 8
 
 
-def test_the_intervals_of_a_twin_that_follows_are_shown_with_its_peaks() -> None:
+def test_the_screen_shows_the_intervals_of_a_following_twin() -> None:
     link, theirs = pair()
     feed = Feed(link, FACTS)
     for low, high in ((5.0, 20.0), (7.0, 15.0)):
@@ -183,7 +183,7 @@ def test_options_of_a_screen_without_the_screen_are_refused(tmp_path: Path) -> N
     assert done.returncode == 2 and "--listen: got no --dashboard" in done.stderr
 
 
-def test_a_screen_that_waits_for_a_file_says_so(tmp_path: Path) -> None:
+def test_a_screen_reports_that_it_waits_for_a_file(tmp_path: Path) -> None:
     file = tmp_path / "load.csv"
     command = [sys.executable, "-m", "plow_twin", "live", str(file), *OPTIONS, "--follow", "--dashboard"]
     pipes = dict.fromkeys(("stdout", "stderr"), subprocess.PIPE)
@@ -194,7 +194,7 @@ def test_a_screen_that_waits_for_a_file_says_so(tmp_path: Path) -> None:
         process.kill()
 
 
-def test_names_that_others_may_own_are_not_answered_to() -> None:
+def test_foreign_host_names_are_refused() -> None:
     here, beyond = PageAccess("127.0.0.1", 8070), PageAccess("0.0.0.0", 8070, TOKEN)
     assert all(here.answers_to(name) for name in ("localhost:8070", "127.0.0.1:8070", "[::1]:8070"))
     assert not any(here.answers_to(name) for name in ("evil.example:8070", "192.168.1.5:8070", "", "["))
@@ -217,7 +217,7 @@ def _status(url: str, **headers: str) -> int:
             return error.code
 
 
-def test_who_has_no_token_comes_from_another_page_or_asks_for_another_name_sees_nothing() -> None:
+def test_requests_without_token_from_other_pages_or_under_other_names_are_refused() -> None:
     with Screen(PageAccess("127.0.0.1", 0, TOKEN), FACTS) as screen:
         screen.feed.turn()
         url = screen.url
@@ -255,7 +255,7 @@ def _memory_kb(pid: int) -> int:
     return int(next(line for line in text.splitlines() if line.startswith("VmRSS")).split()[1])
 
 
-def test_a_frozen_page_costs_no_memory_delays_no_page_and_gets_the_newest_when_it_reads_again() -> None:
+def test_a_frozen_page_takes_no_memory_and_later_continues_with_the_newest_data() -> None:
     with (
         Screen(PageAccess("127.0.0.1", 0), FACTS) as screen,
         socket.create_connection(("127.0.0.1", int(screen.url.rstrip("/").rpartition(":")[2]))) as raw,
@@ -339,7 +339,7 @@ def _digests(run: Path) -> list[Digest]:
     return [entry for entry in entries if isinstance(entry, Digest)]
 
 
-def test_ten_readers_a_frozen_a_killed_page_and_a_frozen_server_change_nothing_of_the_twin(tmp_path: Path) -> None:
+def test_slow_frozen_and_killed_pages_and_servers_do_not_affect_the_twin(tmp_path: Path) -> None:
     (tmp_path / "load.csv").write_text("t,fx,fy,m\n" + "".join(map(_row, range(COUNT))))
     done = plow_twin_here("live", tmp_path / "load.csv", *OPTIONS, "--record", tmp_path / "alone")
     with _twin("--record", tmp_path / "watched") as (process, url), ExitStack() as pages:
@@ -361,7 +361,7 @@ def test_ten_readers_a_frozen_a_killed_page_and_a_frozen_server_change_nothing_o
     assert not told["recorder"]["lost"] and not Path(f"/proc/{server}").exists()
 
 
-def test_an_operator_acknowledges_and_marks_and_the_journal_has_both(tmp_path: Path) -> None:
+def test_acknowledgements_and_marks_of_an_operator_are_journalled(tmp_path: Path) -> None:
     with _twin("--record", tmp_path / "run") as (process, url), _data(url) as page:
         _feed(process)
         told: dict[str, Any] = {}
@@ -411,7 +411,7 @@ def test_a_killed_server_is_reported_once_and_the_twin_continues(tmp_path: Path)
     assert "server of the screen" not in err
 
 
-def test_a_recording_is_shown_while_it_is_written_and_afterwards_and_nothing_can_be_asked_of_it(tmp_path: Path) -> None:
+def test_a_recording_is_shown_during_and_after_the_run_and_accepts_no_requests(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "plow_twin", "dashboard", str(tmp_path / "run"), "--listen", "127.0.0.1:0"]
     with _twin("--record", tmp_path / "run") as (process, _):
         _feed(process, 0, 600)
@@ -508,7 +508,7 @@ def test_the_scripts_of_the_page_have_no_syntax_error() -> None:
 
 
 @pytest.mark.skipif(browser.CHROMIUM is None, reason="no Chromium is installed")
-def test_a_browser_shows_the_twin_takes_names_as_text_and_fetches_nothing_from_elsewhere(tmp_path: Path) -> None:
+def test_a_browser_shows_the_twin_and_names_as_text_and_loads_only_from_the_server(tmp_path: Path) -> None:
     name = "<img src=x onerror='window.fooled=1'>"
     scene = tmp_path / f"{name.replace('/', '')}.yaml"
     scene.write_text(dump_scene(load_scene("paper")))
@@ -543,7 +543,7 @@ def test_a_browser_shows_the_twin_takes_names_as_text_and_fetches_nothing_from_e
 
 
 @pytest.mark.skipif(browser.FIREFOX is None, reason="no Firefox is installed")
-def test_firefox_shows_the_twin_too(tmp_path: Path) -> None:
+def test_firefox_shows_the_twin(tmp_path: Path) -> None:
     with _twin("--scene", "paper") as (process, said):
         url = said.partition("#")[0].split()[-1]
         with browser.firefox_page(tmp_path / "firefox", url) as page:

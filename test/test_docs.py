@@ -54,7 +54,7 @@ def shown_calls() -> list[tuple[str, str]]:
     ]
 
 
-def test_every_call_that_a_page_shows_has_a_verb_options_that_exist_and_the_required_options() -> None:
+def test_every_command_on_a_page_has_an_existing_verb_and_valid_options() -> None:
     calls = shown_calls()
     assert len(calls) > 40
     unknown = []
@@ -96,7 +96,7 @@ def public_names() -> set[str]:
     return {alias.name for alias in aliases if alias.asname == alias.name}
 
 
-def test_every_public_name_is_on_the_reference_page_and_there_is_no_other() -> None:
+def test_the_reference_page_lists_exactly_the_public_names() -> None:
     listed = re.findall(r"^::: plow_twin\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE)
     assert len(listed) == len({*listed}) > 30
     assert {*listed} == public_names()
@@ -123,7 +123,7 @@ def test_every_page_is_in_the_site_s_contents() -> None:
     }
 
 
-def test_every_table_of_the_pages_is_that_of_the_results_and_the_code() -> None:
+def test_every_table_of_the_pages_agrees_with_results_and_code() -> None:
     """The tables of the pages are up to date, and each table of `tools/pages.py` is on a page."""
     code = (
         "import pages, re\n"
@@ -138,7 +138,7 @@ def test_every_table_of_the_pages_is_that_of_the_results_and_the_code() -> None:
     assert done.stdout.splitlines() == ["[]", "set() True"], done.stderr or done.stdout
 
 
-def test_drawn_pictures_are_their_scripts() -> None:
+def test_drawn_pictures_agree_with_their_scripts() -> None:
     pictures = [runpy.run_path(str(ROOT / "tools" / name)) for name in ("lanes_picture.py", "architecture.py")]
     assert all(made["OUT"].read_text() == made["drawing"]() for made in pictures)
     made = pictures[-1]
@@ -147,12 +147,12 @@ def test_drawn_pictures_are_their_scripts() -> None:
     assert folders <= subpackages
 
 
-def test_the_tutorial_s_scene_is_the_example_s() -> None:
+def test_the_tutorial_and_the_example_have_the_same_scene() -> None:
     (scene,) = blocks(ROOT / "docs" / "tutorial.md", "yaml")
     assert scene == (ROOT / "examples" / "first_scene" / "scene.yaml").read_text()
 
 
-def test_every_test_that_shows_a_promise_exists() -> None:
+def test_every_test_named_beside_a_promise_exists() -> None:
     text = (ROOT / "docs" / "operators.md").read_text()
     named = re.findall(r"`(test_\w+\.py)::(\w+)`", text)
     assert len(named) > 60
@@ -179,7 +179,7 @@ def test_the_law_of_the_how_to_runs() -> None:
     assert (done.stdout.strip(), done.stderr) == (str(1.2 * (1.0 - 0.4) / 0.4), "")
 
 
-def test_the_interface_page_is_the_code_s() -> None:
+def test_the_interface_page_agrees_with_the_code() -> None:
     page = (ROOT / "docs" / "interface.md").read_text()
     (scene,) = blocks(ROOT / "docs" / "interface.md", "yaml")
     assert yaml.safe_load(scene)["version"] == 1

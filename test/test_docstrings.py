@@ -97,7 +97,7 @@ def test_errors_that_a_function_raises_are_documented(package: griffe.Module) ->
     assert lacking == []
 
 
-def test_no_docstring_begins_with_a_word_that_names_nothing() -> None:
+def test_no_docstring_begins_with_an_empty_word() -> None:
     """A docstring begins with a verb or the name of its subject, for example `Return whether`, not `Tell whether`."""
     found = []
     for folder in ("plow_twin", "test", "benchmark", "tools", "studies", "examples", "launch"):

@@ -64,7 +64,7 @@ def test_height_of_the_table_follows_from_measured_drops(drops) -> None:
         assert any(reason.startswith("vertical: rough") for reason in one.reasons) == flagged
 
 
-def test_walls_that_are_never_met_are_not_observable(drops) -> None:
+def test_walls_without_impacts_are_not_observable(drops) -> None:
     scene = unknown_table(0.0)
     stiffness, width = scene.marks["contact.stiffness"], scene.marks["clearance.horizontal_m"]
     stated = {
@@ -82,14 +82,14 @@ def test_walls_that_are_never_met_are_not_observable(drops) -> None:
     assert any("0 impacts on the right wall" in reason for reason in found.reasons)
 
 
-def test_impact_on_something_else_is_left_out_and_named(drops) -> None:
+def test_impact_far_from_the_walls_is_left_out_and_reported(drops) -> None:
     # in this drop, the block hits an obstacle 0.7 m from the origin
     found = of_drop(drops, 10)
     assert found.horizontal_state is State.NOT_OBSERVABLE
     assert any(reason.startswith("left wall: 1 impacts left out, got one at 0.69") for reason in found.reasons)
 
 
-def test_block_between_four_walls_with_a_turned_sensor_is_estimated() -> None:
+def test_block_between_four_walls_with_a_rotated_sensor_is_estimated() -> None:
     side, true = 0.2, np.array([0.030, 0.022])
     guide = Scene(
         Head(5.0, 5.0 * side**2 / 6.0, carries="corners"),
@@ -125,7 +125,7 @@ def test_block_between_four_walls_with_a_turned_sensor_is_estimated() -> None:
 @pytest.mark.parametrize(
     ("change", "word"), [((slice(0, 5), slice(None)), "complete poses"), ((slice(None), 2), "complete poses")]
 )
-def test_poses_that_cannot_do_are_named(drops, change, word) -> None:
+def test_unusable_poses_are_named(drops, change, word) -> None:
     pose = drops.pose[0] - [0.0, 1.0, 0.0]
     t = np.arange(len(pose)) / 250.0
     if change[1] == 2:
@@ -194,14 +194,14 @@ def of_guide(t: np.ndarray, q: np.ndarray, stiffness: float) -> Estimate:
     return estimate(nominal, Load(at, wrench), Poses(t, q))
 
 
-def test_a_stiffness_that_is_not_known_widens_the_interval(elastic) -> None:
+def test_an_unknown_stiffness_widens_the_interval(elastic) -> None:
     found = of_guide(*elastic[1e8], stiffness=1e5)
     for value, true in ((found.horizontal, 0.030), (found.vertical, 0.022)):
         assert value.p05 < true < value.p95
 
 
 @pytest.mark.parametrize(("stiffness", "every"), [(1e4, 1), (1e8, 5)])
-def test_contacts_that_are_no_impacts_between_two_poses_determine_nothing(elastic, stiffness, every) -> None:
+def test_contacts_longer_than_two_poses_determine_nothing(elastic, stiffness, every) -> None:
     """A soft contact lasts for many rows. At 50 Hz, two impacts look like one impact."""
     t, q = elastic[stiffness]
     found = of_guide(t[::every], q[::every], stiffness)
@@ -210,7 +210,7 @@ def test_contacts_that_are_no_impacts_between_two_poses_determine_nothing(elasti
 
 
 @pytest.mark.parametrize("too_stiff", [300.0, 30.0])
-def test_a_contact_far_softer_than_believed_leaves_the_clearance_in_its_interval(too_stiff) -> None:
+def test_a_contact_much_softer_than_assumed_leaves_the_clearance_in_its_interval(too_stiff) -> None:
     """The impacts scatter more than rigid impacts, and the interval is correspondingly wide."""
     motion = simulate(guide(1e7), t_end=12.0, output_dt=0.004, tol=1e-6, energy_balance=True)
     noise = np.random.default_rng(1).normal(0.0, [3e-5, 3e-5, 2e-4], motion.q.shape)

@@ -48,7 +48,7 @@ def test_a_hard_contact_is_estimated_by_its_bounces() -> None:
     assert result.stiffness.p05 < truth.scene.contact.stiffness < result.stiffness.p95
 
 
-def test_the_deviate_of_a_path_is_normal_for_a_right_model_and_large_for_a_wrong_one() -> None:
+def test_the_deviate_of_a_path_is_normal_for_a_correct_model_and_large_for_a_wrong_model() -> None:
     """Correct paths scatter widely along a few common directions, so a correct path may be far from the mean.
 
     A wrong path deviates in another direction, and is detected although its mean square over the phases is smaller.
@@ -91,7 +91,7 @@ def test_a_method_that_disagrees_widens_the_interval() -> None:
 
 
 @pytest.mark.parametrize("turn", [0.0, -0.1])
-def test_the_bias_of_a_sensor_behind_a_hard_contact_is_found(turn: float) -> None:
+def test_the_bias_of_a_sensor_with_a_hard_contact_is_found(turn: float) -> None:
     """An undetected angle of half a degree would withdraw the estimate. 9 mm along y would cause an error of 1 mm."""
     truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
     bias = np.array([1e-3, -9e-3, turn])
@@ -99,7 +99,7 @@ def test_the_bias_of_a_sensor_behind_a_hard_contact_is_found(turn: float) -> Non
     assert (np.abs(found - bias) < [5e-4, 5e-4, 1.5e-3]).all()
 
 
-def test_a_bias_changes_the_other_features_of_a_hard_motion_hardly_at_all() -> None:
+def test_a_bias_hardly_changes_the_other_features_of_a_hard_motion() -> None:
     """A remaining angle of 3e-4 rad would separate the measured motion from the simulated motions."""
     truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
     eye = MotionFeatures(Unknowns(truth.nominal), truth.poses, truth.load.period())
@@ -143,7 +143,7 @@ def test_a_classifier_of_drawn_motions_finds_another_law() -> None:
     assert (wrong > MOST_OTHER_LAW).mean() > 0.8
 
 
-def test_log_odds_find_another_law_among_motions_whose_drawn_numbers_matter_more() -> None:
+def test_log_odds_find_another_law_even_if_drawn_numbers_have_more_effect() -> None:
     """The parameters move the features along a curve, ten times as far as law and noise do."""
     rng = np.random.default_rng(5)
     slope, curve, apart = rng.standard_normal((3, 40))
@@ -194,7 +194,7 @@ def test_a_motion_like_those_of_another_law_is_suspect_unless_that_law_is_unlike
     assert summarise_bounced(Unknowns(preset("paper")), poses, bounced, 0, 0).model == model
 
 
-def test_what_a_hard_motion_hides_widens_the_clearances_and_not_the_twins() -> None:
+def test_quantities_hidden_by_a_hard_motion_widen_the_clearances_and_not_the_twins() -> None:
     """Corners rounded by 5 mm make the estimated clearances 0.7 mm too large, which is ten standard deviations."""
     truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
     unknowns, period = Unknowns(truth.nominal), truth.load.period()
@@ -240,7 +240,7 @@ def test_a_clearance_at_its_bound_is_not_observable() -> None:
     assert result.horizontal.p95 - result.horizontal.p05 > 0.02
 
 
-def test_the_likeliest_clearances_are_found_from_paths_with_more_parts_than_drawn_motions() -> None:
+def test_the_most_likely_clearances_are_found_from_few_drawn_motions() -> None:
     """The clearances of each simulated motion are found like those of a new motion, for all parameters and delays."""
     rng = np.random.default_rng(5)
     slopes, curve, common, late = (rng.standard_normal((rows, 150)) for rows in (7, 1, 3, 1))

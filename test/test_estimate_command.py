@@ -44,7 +44,7 @@ def test_the_command_keeps_the_contract(tmp_path: Path) -> None:
     assert facts["forces"]["members"] == 20 and facts["forces"]["pairs"]["top_left_top"]["peak_n"]["p50"] > 0.0
 
 
-def test_a_folder_without_a_load_gives_rough_clearances_whose_intervals_hold(tmp_path: Path) -> None:
+def test_without_a_load_intervals_of_rough_clearances_contain_the_truth(tmp_path: Path) -> None:
     truth = draw(replace(GROUPS["hard"], periods=5.0), 30100)
     truth.write(tmp_path)
     (tmp_path / "load.csv").unlink()
@@ -67,7 +67,7 @@ def test_a_bag_is_read_by_its_mapping(tmp_path: Path) -> None:
     assert facts["vertical"]["mean_m"] == pytest.approx(0.030, abs=3e-4)
 
 
-def test_samples_from_before_new_skids_are_not_used(tmp_path: Path) -> None:
+def test_samples_before_a_change_of_the_pads_are_not_used(tmp_path: Path) -> None:
     entries: list[Entry] = [paper_sample(index) for index in range(200)]
     entries.insert(20, Pose(entries[10].stamp_ns, (1e-3, 0.0, 0.0), (1e-3, 1e-3, 1e-3)))
     last = entries[-1].stamp_ns

@@ -20,7 +20,7 @@ from plow_twin.estimate.unknowns import Unknowns
 from plow_twin.model.loads import compile_loads
 
 
-def test_the_derivative_by_the_compliance_is_that_of_another_integrator_with_a_frame_on_springs() -> None:
+def test_the_derivative_with_respect_to_the_compliance_agrees_with_another_integrator() -> None:
     paper, t = preset("paper"), np.arange(0.0, 3.0, 1e-3)
     contact = replace(paper.contact, law="hunt_crossley", stiffness=1.5e7, exponent=1.0, damping=0.7)
     scene, wrench, stiff = replace(paper, contact=contact), compile_loads(paper.loads).at(t), 4e9
@@ -38,7 +38,7 @@ def test_the_derivative_by_the_compliance_is_that_of_another_integrator_with_a_f
     assert (error.std(axis=0) < 0.1 * size).all(), error.std(axis=0) / size
 
 
-def test_a_frame_on_springs_is_found_and_the_clearances_hold() -> None:
+def test_a_frame_on_springs_is_found_and_intervals_contain_the_truth() -> None:
     truth = mismatched(KINDS["spring"], 30403)
     result = estimate(truth.nominal, truth.load, truth.poses)
     probability, compliance, _ = result.differs["compliance"]

@@ -16,7 +16,7 @@ from plow_twin.estimate.result import Interval, State
 from plow_twin.estimate.unknowns import CORRELATED
 
 
-def test_forces_have_intervals_that_hold_peaks_and_impulses() -> None:
+def test_intervals_of_the_forces_contain_peaks_and_impulses() -> None:
     truth, result = known()[0]
     assert result.correlation is not None and np.linalg.eigvalsh(np.array(result.correlation)).min() > 0.0
     period = truth.load.period()
@@ -74,7 +74,7 @@ def test_members_are_drawn_with_the_estimate_s_correlation() -> None:
     assert gains.shape == (2000, 3)
 
 
-def test_members_that_leave_the_range_are_left_out_and_counted() -> None:
+def test_members_outside_the_range_of_the_model_are_omitted_and_counted() -> None:
     truth, result = known()[0]
     soft = replace(result, stiffness=Interval(2e7, 1e6, 4e7), correlation=None)
     forces = forces_of(truth.nominal, soft, truth.load.between(0.0, 6.0), 60, 3.2)

@@ -22,7 +22,7 @@ from plow_twin.kernel.low_pass import lagged
 from plow_twin.model.scene import Scene
 
 
-def test_links_have_the_weight_of_white_noise_of_acceleration() -> None:
+def test_links_have_the_weight_of_white_acceleration_noise() -> None:
     rng = np.random.default_rng(4)
     span, drift, steps = 0.3, np.array([2.0, 0.5, 1.0]), 300
     rate = np.cumsum(rng.standard_normal((20_000, steps, 1)) * np.sqrt(span / steps), axis=1)
@@ -34,7 +34,7 @@ def test_links_have_the_weight_of_white_noise_of_acceleration() -> None:
 
 
 @pytest.mark.parametrize("moment", [0.0, 0.5])
-def test_a_load_that_leaves_a_component_certain_bounds_the_swings_by_the_others(moment: float) -> None:
+def test_a_load_with_a_certain_component_limits_swings_by_the_other_components(moment: float) -> None:
     noise, drift = np.array([3e-4, 3e-4, 1e-3]), np.array([2.0, 0.5, moment])
     assert 2.0 * unmoved_span(noise, drift) ** 3 / 3.0 == pytest.approx(9e-8)  # the variance after white noise
     assert 0.0 < unmoved_span(noise, np.zeros(3)) < 10.0
@@ -58,7 +58,7 @@ def test_the_normal_equations_of_linked_swings_agree_with_dense_ones(swings: int
     assert factor.covariance() == pytest.approx(inverse[:3, :3], rel=1e-9, abs=1e-12)
 
 
-def test_a_low_pass_is_exact_behind_a_cubic() -> None:
+def test_a_low_pass_of_a_cubic_is_exact() -> None:
     tau, t = 0.03, np.linspace(0.01, 0.5, 50)
     powers = np.array([0.4, -2.0, 5.0, 30.0])
     place = np.polynomial.Polynomial(powers)
@@ -72,7 +72,7 @@ def test_a_low_pass_is_exact_behind_a_cubic() -> None:
     assert slope == pytest.approx((q - out) / tau)
 
 
-def test_an_interval_is_cut_off_where_the_head_has_been() -> None:
+def test_an_interval_ends_at_the_range_of_motion() -> None:
     cut = Interval.normal(0.025, 0.008).above(0.03)
     assert 0.03 < cut.p05 < cut.mean < cut.p95
     assert Interval.normal(0.025, 0.001).above(0.0) == Interval.normal(0.025, 0.001)
@@ -138,7 +138,7 @@ def test_motions_in_lanes_agree_with_motions_alone() -> None:
 
 
 @pytest.mark.parametrize(("group", "least", "most"), [("plain", 3, 4), ("noisy", 8, 11)])
-def test_starts_that_meet_end_the_search(
+def test_equal_results_of_different_starts_end_the_search(
     group: str, least: int, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:  # fmt: skip
     """If two starts lead to the same optimum, no third start is fitted. With noise, all six starts are fitted."""

@@ -105,7 +105,7 @@ def test_forces_follow_the_machine_within_two_load_periods(truth: Truth, forces:
     assert inside[touching].mean() > 0.8
 
 
-def test_intervals_hold_from_the_first_row_on_and_narrow(truth: Truth, followed: Stretch) -> None:
+def test_intervals_contain_the_truth_from_the_first_row_and_narrow(truth: Truth, followed: Stretch) -> None:
     clearance = followed.rows.clearance
     for axis, true in enumerate(truth.clearance):
         value, low, high = clearance[:, axis].T
@@ -115,7 +115,7 @@ def test_intervals_hold_from_the_first_row_on_and_narrow(truth: Truth, followed:
         assert high[-1] - low[-1] < 2e-3  # the interval includes errors of the frame and of the scales of the sensor
 
 
-def test_a_row_uses_measurements_up_to_its_time_only(truth: Truth, followed: Stretch) -> None:
+def test_a_row_uses_only_measurements_up_to_its_time(truth: Truth, followed: Stretch) -> None:
     end = 4.0
     cut = follow(truth.nominal, *_until(truth, end), MEMBERS)
     count = len(cut.rows.t)
@@ -132,7 +132,7 @@ def _until(truth: Truth, end: float) -> tuple[Load, Poses]:
     )
 
 
-def test_rows_of_a_grid_are_those_at_the_samples(truth: Truth) -> None:
+def test_rows_on_a_grid_equal_rows_at_the_samples(truth: Truth) -> None:
     load, poses = _until(truth, 1.0)
     every = follow(truth.nominal, load, poses, MEMBERS).rows
     grid = follow(truth.nominal, load, poses, MEMBERS, dt=0.005).rows
@@ -141,9 +141,7 @@ def test_rows_of_a_grid_are_those_at_the_samples(truth: Truth) -> None:
     assert np.allclose(grid.force[there], every.force[:-1], rtol=1e-6, atol=1.0)
 
 
-def test_nothing_measured_leaves_the_nominal_motion_and_corrects_nothing(
-    truth: Truth, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_measurements_the_motion_stays_nominal(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
     load, _ = _until(truth, 2.0)
     monkeypatch.setattr(TwinBatch, "move", lambda *_: pytest.fail("a member was moved"))
     told = follow(truth.nominal, load, Poses(np.zeros(0), np.zeros((0, 3))), MEMBERS)
@@ -154,7 +152,7 @@ def test_nothing_measured_leaves_the_nominal_motion_and_corrects_nothing(
     assert np.array_equal(told.rows.clearance[0], told.rows.clearance[-1])
 
 
-def test_an_estimate_is_taken_over_without_an_impact_that_never_was(
+def test_an_estimate_is_adopted_without_a_false_impact(
     truth: Truth, forces: Array, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     follower = Follower(truth.nominal, MEMBERS)
@@ -180,7 +178,7 @@ def test_a_withdrawn_estimate_is_undone(truth: Truth) -> None:
     assert (np.ptp(follower.clearance(), axis=1) > 0.3 * before).all()
 
 
-def test_an_estimate_of_one_clearance_is_replaced_by_a_later_one_or_by_one_of_both(truth: Truth) -> None:
+def test_an_estimate_of_one_clearance_is_replaced_by_a_later_estimate_of_it(truth: Truth) -> None:
     follower, both = Follower(truth.nominal, MEMBERS), _known(truth)
     _run(follower, truth, 1.0)
     horizontal = replace(both, vertical_state=State.NOT_OBSERVABLE)
@@ -191,7 +189,7 @@ def test_an_estimate_of_one_clearance_is_replaced_by_a_later_one_or_by_one_of_bo
     assert _take(follower, both) and not _take(follower, later)
 
 
-def test_a_rough_estimate_of_the_same_motion_does_not_replace_one_that_is_not_rough(truth: Truth) -> None:
+def test_a_rough_estimate_does_not_replace_an_accurate_estimate_of_the_same_motion(truth: Truth) -> None:
     follower = Follower(truth.nominal, MEMBERS)
     _run(follower, truth, 0.5)
     rough = _known(truth, State.ROUGH)
@@ -226,7 +224,7 @@ def test_twins_have_the_friction_that_an_estimate_finds(truth: Truth) -> None:
     assert not rubs(replace(truth.nominal, wear=Wear(1e-14, pad_area_m2=0.02, travel_speed_m_s=0.5)), known)
 
 
-def test_kernels_with_friction_are_compiled_at_the_start_only_if_no_cache_can_pass_them_on(
+def test_kernels_with_friction_are_compiled_at_the_start_only_without_a_cache(
     truth: Truth, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compiled: list[Scene] = []
@@ -238,7 +236,7 @@ def test_kernels_with_friction_are_compiled_at_the_start_only_if_no_cache_can_pa
         assert compiled == expected
 
 
-def test_another_machine_is_followed_from_its_own_prior(truth: Truth) -> None:
+def test_a_changed_model_is_followed_from_its_prior(truth: Truth) -> None:
     session = Session(Follower(truth.nominal, MEMBERS), 0)
     load, following = truth.load, session.following
     assert isinstance(following, Follower)
@@ -282,7 +280,7 @@ def test_a_restored_motion_keeps_the_harmonics_of_the_load_in_phase(truth: Truth
     assert session.twin.digest() == again.twin.digest()
 
 
-def test_late_poses_correct_too_and_later_poses_have_no_effect(truth: Truth, forces: Array) -> None:
+def test_late_poses_correct_the_motion_and_very_late_poses_have_no_effect(truth: Truth, forces: Array) -> None:
     def error(late: float) -> float:
         follower = Follower(truth.nominal, MEMBERS)
         _take(follower, replace(_known(truth), gain_m=Interval.normal(truth.gain[2] + 0.05, 0.05)))
@@ -297,7 +295,7 @@ def test_late_poses_correct_too_and_later_poses_have_no_effect(truth: Truth, for
     assert np.array_equal(_run(follower, truth, 1.1, 1.005), _run(same, truth, 1.1, 1.005))
 
 
-def test_the_load_error_of_a_rough_estimate_lets_the_intervals_hold(truth: Truth, forces: Array) -> None:
+def test_intervals_allow_for_the_load_error_of_a_rough_estimate(truth: Truth, forces: Array) -> None:
     """The assumed load lacks a constant force of 4 kN, an eighth of the load's amplitude."""
     figures = {f"load_error_{name}": 0.01 for name in ("fx", "fy", "m")}
     rough = replace(_known(truth, State.ROUGH), figures=figures)
@@ -326,7 +324,7 @@ def test_the_load_error_of_a_rough_estimate_lets_the_intervals_hold(truth: Truth
     assert held["plain"] < 0.6 and held["rough"] > 0.8
 
 
-def test_a_machine_without_gravity_is_steered_too(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_without_gravity_is_corrected_by_poses(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
     moved, move = [], TwinBatch.move
 
     def counted(twins: TwinBatch, which: Array, q: Array, v: Array) -> None:
@@ -390,7 +388,7 @@ def test_a_wrong_bias_of_the_sensor_is_learned_with_a_hard_contact() -> None:
     assert (np.abs(biases.mean(axis=0)) < 0.6 * np.abs(wrong)).all()
 
 
-def test_twins_go_on_with_other_numbers_but_not_with_other_terms() -> None:
+def test_twins_continue_with_changed_numbers_but_not_with_other_terms() -> None:
     scene = replace(draw(GROUPS["plain"], 3).scene, loads=())
     hard = replace(scene, contact=replace(scene.contact, stiffness=1e9, damping=0.3), clearance=Clearance(0.03, 0.02))
     changed, new = TwinBatch([scene] * 2), TwinBatch([scene, hard])
@@ -404,7 +402,7 @@ def test_twins_go_on_with_other_numbers_but_not_with_other_terms() -> None:
     assert not twins.change([0], damped[1:]).any() and twins.scenes[0] == damped[0]
 
 
-def test_poses_with_missing_components_are_used_and_no_number_is_other_than_finite(truth: Truth) -> None:
+def test_poses_with_missing_components_give_finite_numbers(truth: Truth) -> None:
     load, poses = _until(truth, 2.0)
     q = poses.q.copy()
     q[::3, 1], q[1::5, 0] = np.nan, np.nan
@@ -415,7 +413,7 @@ def test_poses_with_missing_components_are_used_and_no_number_is_other_than_fini
     assert (told.rows.low <= told.rows.force).all() and (told.rows.force <= told.rows.high).all()
 
 
-def test_moving_a_twin_to_where_it_is_changes_nothing() -> None:
+def test_moving_a_twin_to_its_own_pose_changes_nothing() -> None:
     scenes = [
         replace(
             draw(GROUPS["plain"], 3).scene, loads=(), contact=Contact("exact_restitution", 1e7, 1.0, restitution=0.4)
@@ -435,7 +433,7 @@ def test_too_few_members_are_refused(truth: Truth) -> None:
         Follower(truth.nominal, 5)
 
 
-def test_early_windows_grow_until_there_are_whole_ones_and_each_has_new_motion() -> None:
+def test_early_windows_grow_to_full_length_and_each_has_new_motion() -> None:
     windows = Windows(32.0, 10.0, 0.0, early=True)
     ends = []
     for index in range(4500):

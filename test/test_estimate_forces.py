@@ -53,7 +53,9 @@ def _exact(result: Estimate) -> dict[str, Interval]:
     return result.values() | dict(zip(("horizontal", "vertical"), result.apparent, strict=True))
 
 
-def test_forces_halve_the_intervals_which_hold(truth: Truth, fitted: tuple[Estimate, Problem, Fit]) -> None:
+def test_forces_halve_the_intervals_and_they_contain_the_truth(
+    truth: Truth, fitted: tuple[Estimate, Problem, Fit]
+) -> None:
     plain, result = fitted[0], estimating.estimate(truth.nominal, truth.load, truth.poses, forces=truth.forces)
     assert (result.model, result.sensor, result.horizontal_state) == ("ok", "ok", State.ESTIMATED)
     contact = truth.scene.contact
@@ -122,7 +124,7 @@ def test_the_law_s_forces_are_those_of_the_solver() -> None:
     np.testing.assert_allclose(small * units.force, force, rtol=1e-9)
 
 
-def test_a_folder_without_forces_runs_no_code_of_forces(
+def test_without_measured_forces_their_code_does_not_run(
     truth: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     short = replace(truth, load=truth.load.between(0.0, 4.0), poses=truth.poses.between(0.0, 4.0), forces=None)

@@ -83,7 +83,7 @@ def test_gaps_with_theta_alone_give_the_clearances_and_the_reason_names_the_miss
     assert result.reasons == tuple(f"{name}: measured 0 times, expected at least 20" for name in "xy")
 
 
-def test_gaps_without_a_pose_give_an_estimate_and_a_shifted_one_is_found(gapped: tuple[Truth, np.ndarray]) -> None:
+def test_gaps_without_a_pose_give_an_estimate_and_a_shifted_gap_is_found(gapped: tuple[Truth, np.ndarray]) -> None:
     truth, gap = gapped
     gaps, lost = Gaps.of(truth.poses.t, gap)
     nothing, _ = Poses.of([], np.zeros((0, 3)))

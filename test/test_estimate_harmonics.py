@@ -54,7 +54,7 @@ def test_a_load_without_two_periods_has_no_frequency() -> None:
     assert Harmonics.of(Load(t, noise)) is None
 
 
-def test_a_third_harmonic_that_the_load_lacks_is_found_and_the_clearances_hold(truth: Truth, found: Estimate) -> None:
+def test_a_missing_third_harmonic_of_the_load_is_found(truth: Truth, found: Estimate) -> None:
     assert found.model == "suspect" and "at 3 times its frequency" in found.reasons[0]
     assert found.horizontal_state is found.vertical_state is State.ROUGH
     for value, true in zip((found.horizontal, found.vertical), truth.clearance, strict=True):
@@ -66,7 +66,7 @@ def test_a_third_harmonic_that_the_load_lacks_is_found_and_the_clearances_hold(t
     assert wave == pytest.approx([np.cos(1.0), np.sin(1.0)], abs=0.1)
 
 
-def test_harmonics_return_from_json_and_count_from_the_start_of_their_window(found: Estimate) -> None:
+def test_harmonics_are_restored_from_json_with_their_phases(found: Estimate) -> None:
     harmonics = found.load_harmonics
     assert harmonics is not None
     data = json.loads(json.dumps(found.as_dict()))
@@ -99,7 +99,7 @@ def test_harmonics_are_found_where_the_residuals_do_not_repeat_with_the_load() -
 
 
 @pytest.mark.parametrize("kind", ["load_5", pytest.param("friction_05", marks=pytest.mark.stress)])
-def test_harmonics_that_explain_nothing_are_given_up_before_whole_swings(
+def test_harmonics_that_explain_nothing_are_dropped_before_whole_swings_are_fitted(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stages = Mock(side_effect=lacking.Problem)

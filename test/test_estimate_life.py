@@ -71,7 +71,7 @@ def test_constant_force_wears_as_archard_says() -> None:
     assert (deviation < 0.05 * force.max()).all()
 
 
-def test_quantiles_scale_with_the_coefficient_and_the_horizon_cuts(tmp_path: Path) -> None:
+def test_quantiles_scale_with_the_coefficient_and_end_at_the_horizon(tmp_path: Path) -> None:
     slow = Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14))
     scene = replace(preset("paper"), wear=slow)
     plan = Plan(0.028, 0.034, 20_000.0, stop_h=1000.0, load_deviation=0.0)
@@ -108,7 +108,7 @@ def test_quantiles_scale_with_the_coefficient_and_the_horizon_cuts(tmp_path: Pat
     assert (life.clearances(np.array([1e3 * p90])) < [0.0285, 0.0347]).all()
 
 
-def test_scenarios_are_forecasts_of_their_own_from_the_same_draws() -> None:
+def test_scenarios_are_separate_forecasts_from_the_same_draws() -> None:
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     dry, heavy = Scenario.parse("dry: coefficient=0.5"), Scenario.parse("heavy:load=1.3,coefficient=1")
     plan = Plan(0.0255, 0.0305, 1e5, draws=200, scenarios=(dry, heavy))
@@ -126,7 +126,7 @@ def test_scenarios_are_forecasts_of_their_own_from_the_same_draws() -> None:
         forecast(scene, replace(plan, scenarios=(dry, dry)))
 
 
-def test_a_table_of_enough_periods_is_a_load_to_forecast_under() -> None:
+def test_a_table_of_enough_periods_is_a_load_for_a_forecast() -> None:
     """A sampled harmonic load, as in a recording, gives the same mean forces as the harmonic load."""
     scene = preset("paper")
     t = np.arange(0.0, 20.0, 0.01)
@@ -138,7 +138,7 @@ def test_a_table_of_enough_periods_is_a_load_to_forecast_under() -> None:
         period_of(replace(scene, loads=(Table("short", t[:900], compile_loads(scene.loads).at(t[:900])),)))
 
 
-def test_an_estimated_clearance_holds_the_wear_that_there_is() -> None:
+def test_an_estimated_clearance_includes_the_present_wear() -> None:
     """The estimated clearance already includes 2 mm of wear of the pads, which the forecast must not add again."""
     worn = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, initial_depth_m=(2e-3,) * 8))
     facts = {
@@ -151,7 +151,7 @@ def test_an_estimated_clearance_holds_the_wear_that_there_is() -> None:
     assert found.clearances(np.zeros(1))[1, 0] == pytest.approx([0.029, 0.034], abs=5e-5)
 
 
-def test_of_a_run_the_pads_as_it_left_them_count_and_no_estimate_of_others(tmp_path: Path) -> None:
+def test_a_forecast_of_a_run_uses_its_last_pads_and_no_estimate_of_earlier_pads(tmp_path: Path) -> None:
     facts = {
         name: {"mean_m": 0.029, "p05_m": 0.0289, "p95_m": 0.0291, "state": "estimated"}
         for name in ("horizontal", "vertical")
@@ -255,7 +255,7 @@ def test_a_forecast_wears_the_pads_by_the_contact_that_was_estimated() -> None:
     assert with_estimate(believed, facts | nothing)[0].contact == believed.contact
 
 
-def test_a_path_that_does_not_come_to_its_end_is_no_limit_never_reached() -> None:
+def test_an_unfinished_path_is_an_error_and_not_an_unreached_limit() -> None:
     """From a clearance of a micrometre, 400 steps make no progress. The result must not be `not reached`."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     tight = replace(scene, clearance=Clearance(1e-6, 0.030))
@@ -266,7 +266,7 @@ def test_a_path_that_does_not_come_to_its_end_is_no_limit_never_reached() -> Non
         mean_forces(scene, np.full(8, 0.5))
 
 
-def test_a_clearance_hardly_known_is_not_below_zero() -> None:
+def test_drawn_clearances_are_never_below_zero() -> None:
     """A clearance drawn from its prior can be -70 mm, from which the path leaves the range of the model."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     found = forecast(scene, Plan(0.026, 0.031, 1e3, draws=50), (0.03, 0.03))
@@ -301,9 +301,7 @@ def test_a_history_that_shrinks_is_refused() -> None:
     assert coefficient(scene, History(travel, shrunk, np.full((2, 2), 1e-3))).interval().mean < 1e-13
 
 
-def test_unusable_input_of_a_forecast_is_refused_and_not_left_out(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unusable_input_of_a_forecast_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """There is no forecast for a stop beyond the horizon, an empty estimate or a missing contact."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     file, found, history = (tmp_path / name for name in ("scene.yaml", "estimate.json", "history.csv"))

@@ -91,7 +91,7 @@ def test_windows_do_not_depend_on_the_order_of_arrival() -> None:
             assert np.array_equal(first, second)
 
 
-def test_measurements_without_a_load_do_not_pile_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_measurements_without_a_load_do_not_accumulate(monkeypatch: pytest.MonkeyPatch) -> None:
     """If the load has stopped, or the clock of the poses is hours ahead, the queue must not grow without limit."""
     monkeypatch.setattr("plow_twin.estimate.window.MOST_KEPT", 100)
     windows = Windows(4.0, 1.0, 0.5)
@@ -130,7 +130,7 @@ def test_a_pose_with_a_stamp_far_ahead_does_not_stop_the_windows() -> None:
     assert len(found) == 8 and all(one.samples for one in found)
 
 
-def test_a_window_begins_behind_a_silence_of_the_load() -> None:
+def test_a_window_begins_after_a_silence_of_the_load() -> None:
     stamps = np.delete(START_NS + np.arange(0, 1200) * 10_000_000, slice(500, 600))
     rows = [(int(stamp), (0.0, 0.0, 0.0)) for stamp in stamps]
     found = _windows(rows, rows)
@@ -173,7 +173,7 @@ def _play(running: Bench, truth: Truth, late: bool) -> None:
         probe.pace(index)
 
 
-def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path: Path) -> None:
+def test_the_live_estimate_is_published_and_repeated_by_the_journal(tmp_path: Path) -> None:
     truth = draw(replace(GROUPS["plain"], periods=5.0, rate_hz=50.0), 3)
     scene = tmp_path / "worn.yaml"
     scene.write_text(dump_scene(replace(preset("paper"), wear=Wear(2e-14, 0.015, 2.0))), encoding="utf-8")
@@ -240,7 +240,7 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
     assert report.compared["clearance"] > 0
 
 
-def test_without_a_load_the_poses_give_a_rough_clearance_whose_interval_holds(tmp_path: Path) -> None:
+def test_without_a_load_the_interval_of_the_rough_clearance_contains_the_truth(tmp_path: Path) -> None:
     truth = draw(replace(GROUPS["hard"], periods=5.0, rate_hz=50.0), 30100)
     settings = {"estimate": "true", "estimate_window": WINDOW_S, "estimate_interval": INTERVAL_S}
     with bench(tmp_path, **settings, **RELIABLE) as running:
@@ -352,7 +352,7 @@ def test_an_estimator_that_ends_after_an_estimate_is_started_again(monkeypatch: 
     assert estimation.done and estimation.restarts == 1
 
 
-def test_other_pads_and_other_model_numbers_discard_earlier_estimates(
+def test_changes_of_pads_and_model_discard_earlier_estimates(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("plow_twin.live.estimation.Worker", _Finished)
@@ -387,7 +387,7 @@ def test_other_pads_and_other_model_numbers_discard_earlier_estimates(
     assert estimation.poll(session) == {}
 
 
-def test_an_estimator_is_ready_only_once_it_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_estimator_is_ready_after_its_compilation(monkeypatch: pytest.MonkeyPatch) -> None:
     near, far = Pipe()
     compiled = []
 
@@ -402,7 +402,7 @@ def test_an_estimator_is_ready_only_once_it_is_compiled(monkeypatch: pytest.Monk
     assert len(compiled) == 1 and not near.poll()
 
 
-def test_a_frozen_worker_is_reported_and_costs_no_further_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frozen_worker_is_reported_and_takes_no_further_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("plow_twin.estimate.worker._MOST_WAITING", 20_000)
     worker = Worker(preset("paper"), Windows(10.0, 4.0, 1.0))
     os.kill(worker._process.pid, signal.SIGSTOP)
@@ -422,7 +422,7 @@ def test_a_frozen_worker_is_reported_and_costs_no_further_memory(monkeypatch: py
     assert not worker._thread.is_alive()
 
 
-def test_the_death_of_a_worker_is_reported_and_stops_nothing() -> None:
+def test_the_end_of_a_worker_is_reported_and_the_twin_continues() -> None:
     worker = Worker(preset("paper"), Windows(10.0, 4.0, 1.0))
     os.kill(worker._process.pid, signal.SIGSTOP)
     worker._connection.close()
@@ -465,7 +465,7 @@ context.try_shutdown()
 
 @pytest.mark.timeout(600)  # at first, the twin and the worker each compile for 65 s of processor time
 @pytest.mark.parametrize(("rows", "code"), [(None, 0), (100, 3)])
-def test_of_a_file_that_ends_the_last_window_is_estimated_or_too_few_data_are_named(
+def test_the_last_window_of_a_file_is_estimated_or_too_few_data_are_reported(
     rows: int | None, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     truth = draw(replace(GROUPS["plain"], periods=5.0, rate_hz=50.0), 3)

@@ -25,7 +25,7 @@ def test_implausible_poses_and_loads_are_left_out_and_counted() -> None:
     assert (load.t.tolist(), lost) == ([0.0, 2.0], 1)
 
 
-def test_the_covariance_of_a_pose_is_believed() -> None:
+def test_the_covariance_of_a_pose_is_used() -> None:
     """A covariance of 1e6, which means `not measured`, must not make the other poses useless."""
     q, own = np.ones((40, 3)), np.full((40, 3), 1e-3)
     own[7], own[8, 0], own[9] = 1e3, 0.02, np.nan
@@ -81,7 +81,7 @@ def test_an_averaged_load_keeps_its_mean_and_bridges_gaps() -> None:
         assert np.abs(np.interp(4.4, few.t, column) - np.interp(4.4, t, whole)) < 0.1
 
 
-def test_the_impulse_that_a_rough_load_leaves_open_between_its_samples_is_known() -> None:
+def test_the_unknown_impulse_of_a_rough_load_between_its_samples_is_estimated() -> None:
     rng = np.random.default_rng(3)
     fine = np.arange(200_001) * 1e-4
     rough = np.cumsum(rng.standard_normal((len(fine), 3)), axis=0) * [1.0, 2.0, 3.0]
@@ -93,7 +93,7 @@ def test_the_impulse_that_a_rough_load_leaves_open_between_its_samples_is_known(
     assert (np.array(smooth.believable().unknown) < 1e-9 * np.array(load.believable().unknown)).all()
 
 
-def test_samples_too_rare_for_a_rough_load_leave_its_oscillation_and_the_density_of_the_rest() -> None:
+def test_rare_samples_of_a_rough_load_determine_only_its_oscillation() -> None:
     rng = np.random.default_rng(4)
     fine, keep = np.arange(0.0, 200.0, 1e-3), np.exp(-1e-3 / 8e-3)
     drive = np.sqrt(1.0 - keep**2) * rng.standard_normal((len(fine), 3)) * [1.0, 2.0, 3.0]

@@ -20,7 +20,7 @@ from plow_twin.estimate.unknowns import GAIN, Unknowns
 from plow_twin.model.loads import compile_loads
 
 
-def test_intervals_hold_and_the_same_data_give_the_same_bits() -> None:
+def test_intervals_contain_the_truth_and_equal_data_give_equal_bits() -> None:
     inside = [
         value.p05 <= true <= value.p95
         for truth, result in known()
@@ -40,7 +40,7 @@ def test_intervals_hold_and_the_same_data_give_the_same_bits() -> None:
         *(pytest.param(name, marks=pytest.mark.stress) for name in ("stuck", "noisier")),
     ],
 )
-def test_data_that_contradict_themselves_are_withdrawn(name: str) -> None:
+def test_contradictory_data_give_a_withdrawn_estimate(name: str) -> None:
     truth = draw(replace(GROUPS[name], periods=6.0), 1)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert (result.model, result.sensor) == (truth.group.model, truth.group.sensor), result.reasons
@@ -67,7 +67,7 @@ def test_a_small_drift_of_the_sensor_widens_the_interval() -> None:
         ),
     ],
 )
-def test_effects_outside_the_model_are_flagged_and_rough_at_best(name: str) -> None:
+def test_effects_outside_the_model_are_reported_and_at_best_rough(name: str) -> None:
     truth = draw(replace(GROUPS[name], periods=6.0), 1)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert (result.model, result.sensor) == (truth.group.model, truth.group.sensor), result.reasons
@@ -88,7 +88,7 @@ def test_effects_outside_the_model_are_flagged_and_rough_at_best(name: str) -> N
         pytest.param("filter_5", 96_001, ("filter",), 1e-3, marks=pytest.mark.stress),
     ],
 )
-def test_a_sensor_beside_the_centre_or_behind_a_low_pass_is_found_and_the_interval_holds(
+def test_a_lever_arm_or_low_pass_of_the_sensor_is_found(
     name: str, seed: int, names: tuple[str, ...], size: float
 ) -> None:
     """Without these unknowns, the fit does not converge, or clearances have errors of 0.4 mm and 1.9 mm."""
@@ -107,7 +107,7 @@ def test_a_sensor_beside_the_centre_or_behind_a_low_pass_is_found_and_the_interv
     assert np.hypot.reduce([share * by for share, by, _ in found]) == pytest.approx(size, rel=0.2)
 
 
-def test_walls_with_different_damping_are_found_and_the_intervals_hold() -> None:
+def test_walls_with_different_damping_are_found() -> None:
     """Without these quantities, a constant part of the load explains the motion, with errors of 4 deviations."""
     truth = mismatched(KINDS["damping_walls"], 98_200)
     result = estimate(truth.nominal, truth.load, truth.poses)
@@ -116,7 +116,7 @@ def test_walls_with_different_damping_are_found_and_the_intervals_hold() -> None
         assert abs(value.mean - true) < min(2.0 * value.deviation, 2e-4)
 
 
-def test_swings_at_an_end_of_the_window_that_are_fitted_badly_are_no_change_of_the_machine() -> None:
+def test_badly_fitted_swings_at_an_end_of_the_window_are_no_change_of_the_machine() -> None:
     """With a change after the third of 176 swings, the estimate would be withdrawn, although it is right to 4 um."""
     truth = mismatched(KINDS["load_steps"], 98_201)
     result = estimate(truth.nominal, truth.load, truth.poses)
@@ -134,9 +134,7 @@ def test_the_vertical_clearance_of_a_head_that_never_moves_sideways_is_estimated
 @pytest.mark.parametrize(
     ("name", "quantity", "size"), [("theta_scale", "scale_theta", 0.01), ("corners", "corner_radius", 2e-3)]
 )
-def test_a_difference_that_explains_the_residuals_is_found_and_the_interval_holds(
-    name: str, quantity: str, size: float
-) -> None:
+def test_a_difference_that_explains_the_residuals_is_found(name: str, quantity: str, size: float) -> None:
     """With derivatives from coarse steps, other quantities would explain the residuals, with errors up to 0.2 mm."""
     truth = mismatched(KINDS[name], 84001)
     result = estimate(truth.nominal, truth.load, truth.poses)
@@ -146,7 +144,7 @@ def test_a_difference_that_explains_the_residuals_is_found_and_the_interval_hold
         assert abs(value.mean - true) < min(value.deviation, 1e-4)
 
 
-def test_the_intervals_of_a_machine_that_does_not_differ_stay_narrow() -> None:
+def test_intervals_of_a_machine_without_differences_stay_narrow() -> None:
     for truth, result in known():
         assert result.apparent is not None
         for value, exact, true in zip(
@@ -157,7 +155,7 @@ def test_the_intervals_of_a_machine_that_does_not_differ_stay_narrow() -> None:
 
 @pytest.mark.stress
 @pytest.mark.parametrize("seed", [43202, 43210])
-def test_intervals_hold_between_soft_and_hard_contacts(seed: int) -> None:
+def test_intervals_between_soft_and_hard_contacts_contain_the_truth(seed: int) -> None:
     """The first machine is treated as if its contact were hard.
 
     Errors of the frame, which are zero here, widen its intervals.
@@ -176,7 +174,7 @@ def test_intervals_hold_between_soft_and_hard_contacts(seed: int) -> None:
         assert abs(exact.mean - true) < 2.0 * exact.deviation and exact.deviation < 2e-4
 
 
-def test_another_law_of_a_soft_contact_is_found_where_residuals_hardly_repeat() -> None:
+def test_another_law_of_a_soft_contact_is_found_although_residuals_hardly_repeat() -> None:
     truth = draw(GROUPS["kelvin_voigt"], 57001)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert result.model == "suspect" and "law" in result.reasons[0] and result.figures["repeated"] < 2.0
@@ -184,7 +182,7 @@ def test_another_law_of_a_soft_contact_is_found_where_residuals_hardly_repeat() 
         assert abs(right.figures["law"]) < 4.0
 
 
-def test_the_fit_finds_the_bias_of_a_sensor_behind_a_soft_contact() -> None:
+def test_the_fit_finds_the_bias_of_a_sensor_with_a_soft_contact() -> None:
     truth, _ = known()[0]
     assert not bias_of_hard(Unknowns(truth.nominal), truth.poses).any()
     moved = estimate(truth.nominal, truth.load, truth.poses.moved(np.array([5e-3, -5e-3, 0.1])))
@@ -194,7 +192,7 @@ def test_the_fit_finds_the_bias_of_a_sensor_behind_a_soft_contact() -> None:
         assert abs(value.mean - true) < value.p95 - value.p05 < 6e-4
 
 
-def test_a_wall_never_touched_is_not_observable() -> None:
+def test_a_clearance_without_a_touched_wall_is_not_observable() -> None:
     """A head that is always pressed to the right never touches the left wall, so gx has its prior value."""
     nominal = preset("paper")
     t = np.arange(0.0, 20.0, 0.01)
@@ -210,7 +208,7 @@ def test_a_wall_never_touched_is_not_observable() -> None:
     assert result.horizontal.p95 - result.horizontal.p05 > 0.01
 
 
-def test_a_motion_that_can_hardly_be_predicted_is_no_evidence_of_a_clearance(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unpredictable_motion_is_no_evidence_of_a_clearance(monkeypatch: pytest.MonkeyPatch) -> None:
     truth, before = known()[0]
     monkeypatch.setattr(tuning, "PREDICTED", 1.1)
     result = estimate(truth.nominal, truth.load, truth.poses)
@@ -248,7 +246,7 @@ def test_a_clearance_without_evidence_is_not_estimated() -> None:
     assert result.vertical.p05 < clearance.vertical_m < result.vertical.p95
 
 
-def test_stated_deviations_of_the_measurements_are_believed() -> None:
+def test_stated_deviations_of_the_measurements_are_used() -> None:
     """The stated deviations, which are lower bounds, determine the intervals and the prior of the load's gains."""
     scene = preset("paper")
     t = np.arange(0.0, 10.0, 0.01)
@@ -288,7 +286,7 @@ def test_poses_too_sparse_for_a_fit_are_refused() -> None:
 
 @pytest.mark.stress
 @pytest.mark.parametrize(("missing", "noise_m"), [(0.9, 5e-4), (0.85, 5e-4), (0.0, 5e-3)])
-def test_sparse_or_noisy_poses_give_no_narrow_interval_beside_the_truth(missing: float, noise_m: float) -> None:
+def test_sparse_or_noisy_poses_give_no_narrow_wrong_interval(missing: float, noise_m: float) -> None:
     truth = draw(replace(GROUPS["plain"], periods=6.0, noise_m=noise_m), 2)
     q = truth.poses.q.copy()
     q[np.random.default_rng(2).random(q.shape) < missing] = np.nan
@@ -314,7 +312,7 @@ def test_a_silence_of_the_load_is_not_bridged() -> None:
     assert few.longest_stretch() is few, "a load given by few knots"
 
 
-def test_a_step_of_the_clock_leaves_the_longest_part() -> None:
+def test_after_a_step_of_the_clock_the_longest_part_is_used() -> None:
     """The step is not a period of the load, by which the units of the estimate would be chosen."""
     truth, _ = known()[0]
     load, poses = truth.load, truth.poses
@@ -381,7 +379,7 @@ def test_a_rough_load_costs_little_accuracy() -> None:
         assert value.p95 - value.p05 < 2.5e-4 and abs(value.mean - true) < 1.5e-4
 
 
-def test_ten_poses_a_second_are_fitted_to_the_end_and_the_sensor_is_not_suspect() -> None:
+def test_ten_poses_a_second_suffice_and_the_sensor_is_not_suspect() -> None:
     """The residuals of a fit that has not converged must not be mistaken for a sensor with variable noise."""
     truth = draw(GROUPS["slow"], 33001)
     result = estimate(truth.nominal, truth.load, truth.poses)

@@ -47,7 +47,7 @@ def worn_askew(depth: np.ndarray, seed: int) -> tuple[Estimate, dict[str, float]
     }  # fmt: skip
 
 
-def test_walls_worn_askew_are_estimated_and_the_model_is_not_suspect(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rotated_walls_are_estimated_and_the_model_is_not_suspect(monkeypatch: pytest.MonkeyPatch) -> None:
     """The wear is as uneven as near the end of a life. A fit with evenly worn pads fails."""
     fitted = Mock(side_effect=pads.fit)
     monkeypatch.setattr(pads, "fit", fitted)
@@ -62,7 +62,7 @@ def test_walls_worn_askew_are_estimated_and_the_model_is_not_suspect(monkeypatch
     assert result.groups["horizontal_top"][0].p05 > result.groups["horizontal_bottom"][0].p95
 
 
-def test_walls_worn_less_askew_do_not_make_the_clearance_too_small() -> None:
+def test_slightly_rotated_walls_do_not_make_the_clearance_too_small() -> None:
     """A fit with evenly worn pads passes all checks here, but its error is 0.26 mm, with a deviation of 0.29 mm."""
     result, true = worn_askew(0.6 * UNEVEN, 2)
     off = result.vertical.mean - 0.5 * (true["vertical_left"] + true["vertical_right"])
@@ -70,7 +70,7 @@ def test_walls_worn_less_askew_do_not_make_the_clearance_too_small() -> None:
     assert abs(off) < 1.5e-4 and result.apparent[1].deviation < 2e-4
 
 
-def test_pads_that_are_not_touched_leave_a_clearance_between_askew_walls_open() -> None:
+def test_untouched_pads_leave_a_clearance_between_rotated_walls_unknown() -> None:
     """The lower left pad is never touched, so the lower and the mean horizontal clearance are undetermined."""
     truth, _ = known()[0]
     depth = tuple(1e-3 * value for value in (3.0, 0.0, 0.0, 2.0, 0.0, 4.0, 1.0, 0.0))
@@ -92,7 +92,7 @@ def test_pads_that_are_not_touched_leave_a_clearance_between_askew_walls_open() 
     assert result.groups["horizontal_top"][0].deviation < 2.5e-4
 
 
-def test_a_pad_that_a_pressed_head_never_touches_leaves_the_clearance_open() -> None:
+def test_an_untouched_pad_of_a_pressed_head_leaves_the_clearance_unknown() -> None:
     """The rotation of the right wall is fitted up to the touch of its lower pad, with an error of six deviations."""
     truth = mismatched(KINDS["pressed"], 99001)
     result = estimate(truth.nominal, truth.load, truth.poses)

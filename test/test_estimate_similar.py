@@ -15,7 +15,7 @@ from plow_twin.estimate.forces import draw_scenes
 from plow_twin.estimate.similar import Units
 
 
-def test_a_machine_of_another_size_is_estimated_as_one_of_the_paper_s_size() -> None:
+def test_a_machine_of_another_size_is_estimated_like_the_paper_s_machine() -> None:
     truth, result = known()[0]
     desk = Units(8.0, 1024.0, 4.0)  # a machine that is an eighth as large, a thousandth as heavy and four times as fast
     scene = desk.scene(truth.nominal)
@@ -35,7 +35,7 @@ def test_a_machine_of_another_size_is_estimated_as_one_of_the_paper_s_size() -> 
 
 
 @pytest.mark.parametrize("friction", [Friction(0.2, 0.02), Friction(0.3, stick_stiffness_n_m=5e7)])
-def test_a_scene_in_other_units_moves_alike(friction: Friction) -> None:
+def test_a_scene_in_other_units_has_the_same_motion(friction: Friction) -> None:
     thrown = Initial((1e-3, 0.0, 1e-3), (0.4, 0.3, 0.5))
     units, scene = Units(8.0, 1024.0, 4.0), replace(preset("bench_kv"), friction=friction, initial=thrown)
     # load and energy balance have no effect on the motion, but with them the kernels of other tests are used

@@ -43,7 +43,7 @@ def unexplained(source: str) -> list[str]:
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.py")), ids=lambda path: path.name)
-def test_a_number_is_chosen_in_the_table_or_says_where_it_comes_from(path: Path) -> None:
+def test_a_number_is_in_the_table_or_states_its_origin(path: Path) -> None:
     if path.name != "tuning.py":
         assert unexplained(path.read_text(encoding="utf-8")) == []
 

@@ -34,7 +34,7 @@ def test_the_equations_of_motion_give_walls_and_stiffness_without_a_simulation()
     assert (equations.touched(q, walls, 1e-3) > 1.0).all()
 
 
-def test_a_load_that_does_not_explain_the_motion_gives_a_rough_clearance_whose_interval_holds() -> None:
+def test_a_load_that_does_not_explain_the_motion_gives_a_rough_clearance() -> None:
     truth = mismatched(replace(KINDS["load_10"], periods=6.0), 80001)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert result.model == "suspect" and result.reasons
@@ -43,7 +43,7 @@ def test_a_load_that_does_not_explain_the_motion_gives_a_rough_clearance_whose_i
     assert result.figures["load_error"] > 0.03
 
 
-def test_a_rare_sample_is_an_average_whose_shape_is_smooth_and_whose_amplitude_is_unknown() -> None:
+def test_rare_samples_are_averages_of_unknown_amplitude() -> None:
     t = np.arange(0.0, 20.0, 1e-3)
     true = np.stack([3e4 * np.sin(2.0 * t), 1e4 * np.cos(2.0 * t), 0.0 * t], axis=1)
     means = Load(t.reshape(-1, 1000).mean(axis=1), true.reshape(-1, 1000, 3).mean(axis=1))
@@ -56,7 +56,7 @@ def test_a_rare_sample_is_an_average_whose_shape_is_smooth_and_whose_amplitude_i
     assert smooth.gain_deviations()[:2] == pytest.approx(tuning.COARSE_GAIN, rel=0.1)
 
 
-def test_without_an_angle_the_range_of_the_head_gives_a_clearance_whose_deviation_holds() -> None:
+def test_without_an_angle_the_range_of_motion_gives_the_clearance() -> None:
     truth, _ = known()[0]
     q = truth.poses.q.copy()
     q[:, 2] = np.nan
@@ -67,7 +67,7 @@ def test_without_an_angle_the_range_of_the_head_gives_a_clearance_whose_deviatio
     assert (np.abs(found.clearance - truth.clearance) < 3.0 * found.deviation).all()
 
 
-def test_a_clearance_that_no_drawn_motion_has_is_not_a_result() -> None:
+def test_a_clearance_beyond_all_drawn_motions_is_no_result() -> None:
     """With soft walls, unevenly worn pads have the effect of a negative clearance."""
     truth = mismatched(replace(KINDS["hard_askew"], periods=4.0), 99002)
     unknowns, period = Unknowns.stated(truth.nominal, truth.load, truth.poses), truth.load.period()
@@ -75,14 +75,14 @@ def test_a_clearance_that_no_drawn_motion_has_is_not_a_result() -> None:
     assert found is None and work > 0
 
 
-def test_a_quick_load_is_no_reason_to_look_at_the_poses_in_its_own_time() -> None:
+def test_a_fast_load_does_not_change_the_units_of_the_poses() -> None:
     """In units in which a load of 8 Hz has the paper's period, poses at 100 Hz would be too sparse."""
     truth = mismatched(replace(KINDS["chatter"], periods=6.0), 80001)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert result.horizontal_state is State.ROUGH and _holds(result, truth.clearance)
 
 
-def test_poses_without_any_load_give_a_rough_clearance_whose_interval_holds() -> None:
+def test_poses_without_any_load_give_a_rough_clearance() -> None:
     """Soft walls yield by more than half of the clearance; hard walls leave the range of motion."""
     for truth in (known()[0][0], draw(replace(GROUPS["hard"], periods=4.0), 30100)):
         result = estimate(truth.nominal, Load.unmeasured(float(truth.load.t[-1])), truth.poses)

@@ -19,7 +19,7 @@ from plow_twin.model.loads import compile_loads
 from plow_twin.model.scene import MOST_DAMPING_FACTOR
 
 
-def test_the_prior_is_the_scene_s_or_that_of_the_mark() -> None:
+def test_the_scene_or_the_mark_determines_the_prior() -> None:
     scene = preset("paper")
     t = np.arange(0.0, 10.0, 0.1)
     load, poses = Load(t, compile_loads(scene.loads).at(t)), Poses(t, np.zeros((len(t), 3)))
@@ -42,7 +42,7 @@ def test_the_prior_is_the_scene_s_or_that_of_the_mark() -> None:
 
 
 @pytest.mark.parametrize("number", ["stiffness", "damping"])
-def test_a_deviation_far_above_its_number_is_that_of_a_log_normal_number(number: str) -> None:
+def test_a_deviation_far_above_its_number_gives_a_log_normal_prior(number: str) -> None:
     scene, load = preset("paper"), Load.unmeasured(1.0)
     marks = {f"contact.{number}": Provenance(Mark.ASSUMED, "", 100.0 * getattr(scene.contact, number))}
     stated = Unknowns.stated(replace(scene, marks=marks), load, Poses(np.zeros(0), np.zeros((0, 3)))).deviations()
@@ -73,7 +73,7 @@ def test_the_scene_of_a_vector_depends_only_on_the_quantities_that_are_declared_
     [(Contact("kelvin_voigt", 1e7, damping=4e4), set()), (Contact("hertz", 1e7, 4.0), set()),
      (Contact("hertz", 1e7, 1.5), {1.52})],
 )  # fmt: skip
-def test_the_estimate_changes_a_scene_only_as_its_contact_law_and_friction_admit(
+def test_the_estimate_changes_a_scene_within_its_contact_law_and_friction(
     contact: Contact, exponents: set[float]
 ) -> None:
     stuck = Friction(0.2, stick_stiffness_n_m=1e7, static_coefficient=0.2)
@@ -94,7 +94,7 @@ def test_the_alternative_law_has_no_options_of_the_scene_s_law() -> None:
     assert other is not None and other.scene.contact == Contact("kelvin_voigt", 1e7, damping=1.0)
 
 
-def test_no_drawn_damping_factor_exceeds_the_admissible_one() -> None:
+def test_no_drawn_damping_factor_exceeds_the_admissible_factor() -> None:
     stiff = Contact("hunt_crossley", 1e7, damping=0.1 * MOST_DAMPING_FACTOR)
     unknowns = Unknowns(replace(preset("paper"), contact=stiff))
     vector = unknowns.nominal() + 3.0 * unknowns.deviations()

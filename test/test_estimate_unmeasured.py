@@ -24,7 +24,7 @@ from plow_twin.estimate.result import State
         ),
     ],
 )  # fmt: skip
-def test_the_believed_load_gives_clearances_where_components_are_missing(
+def test_the_load_gives_clearances_if_components_are_missing(
     kept: tuple[int | None, ...], deviation: tuple[float, float, float], reasons: tuple[str, ...], most: float
 ) -> None:
     """A component with few values, or with a large stated deviation, is treated as not measured."""
@@ -50,7 +50,7 @@ def test_a_machine_whose_load_does_not_explain_the_motion_gives_no_narrow_interv
 
 
 @pytest.mark.stress
-def test_a_start_whose_neighbours_cannot_be_simulated_is_improved_all_the_same() -> None:
+def test_a_start_is_improved_even_if_its_neighbours_cannot_be_simulated() -> None:
     """The drawn start of this machine has unknowns whose derivatives come from the prior alone."""
     truth = mismatched(KINDS["no_theta"], 99004)
     result = estimate(truth.nominal, truth.load, truth.poses)

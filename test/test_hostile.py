@@ -89,7 +89,7 @@ SOME_FILES = ("flow sequences", "aliases", "unknown keys")
 
 
 @pytest.mark.parametrize("reader", READERS)
-def test_files_that_stand_for_too_much_are_refused_in_a_line(reader: str, tmp_path: Path) -> None:
+def test_files_with_excessive_content_are_refused_in_a_line(reader: str, tmp_path: Path) -> None:
     """Each command ends with exit code 2 and one line, without a signal, after at most 60 s of processor time."""
     files = list(FILES if reader == "scene" else SOME_FILES)
     for name in files:
@@ -151,14 +151,14 @@ def test_content_within_the_bounds_is_read() -> None:
     assert len(load_yaml(keys(MOST_KEYS), "scene", "sections")[0]) == MOST_KEYS
 
 
-def test_a_file_without_end_is_read_up_to_the_largest(tmp_path: Path) -> None:
+def test_a_file_without_end_is_read_up_to_the_largest_size(tmp_path: Path) -> None:
     found, problems = read_yaml(Path("/dev/zero"), "scene", "sections")
     assert found is None and problems[0].expected == f"at most {LARGEST_FILE >> 20} MiB of YAML"
     (tmp_path / "latin.yaml").write_bytes(b"a: \xff")
     assert "not UTF-8" in read_yaml(tmp_path / "latin.yaml", "scene", "sections")[1][0].expected
 
 
-def test_thousands_of_unknown_keys_are_listed_up_to_a_number(tmp_path: Path) -> None:
+def test_a_limited_number_of_unknown_keys_is_listed(tmp_path: Path) -> None:
     from plow_twin.errors import SceneError
     from plow_twin.scene_file import loads_scene
 
@@ -301,7 +301,7 @@ def _on_a_terminal(*commands: list[str], folder: Path) -> list[str]:
     return written.decode().split("\0")[:-1]
 
 
-def test_names_and_texts_of_a_file_do_nothing_to_a_terminal(tmp_path: Path) -> None:
+def test_names_and_texts_of_a_file_do_not_control_a_terminal(tmp_path: Path) -> None:
     (tmp_path / "scene.yaml").write_text(SCENE)
     (tmp_path / "wrong.yaml").write_text(SCENE + '"\\e]0;owned\\a": 1\n')
     (tmp_path / "\x1b]0;owned\x07.yaml").write_text("version: 2")
@@ -319,7 +319,7 @@ def test_names_and_texts_of_a_file_do_nothing_to_a_terminal(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("content", [b"x" * 70_000, b"\0\0", b"p\x1b[2Jw", b"\xff\xfe"])
-def test_a_file_that_holds_no_secret_is_named_and_not_shown(tmp_path: Path, content: bytes) -> None:
+def test_an_invalid_secret_file_is_named_and_not_shown(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "secret"
     path.write_bytes(content)
     outputs = Credentials({"influx": {"token_file": "secret"}}, tmp_path)

@@ -84,7 +84,7 @@ def test_code_of_other_sources_is_removed(tmp_path: Path) -> None:
     assert old.load("signature") is None
 
 
-def test_a_kernel_that_only_kernels_call_stands_as_a_copy_in_each_entry_and_has_no_machine_code(tmp_path: Path) -> None:
+def test_an_inner_kernel_is_copied_into_each_entry_and_has_no_machine_code(tmp_path: Path) -> None:
     """Separate compilation of such a kernel, in addition to its callers, would take a third of the time.
 
     Without copies, bits would depend on the entry that a process loads first, and on whether it compiles or loads
@@ -122,7 +122,7 @@ def test_a_kernel_is_compiled_once_for_numbers_and_constants(tmp_path: Path) -> 
     assert run(tmp_path, program) == "14 1"
 
 
-def test_a_disk_that_takes_no_cache_is_one_warning_and_the_run_goes_on(tmp_path: Path) -> None:
+def test_an_unwritable_cache_gives_one_warning_and_the_run_continues(tmp_path: Path) -> None:
     full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)); "
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, "-c", full + LINKED], env=environment, capture_output=True, text=True)

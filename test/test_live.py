@@ -130,7 +130,9 @@ def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(
     assert len(printed) == 9 and "excitation,load,non_finite,1,2200000000,nan 0.0 0.0" in printed
 
 
-def test_a_time_that_stands_alone_is_no_clock_and_no_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_single_stamp_far_ahead_neither_sets_the_clock_nor_ends_the_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     date = "2026-01-01T00:00:{:06.3f}".format
     rows = [f"{date(index * 1e-3)},1,2,3\n" for index in range(300)]
     rows[150:150] = ["2080-01-01,1,2,3\n"]  # this stamp is more than fifty years after the previous stamp
@@ -163,7 +165,7 @@ def test_a_pose_may_lack_any_component(tmp_path: Path) -> None:
     assert _run(path, mapping)["input"][2]["head_pose_used"] == "20"
 
 
-def test_measured_poses_and_gaps_are_journaled_as_they_come(tmp_path: Path) -> None:
+def test_measured_poses_and_gaps_are_journalled_in_order_of_arrival(tmp_path: Path) -> None:
     rows = [",".join(map(repr, _row(index))) + ",,,," for index in range(100)]
     rows.insert(50, "0.0302,,,,0.001,0.002,0.003,0.004")
     rows.insert(60, "0.0405,,,,,,,0.005")
@@ -276,7 +278,7 @@ def test_an_unused_message_of_any_input_is_a_warning(tmp_path: Path) -> None:
     assert (level, message, values["travel_used"], values["travel_dropped"]) == (1, "travel_dropped", "19", "1")
 
 
-def test_the_senders_own_numbers_show_loss_repetition_and_a_new_start(tmp_path: Path) -> None:
+def test_message_numbers_of_the_sender_show_loss_repetition_and_restart(tmp_path: Path) -> None:
     numbers = [*range(7, 100), 99, *range(110, 200), *range(1, 50), *range(52, 60)]
     lines = [
         json.dumps({"time": 1000 + index, "load": {"f": [index, 2, 3]}, "n": n}) for index, n in enumerate(numbers)
@@ -319,7 +321,7 @@ def test_a_single_stray_number_moves_nothing(tmp_path: Path, numbers: list[str],
     assert (values["samples_lost"], values["samples_used"]) == (str(lost), str(len(numbers)))
 
 
-def test_a_mapping_takes_units_offsets_clocks_and_names_its_faults(tmp_path: Path) -> None:
+def test_a_mapping_has_units_offsets_and_clocks_and_its_faults_are_named(tmp_path: Path) -> None:
     path = tmp_path / "map.yaml"
 
     def read(text: str, **content: Any) -> tuple[int, dict[str, float]] | None:
@@ -383,7 +385,7 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_its_faults(tmp_path: Pat
                 reader(path)
 
 
-def test_files_wait_for_a_recorder_that_is_slow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_wait_for_a_slow_recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Input without a clock arrives in batches. Each batch fills a quarter of this queue."""
     monkeypatch.setattr("plow_twin.live.recording._QUEUE_SIZE", 2400)
     monkeypatch.setattr("plow_twin.record.recorder._POLL_S", 0.3)
@@ -408,7 +410,7 @@ def test_a_full_disk_under_the_log_does_not_end_the_twin(tmp_path: Path) -> None
         assert (report.samples, report.exit_code) == (50, 0)
 
 
-def test_a_reader_of_the_lines_that_hangs_stops_nothing_and_what_it_does_not_get_is_counted() -> None:
+def test_a_hanging_reader_of_the_lines_stops_nothing_and_lost_lines_are_counted() -> None:
     taken: list[str] = []
     hangs, lost_at = threading.Event(), list[int]()
 
@@ -427,7 +429,7 @@ def test_a_reader_of_the_lines_that_hangs_stops_nothing_and_what_it_does_not_get
     assert taken[-MOST_WAITING:] == list(map(str, range(100, MOST_WAITING + 100)))
 
 
-def test_a_live_twin_whose_standard_output_nobody_reads_goes_on_and_ends_when_it_is_stopped(tmp_path: Path) -> None:
+def test_a_live_twin_with_an_unread_standard_output_continues_and_can_be_stopped(tmp_path: Path) -> None:
     path, port = _csv(tmp_path / "load.csv", 100), _free_port()
     more = ["--metrics", str(port), "--record", str(tmp_path / "run")]
     with _live(str(path), "--follow", "--scene", "paper", *more) as live:
@@ -611,7 +613,7 @@ def test_files_with_dates_are_waited_for_and_followed_from_one_to_the_next(
         assert json.loads(capsys.readouterr().out)["input"]["samples_used"] == str(count)
 
 
-def test_the_share_read_of_files_that_end_rises_to_all(tmp_path: Path) -> None:
+def test_the_share_of_files_that_has_been_read_rises_to_one(tmp_path: Path) -> None:
     for day in (1, 2):
         _csv(tmp_path / f"load_{day}.csv", 9000)
     for source in (tmp_path / "load_1.csv", tmp_path / "load_*.csv"):
@@ -624,7 +626,7 @@ def test_the_share_read_of_files_that_end_rises_to_all(tmp_path: Path) -> None:
         assert shares == sorted(shares) and shares[0] == 0.0 and shares[-1] == 1.0 and len({*shares}) > 2
 
 
-def test_nothing_of_a_followed_file_is_lost_unseen_when_it_is_cut_or_another_takes_its_place(tmp_path: Path) -> None:
+def test_losses_of_a_truncated_or_replaced_file_are_counted(tmp_path: Path) -> None:
     path = tmp_path / "load.csv"
     path.write_text("t,fx,fy,m\n1,10,0,0\n2,20,0,0\n3,3")
     files = Files([path], follow=True)
@@ -654,7 +656,7 @@ def test_nothing_of_a_followed_file_is_lost_unseen_when_it_is_cut_or_another_tak
     files.close()
 
 
-def test_lines_on_standard_input_are_taken_and_silence_is_held(tmp_path: Path) -> None:
+def test_lines_on_standard_input_are_used_and_a_silence_is_held(tmp_path: Path) -> None:
     arguments = ("-", "--record", str(tmp_path / "run"), "--set", "excitation_timeout=0.05")
     with _live(*arguments, stdin=subprocess.PIPE) as live:
         assert live.process.stdin is not None
@@ -714,7 +716,7 @@ class Endless:
 
 
 @pytest.mark.stress
-def test_nothing_lives_longer_than_the_time_remembered_but_the_index_of_the_recording(tmp_path: Path) -> None:
+def test_the_memory_of_a_long_run_is_bounded_except_for_the_index_of_the_recording(tmp_path: Path) -> None:
     (tmp_path / "map.yaml").write_text("excitation: {topic: load}\nhead_pose: {topic: load}\ntravel: {topic: load}\n")
     given = {"record_path": str(tmp_path / "run"), "alarm_force": [1e3, 1e9], "alarm_residual": [0.015, 0.0]}
     settings = parameters.settings(given | {"jump_forward": 3600.0, "excitation_timeout": 3600.0})
@@ -754,7 +756,7 @@ def _free_port() -> int:
         return int(found.getsockname()[1])
 
 
-def test_a_refusal_by_the_system_is_a_warning_and_the_rest_is_done() -> None:
+def test_a_refusal_by_the_system_is_a_warning_and_the_other_settings_apply() -> None:
     code = """
 import os, resource
 from dataclasses import replace
@@ -790,7 +792,7 @@ print(os.sched_getaffinity(0) == {one})
         (["mqtt://localhost:1"], 1, "expected a mapping that assigns the topics"),
     ],
 )
-def test_a_wrong_call_names_the_expectation(
+def test_a_wrong_call_is_refused_with_the_expected_call(
     arguments: list[str],
     code: int,
     said: str,
@@ -831,7 +833,7 @@ def test_prometheus_reads_the_numbers_of_the_diagnostics(tmp_path: Path) -> None
         assert live.stop() == 0
 
 
-def test_readers_of_metrics_that_ask_nothing_are_bounded() -> None:
+def test_silent_readers_of_metrics_are_limited() -> None:
     port = _free_port()
     with Metrics(port, {"state": (0, "", {"model_time_s": "1.5"})}), ExitStack() as opened:
         idle = [opened.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(40)]
@@ -855,7 +857,7 @@ def _expressions(board: dict[str, Any]) -> list[str]:
     return [target["expr"] for panel in board["panels"] for target in panel["targets"]]
 
 
-def test_poses_gaps_and_speeds_that_cannot_be_are_not_used() -> None:
+def test_impossible_poses_gaps_and_speeds_are_not_used() -> None:
     used: list[Any] = []
     inputs = Inputs(cast(Any, None), "excitation", 10, 2.0, journaled=False)
     inputs.active = inputs.started = True
@@ -897,9 +899,7 @@ def test_an_input_without_a_sample_or_without_a_header_is_named(
     assert said in shown and "no --scene: the preset paper is used" in shown
 
 
-def test_failed_advances_are_no_success_in_any_view_of_a_run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_view_of_a_run_reports_failed_advances(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, run = _csv(tmp_path / "load.csv", 720, times=3.0), tmp_path / "run"
     assert run_cli(["live", str(path), "--scene", "paper", "--record", str(run)]) == 3
     said = capsys.readouterr().err
@@ -916,9 +916,7 @@ def test_failed_advances_are_no_success_in_any_view_of_a_run(
     assert replay(run).exit_code == 0
 
 
-def test_a_silence_in_a_file_is_named_in_every_view_and_no_loss(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_view_reports_a_silence_in_a_file_and_no_loss(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, run, page = _csv(tmp_path / "load.csv", 2000), tmp_path / "run", tmp_path / "run.html"
     rows = path.read_text(encoding="utf-8").splitlines()
     path.write_text("\n".join(rows[:301] + rows[1001:1201] + rows[1701:]), encoding="utf-8")
@@ -947,7 +945,7 @@ def test_a_silence_in_a_file_is_named_in_every_view_and_no_loss(
 
 
 @pytest.mark.parametrize(("given", "said"), [("follow=full", True), ("follow=parameters", False)])
-def test_a_file_that_ends_is_read_at_the_pace_of_the_twins_that_follow_and_this_is_said(
+def test_a_file_is_read_at_the_speed_of_the_following_twins_and_a_message_says_so(
     given: str, said: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = _csv(tmp_path / "load.csv", 50)
@@ -1003,7 +1001,7 @@ def test_a_natural_mistake_in_a_file_is_named(
     assert said in capsys.readouterr().err
 
 
-def test_utf16_a_folder_that_is_taken_and_a_threshold_in_kilonewtons_are_named(
+def test_utf16_a_used_folder_and_a_threshold_in_kilonewtons_are_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = _csv(tmp_path / "load.csv", 100)

@@ -14,7 +14,7 @@ FACE = Face(length_m=200.0, speed_m_s=2.0, turn_s=4.0)
 LOAD = CuttingLoad(FACE, 40e3, lateral_n=5e3, at_m=(0.1, 0.7), variation=0.5, correlation_m=0.05, seed=3)
 
 
-def test_the_plough_runs_to_the_end_turns_and_comes_back_without_a_jump() -> None:
+def test_the_plough_travels_turns_and_returns_without_a_jump() -> None:
     t = np.arange(0.0, 500.0, 1e-3)
     position, speed, number = FACE.travel(t)
     assert position.min() >= 0.0 and position.max() <= 200.0
@@ -25,7 +25,7 @@ def test_the_plough_runs_to_the_end_turns_and_comes_back_without_a_jump() -> Non
     assert np.abs(np.diff(speed)).max() <= 1.0001e-3
 
 
-def test_the_load_has_mean_variation_correlation_and_skewness_asked_for() -> None:
+def test_the_load_has_the_requested_mean_variation_correlation_and_skewness() -> None:
     t = np.arange(4.0, 96.0, 1e-3)
     force = np.concatenate([LOAD.at(t + index * 102.0) for index in range(6)])
     fx, fy, moment = force.T
@@ -42,7 +42,7 @@ def test_the_load_has_mean_variation_correlation_and_skewness_asked_for() -> Non
     assert np.corrcoef(one[lag:], one[:-lag])[0, 1] == pytest.approx(np.exp(-1.0), abs=0.06)
 
 
-def test_the_coal_stays_where_it_is_and_each_pass_cuts_another_web() -> None:
+def test_the_load_depends_on_position_seed_and_pass() -> None:
     times = np.arange(10.0, 20.0, 0.01)
     coarse, fine = LOAD.at(times), LOAD.at(np.arange(10.0, 20.0, 0.001))
     np.testing.assert_allclose(fine[::10][: len(coarse)], coarse, rtol=0.0, atol=0.01)

@@ -158,7 +158,7 @@ def _error(force: Array, true: Array) -> float:
 
 
 @pytest.mark.parametrize("how", ["parameters", "full"])
-def test_an_estimate_that_stands_is_taken_over_and_undone_when_it_is_withdrawn(truth: Truth, how: str) -> None:
+def test_a_valid_estimate_is_adopted_and_undone_after_its_withdrawal(truth: Truth, how: str) -> None:
     live = Live(truth.nominal, how)
     live.take(_in_turn(truth, 0.0, 3.0))
     nominal, prior = live.column("force"), live.clearance()
@@ -201,7 +201,7 @@ def test_another_machine_is_followed_from_its_prior(truth: Truth, change: Entry)
 
 
 @pytest.mark.parametrize("before", ["nothing", "withdrawn", "other numbers"])
-def test_without_an_estimate_poses_leave_the_median_twin_alone(truth: Truth, before: str) -> None:
+def test_without_an_estimate_poses_do_not_move_the_median_twin(truth: Truth, before: str) -> None:
     """The clearances of the machine are larger by 1.5 mm.
 
     The nominal twin, steered to its poses, would press its walls.
@@ -241,7 +241,7 @@ def test_wear_continues_from_its_depth_and_widens_the_estimate(truth: Truth) -> 
     assert live.clearance()[0, 0] - at_first[0, 0] == pytest.approx(0.5 * grown[[1, 3, 5, 7]].sum(), rel=0.2)
 
 
-def test_intervals_of_peaks_and_impulses_are_those_of_the_span_that_is_published(truth: Truth) -> None:
+def test_intervals_of_peaks_and_impulses_belong_to_the_published_span(truth: Truth) -> None:
     live = Live(truth.nominal)
     live.take(_in_turn(truth, 0.0, 1.0))
     for name in ("force", "peak", "impulse"):
@@ -287,7 +287,7 @@ def _again(journal: Sequence[Entry], scene: Scene, at_once: int = 1) -> Session:
     return session
 
 
-def test_late_samples_and_poses_end_in_the_bits_of_those_in_order_and_replay_gives_all_again(truth: Truth) -> None:
+def test_late_samples_and_poses_give_the_bits_of_ordered_ones_and_replay_repeats_them(truth: Truth) -> None:
     entries = [*_in_turn(truth, 0.0, 1.0), _known(truth), *_in_turn(truth, 1.0, 2.0)]
     ordered, late = Live(truth.nominal), Live(truth.nominal)
     ordered.take(entries)
@@ -312,7 +312,7 @@ def test_late_samples_and_poses_end_in_the_bits_of_those_in_order_and_replay_giv
     assert force == pytest.approx(expected, rel=0.02, abs=2e3)
 
 
-def test_publications_do_not_change_the_motion_where_poses_samples_and_a_hold_are_late(truth: Truth) -> None:
+def test_publications_do_not_change_the_motion_with_late_poses_samples_and_holds(truth: Truth) -> None:
     """The last publication limits how late a sample can be."""
     live, part = Live(truth.nominal), _in_turn(truth, 0.5, 1.5)
     live.take([*_in_turn(truth, 0.0, 0.5), _known(truth), *part[30:60], *part[:30], *part[90:120], *part[60:90]])
@@ -323,7 +323,7 @@ def test_publications_do_not_change_the_motion_where_poses_samples_and_a_hold_ar
     assert _again(live.journal, truth.nominal).twin.digest() == live.twin.digest()
 
 
-def test_a_snapshot_holds_all_that_a_later_run_needs(truth: Truth) -> None:
+def test_a_later_run_can_continue_from_a_snapshot(truth: Truth) -> None:
     live = Live(truth.nominal)
     live.take([*_in_turn(truth, 0.0, 0.6), _known(truth), *_in_turn(truth, 0.6, 0.8), *_poses(truth, 0.81, 0.85)])
     snapshot = live.session.renew()
@@ -391,7 +391,7 @@ def _late(truth: Truth, t: float) -> list[Sample]:
     return [replace(first, stamp_ns=(first.stamp_ns + second.stamp_ns) // 2)]
 
 
-def test_the_guard_of_a_steered_twin_knows_its_penetrations_with_an_offset_centre_of_mass(truth: Truth) -> None:
+def test_penetrations_of_members_do_not_depend_on_the_centre_of_mass(truth: Truth) -> None:
     head = replace(truth.nominal.head, rotation="consistent", com_offset_m=(0.03, -0.02))
     gravity = replace(truth.nominal.gravity, arm_m=0.0)
     scene = replace(truth.nominal, head=head, gravity=gravity)
@@ -402,7 +402,7 @@ def test_the_guard_of_a_steered_twin_knows_its_penetrations_with_an_offset_centr
 
 
 @pytest.mark.parametrize("wear", [None, Wear(2e-14, 0.015, 2.0)])
-def test_a_restored_motion_goes_on_with_what_is_known_now(truth: Truth, wear: Wear | None) -> None:
+def test_a_restored_motion_continues_with_the_present_estimate(truth: Truth, wear: Wear | None) -> None:
     live = Live(replace(truth.nominal, wear=wear))
     live.take(_in_turn(truth, 0.0, 0.5))
     before = live.session.snapshot()
@@ -416,7 +416,7 @@ def test_a_restored_motion_goes_on_with_what_is_known_now(truth: Truth, wear: We
     assert _again(live.journal, live.session.twin.scene).twin.digest() == live.twin.digest()
 
 
-def test_counts_of_poses_go_on_with_other_numbers_of_the_model_and_with_a_restored_motion(truth: Truth) -> None:
+def test_counts_of_poses_continue_after_a_change_of_the_model_and_a_restore(truth: Truth) -> None:
     live = Live(truth.nominal)
     start = live.session.snapshot()
     live.take(_in_turn(truth, 0.0, 0.5))
@@ -427,7 +427,7 @@ def test_counts_of_poses_go_on_with_other_numbers_of_the_model_and_with_a_restor
     assert live.twin.poses.used == used
 
 
-def test_each_mark_has_a_digest_as_of_a_twin_that_does_not_follow(truth: Truth) -> None:
+def test_a_digest_can_be_requested_several_times_for_a_sample(truth: Truth) -> None:
     t, marks = np.array([0.01, 0.02, 0.03]), np.array([2, 2, 3])
     for twin in (Follower(truth.nominal, MEMBERS), Twin(truth.nominal, excitation="sampled")):
         digests = twin.advance_rows(t, np.zeros((3, 3)), np.zeros(3, ROW), marks).digests
@@ -477,7 +477,7 @@ def test_a_jump_of_the_head_is_followed_and_angles_are_equal_up_to_full_turns(tr
     assert np.median(live.poses()[:, 0]) == pytest.approx(side, abs=3e-3)
 
 
-def test_twins_that_leave_the_range_of_the_model_come_back_with_the_next_pose(truth: Truth) -> None:
+def test_twins_outside_the_range_of_the_model_recover_at_the_next_pose(truth: Truth) -> None:
     live, lost = Live(truth.nominal), list[int]()
     for entry in _in_turn(truth, 0.0, 1.0):
         live.take([entry])
@@ -485,7 +485,7 @@ def test_twins_that_leave_the_range_of_the_model_come_back_with_the_next_pose(tr
     assert max(lost) > 0 and lost[-1] == 0
 
 
-def test_waiting_poses_are_bounded_dropped_ones_counted_and_no_estimate_is_dropped(truth: Truth) -> None:
+def test_waiting_poses_are_limited_and_counted_and_no_estimate_is_dropped(truth: Truth) -> None:
     live = Live(truth.nominal)
     live.take(_in_turn(truth, 0.0, 0.5))
     live.take([Pose(_stamp(t), (0.0, 0.0, 0.0)) for t in (3601.0, 7200.0)])
@@ -500,7 +500,7 @@ def test_waiting_poses_are_bounded_dropped_ones_counted_and_no_estimate_is_dropp
     assert live.twin.estimate is not None
 
 
-def test_without_measurements_the_median_twin_is_the_nominal_one_and_no_twin_is_moved(
+def test_without_measurements_the_median_twin_is_the_nominal_twin(
     truth: Truth, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(TwinBatch, "move", lambda *_: pytest.fail("a member was moved"))
@@ -513,7 +513,7 @@ def test_without_measurements_the_median_twin_is_the_nominal_one_and_no_twin_is_
     assert not rows["followed"].any()
 
 
-def test_twins_that_do_not_keep_up_leave_one_that_the_parameters_follow(truth: Truth) -> None:
+def test_twins_that_are_too_slow_are_replaced_by_a_single_twin(truth: Truth) -> None:
     live = Live(truth.nominal)
     live.take([*_in_turn(truth, 0.0, 0.5), _known(truth), *_in_turn(truth, 0.5, 1.0)])
     force, steered = live.column("force")[-1], live.session.snapshot()
@@ -619,7 +619,7 @@ class Front:
 
 
 @pytest.mark.parametrize("mode", ["on_sample", "fixed_rate"])
-def test_a_runtime_reports_its_followers_and_falls_back_to_the_parameters_where_samples_wait(
+def test_a_runtime_reports_its_twins_and_follows_with_parameters_if_samples_wait(
     truth: Truth, tmp_path: Path, mode: str
 ) -> None:
     scene = tmp_path / "believed.yaml"
@@ -683,7 +683,7 @@ def test_a_runtime_reports_its_followers_and_falls_back_to_the_parameters_where_
     assert {f"/{name}" for name in (*layout.FORCE_BOUNDS, *layout.POSE, *layout.MEASURED)} <= entities
 
 
-def test_forces_go_out_before_the_other_twins_are_advanced(
+def test_forces_are_sent_before_the_other_twins_are_advanced(
     truth: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = tmp_path / "believed.yaml"
@@ -708,7 +708,7 @@ def test_forces_go_out_before_the_other_twins_are_advanced(
 
 
 @pytest.mark.parametrize(("follow", "there"), [("off", "False"), ("full", "True")])
-def test_the_code_of_following_is_not_loaded_where_it_is_off(tmp_path: Path, follow: str, there: str) -> None:
+def test_without_following_its_code_is_not_loaded(tmp_path: Path, follow: str, there: str) -> None:
     code = f"""
 import sys
 from plow_twin.live import parameters
@@ -736,7 +736,7 @@ runtime.close()
     assert done.stdout.strip() == there, done.stderr
 
 
-def test_nothing_follows_in_bounded_time(truth: Truth) -> None:
+def test_hard_real_time_excludes_following(truth: Truth) -> None:
     values = {"estimate": True, "max_evaluations": 1000}
     assert [one.key for one in problems(parameters.settings(values), truth.nominal)] == ["max_evaluations"]
     assert not problems(parameters.settings(values | {"follow": "off"}), truth.nominal)

@@ -163,7 +163,7 @@ def _stamps(found: list[Arrived]) -> list[int]:
     return [arrived.content["source"] for arrived in found]
 
 
-def test_values_of_a_stamp_are_a_sample_and_unchanged_fields_stay() -> None:
+def test_values_with_one_stamp_form_a_sample_and_unchanged_fields_are_repeated() -> None:
     samples = Samples(["a", "b"], wait_s=1.0)
     samples.add("a", 10, 1.0, 0.0)
     samples.add("b", 10, 2.0, 0.1)
@@ -211,7 +211,7 @@ def test_a_wrong_mapping_of_nodes_names_the_key(tmp_path: Path) -> None:
         assert said in str(caught.value)
 
 
-def test_samples_come_with_the_sources_stamps_and_bad_values_are_counted(server: Plant, roles: Any) -> None:
+def test_samples_have_source_stamps_and_bad_values_are_counted(server: Plant, roles: Any) -> None:
     start_ns = time.time_ns() // MS * MS
     with _bridge(server, roles) as bridge:
         server.do("rows", _rows(start_ns, 0, 200), 1e-3)
@@ -233,7 +233,7 @@ def test_samples_come_with_the_sources_stamps_and_bad_values_are_counted(server:
         assert facts.keys() == SOURCE_KEYS.keys()
 
 
-def test_a_lost_message_is_seen_by_its_number_and_filled_from_the_history(server: Plant, roles: Any) -> None:
+def test_a_lost_message_is_detected_and_read_from_the_history(server: Plant, roles: Any) -> None:
     start_ns = time.time_ns() // MS * MS
     with _bridge(server, roles) as bridge:
         server.do("rows", _rows(start_ns, 0, 5))
@@ -249,7 +249,7 @@ def test_the_server_s_grants_are_compared_with_the_requests() -> None:
     assert Revised(10.0, 1.0, 100).complaint(1.0) == ""
     assert Revised(10.0, 10.0, 100).complaint(0.0) == ""
     assert "samples every 100 ms, requested every 1 ms" in Revised(100.0, 100.0, 1000).complaint(1.0)
-    assert "keeps 1 values, 100 come" in Revised(100.0, 1.0, 1).complaint(1.0)
+    assert "queues 1 values, but 100 arrive" in Revised(100.0, 1.0, 1).complaint(1.0)
 
 
 def _without_undone_holds(entries: list[Entry]) -> list[Sample | Hold]:
@@ -330,7 +330,7 @@ def test_a_break_without_history_is_a_loss(server: Plant, roles: Any) -> None:
 
 
 @pytest.mark.parametrize("kind", ["future", "endless", "nothing"])
-def test_a_history_that_lies_is_not_believed(kind: str, roles: Any) -> None:
+def test_a_wrong_history_is_not_used(kind: str, roles: Any) -> None:
     plant = Plant()
     start_ns = time.time_ns() // MS * MS
     try:
@@ -459,7 +459,7 @@ def test_an_encrypted_session_of_a_user_leaves_no_secret_in_the_recording(
     assert access.password.encode() not in shown + recorded and key not in recorded
 
 
-def test_a_user_signs_in_by_certificate_and_no_other_one_does(
+def test_only_the_user_with_the_certificate_can_log_in(
     secured: tuple[Plant, Access], certificates: Path, roles: Any, tmp_path: Path
 ) -> None:
     plant, access = secured
@@ -515,7 +515,7 @@ def test_untrusted_and_unencrypted_connections_are_refused(
         assert "secret" not in str(caught.value)
 
 
-def test_a_node_that_is_not_there_is_named(server: Plant, tmp_path: Path) -> None:
+def test_a_missing_node_is_named(server: Plant, tmp_path: Path) -> None:
     (tmp_path / "map.yaml").write_text(MAP.replace("Load.Fy", "Load.Fz"))
     bridge = OpcUa(Access(f"opc.tcp://127.0.0.1:{server.port}"), read_map(tmp_path / "map.yaml", None))
     with pytest.raises(BridgeError, match=r"Load\.Fz, expected a node of the server: BadNodeIdUnknown"):

@@ -33,7 +33,7 @@ def free_force(*numbers: float) -> float:
 @pytest.mark.parametrize(
     ("e", "d"), [(0.1, 9.998159), (0.3, 3.087082), (0.5, 1.432751), (0.7, 0.634828), (0.9, 0.166482)]
 )
-def test_exact_damping_factor_is_the_published_one(e: float, d: float) -> None:
+def test_exact_damping_factor_equals_the_published_factor(e: float, d: float) -> None:
     assert exact_damping_number(e) == pytest.approx(d, abs=5e-7)
 
 
@@ -121,7 +121,7 @@ def _raise(base, power, n, inverse, half_root) -> None:  # type: ignore[no-untyp
         ({"law": "spring", "stiffness": math.nan}, "contact.stiffness: got nan"),
     ],
 )
-def test_a_law_that_cannot_be_is_refused_by_name(contact: dict[str, object], words: str) -> None:
+def test_an_impossible_law_is_refused_by_name(contact: dict[str, object], words: str) -> None:
     with pytest.raises(SceneError, match=words):
         Scene(Head(1.0, 1.0), Frame(0.1, 0.1), Clearance(0.01, 0.01), Contact(**contact))  # type: ignore[arg-type]
 
@@ -136,7 +136,7 @@ def test_parts_of_the_wrong_kind_are_all_named_at_once() -> None:
         Scene(Head(1.0, 1.0), Frame(0.1, 0.1, labels), Clearance(0.01, 0.01), Contact("hertz", 1e7))
 
 
-def test_the_command_line_takes_laws_from_a_file_that_its_user_names(tmp_path: Path) -> None:
+def test_the_command_line_adds_laws_from_a_file(tmp_path: Path) -> None:
     scene, laws = tmp_path / "scene.yaml", tmp_path / "laws.py"
     scene.write_text((config_folder() / "paper.yaml").read_text().replace("law: hunt_crossley", "law: of_a_file"))
     laws.write_text(

@@ -90,7 +90,7 @@ def test_senses_are_those_of_the_paper() -> None:
     assert stops_ccw == expected
 
 
-def test_length_scale_skips_clearances_that_are_not_there() -> None:
+def test_length_scale_ignores_tiny_clearances() -> None:
     scene = preset("paper")
     for horizontal, vertical, expected in (
         (0.025, 0.03, 0.025),

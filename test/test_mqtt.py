@@ -183,7 +183,7 @@ def test_a_broker_keeps_messages_for_an_absent_twin_and_garbage_is_counted(broke
 
 # paho does not close the socket of a failed handshake; the garbage collector does
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_misspelt_topic_of_a_broker_is_no_success(
+def test_a_misspelt_topic_of_a_broker_is_an_error(
     broker: Access, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("PLOW_TWIN_MQTT_PASSWORD", broker.password)
@@ -249,12 +249,12 @@ def _hostile(*answers: bytes) -> Iterator[Access]:
     ],
     ids=["refuses", "closes", "is none"],
 )
-def test_a_broker_that_does_not_accept_is_told(answer: bytes, said: str) -> None:
+def test_a_refusal_by_the_broker_is_reported(answer: bytes, said: str) -> None:
     with _hostile(answer) as access, pytest.raises(BridgeError, match=f"(?i){said}"):
         Mqtt(access, connect_s=1.0).start(["a"])
 
 
-def test_a_broker_that_sends_more_than_can_wait_fills_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flood_of_messages_from_a_broker_takes_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mqtt, "_QUEUED_BYTES", 500_000)
 
     def published(size: int) -> bytes:
@@ -297,7 +297,7 @@ def _open_broker(folder: Path, port: int) -> Iterator[None]:
             process.kill()
 
 
-def test_a_broker_gets_all_groups_with_tls_and_says_when_the_twin_has_died(broker: Access, tmp_path: Path) -> None:
+def test_a_broker_receives_all_groups_with_tls_and_reports_the_end_of_the_twin(broker: Access, tmp_path: Path) -> None:
     (tmp_path / "secret").write_text(broker.password + "\n")
     (tmp_path / "out.yaml").write_text(f"mqtt: {{user: plough, password_file: secret, ca: '{broker.ca}'}}\n")
     path, url = _csv(tmp_path / "load.csv", 1500), f"{broker.url}/face/plough"
@@ -328,7 +328,7 @@ def test_a_broker_gets_all_groups_with_tls_and_says_when_the_twin_has_died(broke
         subscriber.close()
 
 
-def test_a_run_that_ends_while_its_broker_is_gone_is_no_success(tmp_path: Path) -> None:
+def test_a_run_that_ends_without_its_broker_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "map.yaml").write_text(MAP.replace(", sequence: n", ""))
     port, client, broker = _free_port(), make_client("", clean=True), ExitStack()
     broker.enter_context(_open_broker(tmp_path, port))
@@ -352,7 +352,7 @@ def test_a_run_that_ends_while_its_broker_is_gone_is_no_success(tmp_path: Path) 
     assert live.process.returncode == 3 and "not connected at the end: the connection broke" in said, said
 
 
-def test_a_missing_broker_is_reported_and_costs_the_twin_nothing(tmp_path: Path) -> None:
+def test_a_missing_broker_is_reported_and_does_not_affect_the_twin(tmp_path: Path) -> None:
     path, runs = _csv(tmp_path / "load.csv", 2000), [tmp_path / "alone", tmp_path / "with"]
     url = f"mqtt://127.0.0.1:{_free_port()}/plough"
     done = [
@@ -371,7 +371,7 @@ def _entries(run: Path) -> list[object]:
     return [record.entry for record in records_of(run) if isinstance(record, EntryRecord)]
 
 
-def test_messages_that_wait_for_a_broker_are_bounded_counted_and_come_in_order(tmp_path: Path) -> None:
+def test_messages_for_a_broker_are_limited_counted_and_sent_in_order(tmp_path: Path) -> None:
     port = _free_port()
     there = Message("online", b"true", True)
     way = Broker(
@@ -420,7 +420,7 @@ def _metrics(payload: Any) -> dict[str, Any]:
     return {found.name: found for found in payload.metrics}
 
 
-def test_a_host_of_sparkplug_hears_birth_data_rebirth_and_death_in_sequence(tmp_path: Path) -> None:
+def test_a_sparkplug_host_receives_birth_data_rebirth_and_death_in_sequence(tmp_path: Path) -> None:
     port, path = _free_port(), _csv(tmp_path / "load.csv", 500)
     arguments = (str(path), "--follow", "--mqtt-out", f"mqtt://127.0.0.1:{port}", "--sparkplug", "mine/plough")
     with ExitStack() as opened:
@@ -455,6 +455,6 @@ def test_a_host_of_sparkplug_hears_birth_data_rebirth_and_death_in_sequence(tmp_
         ("mqtt://localhost/a/+/b", "the prefix without + and #"),
     ],
 )
-def test_a_bad_address_is_refused_with_the_expectation(url: str, said: str, tmp_path: Path) -> None:
+def test_a_bad_address_is_refused_with_the_expected_form(url: str, said: str, tmp_path: Path) -> None:
     done = plow_twin_here("live", _csv(tmp_path / "load.csv", 3), "--mqtt-out", url, "--quiet")
     assert done.returncode == 2 and said in " ".join(done.stderr.split()) and "secret" not in done.stderr

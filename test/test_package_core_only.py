@@ -62,7 +62,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory, wheel: Path) -> Path:
     return python
 
 
-def test_model_and_twin_need_numpy_scipy_and_numba_alone(environment: Path, tmp_path: Path) -> None:
+def test_model_and_twin_need_only_numpy_scipy_and_numba(environment: Path, tmp_path: Path) -> None:
     answer = json.loads(run(environment, "-c", CORE_ONLY, cwd=tmp_path))
     assert set(answer["distributions"]) <= {"numpy", "scipy", "numba", "llvmlite", "pip", "setuptools", "plow_twin"}
     assert Path(answer["file"]).is_relative_to(environment.parent.parent)

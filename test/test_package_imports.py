@@ -161,7 +161,7 @@ def _module_imports(path: Path, modules: set[str]) -> set[str]:
     return found - {_module_name(path)}
 
 
-def test_no_module_imports_itself_by_a_detour() -> None:
+def test_no_import_is_circular() -> None:
     modules = {_module_name(path) for path in _modules()}
     graph = {_module_name(path): _module_imports(path, modules) for path in _modules()}
     assert graph["plow_twin.cli.simulate"] > {"plow_twin.run.simulate", "plow_twin.cli.console"}

@@ -73,7 +73,7 @@ def test_a_spreadsheet_s_file_becomes_a_mapping_with_which_the_twin_runs(
         ),
     ],
 )
-def test_units_are_those_of_the_names_or_of_the_sizes(
+def test_units_follow_from_names_or_magnitudes(
     tmp_path: Path, header: str, step: float, size: float, units: dict[str, str]
 ) -> None:
     guess = guess_columns(_file(tmp_path / "own.csv", header, step=step, size=size), PAPER, {}, {})
@@ -86,9 +86,7 @@ def test_units_are_those_of_the_names_or_of_the_sizes(
     assert guess.stamps_s[-1] == pytest.approx(0.599)
 
 
-def test_undecided_columns_end_with_the_option_that_states_them(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_for_undecided_columns_the_option_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = _file(tmp_path / "own.csv", "t;a;b;c;d", step=1e-3, size=1.0)
     assert cli(["setup", str(file), "--out", str(tmp_path / "out")]) == 2
     said = " ".join(capsys.readouterr().err.split())
@@ -160,7 +158,7 @@ def test_prompts_in_a_terminal_take_corrections_and_write_the_choice(tmp_path: P
 
 
 @pytest.mark.parametrize("last", [CTRL_C, b"\x04"], ids=["Ctrl-C", "Ctrl-D"])
-def test_a_prompt_that_is_broken_off_leaves_nothing(last: bytes, tmp_path: Path) -> None:
+def test_an_interrupted_prompt_leaves_no_file(last: bytes, tmp_path: Path) -> None:
     _file(tmp_path / "own.csv", "t;a;b;c;d", step=1e-3, size=1.0)
     code, screen = _in_terminal(tmp_path, b"a\n", last)
     assert code == 1 and "interrupted" in screen and "Traceback" not in screen

@@ -60,7 +60,7 @@ def test_losses_of_a_recording_are_known_after_one_reading_of_its_tables(run: Ru
     assert alone.losses() == read.losses()
 
 
-def test_numpy_pandas_and_arrow_are_the_same_numbers(run: Run) -> None:
+def test_numpy_pandas_and_arrow_have_the_same_numbers(run: Run) -> None:
     table = plow_twin.read_recording(run.folder)["head_state"]
     stamps, values = table.numpy()
     frame, arrow = table.pandas(), table.arrow()
@@ -71,7 +71,7 @@ def test_numpy_pandas_and_arrow_are_the_same_numbers(run: Run) -> None:
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet", "npz"])
-def test_an_export_is_the_recording_and_overwrites_nothing(
+def test_an_export_equals_the_recording_and_overwrites_nothing(
     kind: str, run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / ("run.npz" if kind == "npz" else "tables")
@@ -98,7 +98,7 @@ def test_an_export_is_the_recording_and_overwrites_nothing(
     assert "exists already" in capsys.readouterr().err
 
 
-def test_an_export_of_a_cut_recording_says_so_and_of_a_place_that_takes_nothing_too(
+def test_an_export_reports_a_truncated_recording_and_an_unwritable_folder(
     run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cut = tmp_path / "cut.mcap"

@@ -168,7 +168,7 @@ def test_rerun_checks_the_file(run: Run) -> None:
     assert result.returncode == 0, result.stdout + result.stderr
 
 
-def test_a_file_cut_anywhere_gives_its_content_before_the_cut(run: Run, tmp_path: Path) -> None:
+def test_a_truncated_file_is_read_up_to_its_end(run: Run, tmp_path: Path) -> None:
     data = run.file.read_bytes()
     whole = list(records_of(run.file))
     rng = random.Random(1)
@@ -187,7 +187,7 @@ def test_a_file_cut_anywhere_gives_its_content_before_the_cut(run: Run, tmp_path
         assert reader.lost == {} and reader.damaged_chunks == 0
 
 
-def test_a_damaged_byte_costs_one_chunk_and_is_reported(run: Run, tmp_path: Path) -> None:
+def test_a_damaged_byte_loses_one_chunk_and_is_reported(run: Run, tmp_path: Path) -> None:
     data = bytearray(run.file.read_bytes())
     whole = list(records_of(run.file))
     spans = chunk_spans(run.file)
@@ -250,12 +250,12 @@ def check_large(run: Run, folder: Path, images: int, image_size: int, attachment
     return most
 
 
-def test_attachments_and_other_topics_of_any_size_are_passed_over(run: Run, tmp_path: Path) -> None:
+def test_attachments_and_other_topics_of_any_size_are_skipped(run: Run, tmp_path: Path) -> None:
     check_large(run, tmp_path, images=2, image_size=1_000_000, attachments=1)
 
 
 @pytest.mark.stress
-def test_ten_gigabytes_take_the_memory_of_some_chunks(run: Run, tmp_path: Path) -> None:
+def test_ten_gigabytes_are_read_in_bounded_memory(run: Run, tmp_path: Path) -> None:
     small = check_large(run, tmp_path, images=0, image_size=0, attachments=0)
     large = check_large(run, tmp_path, images=70, image_size=60_000_000, attachments=20)
     assert (tmp_path / "large.mcap").stat().st_size > 10_000_000_000
@@ -285,7 +285,7 @@ def test_a_file_that_another_program_rewrote_is_a_run(run: Run, tmp_path: Path) 
         (None, "no such recording"),
     ],
 )
-def test_a_file_that_is_no_recording_is_named(content: bytes | None, expected: str, tmp_path: Path) -> None:
+def test_a_file_without_a_recording_is_named(content: bytes | None, expected: str, tmp_path: Path) -> None:
     file = tmp_path / "notes.mcap"
     if content is not None:
         file.write_bytes(content)

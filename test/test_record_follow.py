@@ -20,7 +20,7 @@ from plow_twin.record.running import find_run
 COUNT = 3000
 
 
-def test_a_follower_sees_every_sample_of_every_part_and_ends_with_the_run(tmp_path: Path) -> None:
+def test_a_tail_reads_every_sample_of_every_part_and_ends_with_the_run(tmp_path: Path) -> None:
     before = record_run(tmp_path / "before", map(paper_sample, range(10)))
     # this first reading compiles the reader
     assert sum(len(batch.entries) for batch in RunReader(before.folder, Tail()).batches())
@@ -42,7 +42,7 @@ def test_a_follower_sees_every_sample_of_every_part_and_ends_with_the_run(tmp_pa
     assert sent == sum(sum(map(len, batch.outputs)) for batch in RunReader(tmp_path / "run").batches()) > 3 * COUNT
 
 
-def test_a_follower_waits_for_an_end_of_which_only_a_part_is_written(tmp_path: Path) -> None:
+def test_a_tail_waits_for_an_end_that_is_partly_written(tmp_path: Path) -> None:
     file = record_run(tmp_path / "run", map(paper_sample, range(10))).file
     whole = file.read_bytes()
     file.write_bytes(whole[:-3])
@@ -65,7 +65,7 @@ WRITER = """
 """
 
 
-def test_a_follower_ends_when_the_writer_is_killed(tmp_path: Path) -> None:
+def test_a_tail_ends_when_the_writer_is_killed(tmp_path: Path) -> None:
     command = [sys.executable, "-c", textwrap.dedent(WRITER), str(tmp_path / "run"), str(Path(__file__).parent)]
     with started(command) as process:
         reader = RunReader(find_run(tmp_path / "run", 60.0), Tail())
@@ -78,7 +78,7 @@ def test_a_follower_ends_when_the_writer_is_killed(tmp_path: Path) -> None:
     assert samples > 50 and reader.status is FileStatus.TRUNCATED
 
 
-def test_the_run_that_is_written_is_found_beside_an_earlier_one(tmp_path: Path) -> None:
+def test_the_run_in_progress_is_found_beside_an_earlier_run(tmp_path: Path) -> None:
     record_run(tmp_path / "run", map(paper_sample, range(10)))
     writer = threading.Thread(target=record_run, args=(tmp_path / "run_2", map(paper_sample, range(COUNT))))
     writer.start()

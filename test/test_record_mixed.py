@@ -133,7 +133,7 @@ def _same(report: ReplayReport) -> bool:
     return report.exit_code == 0 and not report.not_compared
 
 
-def test_a_late_speed_does_not_reach_back_across_a_snapshot(tmp_path: Path) -> None:
+def test_a_late_speed_has_no_effect_before_a_snapshot(tmp_path: Path) -> None:
     live = Mixed(tmp_path)
     live.send(*map(_swinging, range(200)))
     live.driver.snapshot()
@@ -156,7 +156,7 @@ def test_a_speed_from_before_a_snapshot_is_not_lost_when_a_sample_after_it_is_la
     assert digests[0] == digests[1]
 
 
-def test_after_a_hold_and_a_reset_samples_are_not_taken_for_held(tmp_path: Path) -> None:
+def test_after_a_hold_and_a_reset_samples_do_not_count_as_held(tmp_path: Path) -> None:
     live = Mixed(tmp_path, publish_mode="fixed_rate", alarm_force=[1e3, 1e9], excitation_timeout=0.05)
     live.send(_at(0, NOTHING))
     live.silence(100)
@@ -169,7 +169,7 @@ def test_after_a_hold_and_a_reset_samples_are_not_taken_for_held(tmp_path: Path)
 
 
 @pytest.mark.parametrize("hold", ["hold", "zero"])
-def test_a_blow_before_a_hold_raises_an_alarm_and_a_blow_in_the_hold_does_not(hold: str, tmp_path: Path) -> None:
+def test_an_impact_before_a_hold_raises_an_alarm_and_an_impact_in_the_hold_does_not(hold: str, tmp_path: Path) -> None:
     live = Mixed(tmp_path, publish_mode="fixed_rate", alarm_force=[6e4, 1e9], excitation_timeout=0.05, hold_policy=hold)
     # after a short push, the head moves on without samples until it meets the frame
     live.send(*(_at(index, (0.0, 40e3, 0.0)) for index in range(20)))
@@ -201,7 +201,7 @@ def test_nothing_is_published_again_when_a_late_sample_fails(span: float, tmp_pa
     assert _same(live.replayed())
 
 
-def test_late_samples_at_the_edge_of_the_memory_give_the_same_however_they_came(tmp_path: Path) -> None:
+def test_late_samples_at_the_edge_of_the_memory_give_the_same_motion_in_any_order(tmp_path: Path) -> None:
     found = []
     for grouped in (True, False):
         live = Mixed(tmp_path / str(grouped), publish_mode="fixed_rate", rollback_span=0.5)
@@ -228,7 +228,7 @@ def test_a_late_speed_at_the_edge_of_the_memory_acts_where_it_did(tmp_path: Path
     assert _same(live.replayed())
 
 
-def test_a_speed_before_the_first_sample_acts_from_there_on_however_often_it_is_run_again(tmp_path: Path) -> None:
+def test_a_speed_before_the_first_sample_acts_after_every_rollback(tmp_path: Path) -> None:
     live = Mixed(tmp_path, rollback_span=0.1)
     live.driver.travel(T0 + 36 * MS, 2.8)
     live.driver.travel(T0 + 13 * MS, 1.7)

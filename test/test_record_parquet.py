@@ -108,7 +108,7 @@ def test_instants_are_the_same_in_each_zone_and_naive_times_are_utc(tmp_path: Pa
     assert time_ns("2026-01-02T03:03:19.123Z") == BEGIN_NS - 456_789
 
 
-def test_missing_values_are_empty_numbers_are_exact_and_lists_are_left_out(tmp_path: Path) -> None:
+def test_missing_values_are_empty_and_numbers_exact_and_lists_are_omitted(tmp_path: Path) -> None:
     path = tmp_path / "any.parquet"
     table = pa.table(
         {
@@ -204,9 +204,7 @@ def _large_column(path: Path) -> None:
     )  # fmt: skip
 
 
-def test_what_is_no_parquet_or_stands_for_too_much_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_invalid_or_excessive_parquet_gives_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = {name: tmp_path / f"{name}.parquet" for name in ("rows", "columns", "column", "text", "empty", "cut")}
     _rows(files["rows"], 50_000_000)
     assert files["rows"].stat().st_size < 500_000
@@ -246,7 +244,7 @@ def test_a_damaged_page_ends_the_rows_there_and_is_counted(tmp_path: Path, capsy
     assert "the rows from 8193 on cannot be read" in capsys.readouterr().err
 
 
-def test_the_share_that_has_been_read_rises_to_all(tmp_path: Path) -> None:
+def test_the_share_that_has_been_read_rises_to_one(tmp_path: Path) -> None:
     path = tmp_path / "plant.parquet"
     parquet.write_table(_table(20_000), path)
     with ParquetLines(path) as lines:

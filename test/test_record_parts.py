@@ -49,7 +49,7 @@ COUNT = 3000
 SMALL: dict[str, Any] = {"part_bytes": 200_000, "flush_period_s": 0.01, "chunk_size": 50_000}
 
 
-def test_parts_are_whole_alone_and_nothing_is_lost_between_them(tmp_path: Path) -> None:
+def test_parts_can_be_read_alone_and_nothing_is_lost_between_them(tmp_path: Path) -> None:
     run = record_run(
         tmp_path / "run", map(paper_sample, range(COUNT)), part_bytes=200_000, flush_period_s=0.01, chunk_size=50_000
     )
@@ -91,7 +91,7 @@ def test_the_journal_alone_takes_less_than_75_bytes_a_sample(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(("share", "begun"), [(0.4, None), (0.9, 0), (0.9, 100)])
-def test_a_recording_that_was_cut_off_is_repaired(share: float, begun: int | None, tmp_path: Path) -> None:
+def test_a_truncated_recording_is_repaired(share: float, begun: int | None, tmp_path: Path) -> None:
     """A recorder that is killed during a change of files leaves a second part, which has `begun` bytes."""
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), chunk_size=50_000)
     data = run.file.read_bytes()
@@ -113,7 +113,7 @@ def test_a_recording_that_was_cut_off_is_repaired(share: float, begun: int | Non
         assert reader.message_count == len(found)
 
 
-def test_a_recording_that_is_being_written_is_not_repaired(tmp_path: Path) -> None:
+def test_a_recording_in_progress_is_not_repaired(tmp_path: Path) -> None:
     scene = dump_scene(load_scene(scene_path("paper")))
     with closing(Recorder(tmp_path / "run", RunHeader(scene))) as recorder:
         recorder.journal(paper_sample(0))
@@ -206,7 +206,7 @@ def test_topics_recorded_beside_a_run_are_examined_and_repaired(tmp_path: Path) 
     assert "own/msg/Level" in (writer.folder / "metadata.yaml").read_text()
 
 
-def test_a_part_that_stands_there_twice_is_named_and_read_once(tmp_path: Path) -> None:
+def test_a_repeated_part_is_named_and_read_once(tmp_path: Path) -> None:
     run = record_run(
         tmp_path / "run", map(paper_sample, range(COUNT)), part_bytes=200_000, flush_period_s=0.01, chunk_size=50_000
     )
@@ -253,7 +253,7 @@ def test_a_recording_of_another_layout_is_refused_by_its_number(tmp_path: Path) 
         RunReader(tmp_path / "old.mcap")
 
 
-def test_a_stretch_that_stands_there_twice_is_counted_and_used_once(tmp_path: Path) -> None:
+def test_repeated_entries_are_counted_and_used_once(tmp_path: Path) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), chunk_size=50_000)
     whole, spans = run.file.read_bytes(), chunk_spans(run.file)
     before = replay(run.folder)
@@ -267,7 +267,7 @@ def test_a_stretch_that_stands_there_twice_is_counted_and_used_once(tmp_path: Pa
     assert found.gaps == 0 and any("more than once" in problem for problem in found.problems)
 
 
-def test_a_full_disk_is_named_and_a_repair_leaves_nothing_half_done(tmp_path: Path) -> None:
+def test_on_a_full_disk_a_repair_leaves_no_incomplete_file(tmp_path: Path) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)))
     run.file.write_bytes(run.file.read_bytes()[:-1000])
     there = sorted(run.folder.iterdir())
@@ -307,7 +307,9 @@ def test_a_change_of_files_on_a_full_disk_is_undone_and_done_later(
     assert listed_parts(tmp_path / "run") == ["run_0.mcap", "run_1.mcap"]
 
 
-def test_a_full_disk_ends_the_writing_of_a_replay_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_full_disk_ends_the_writing_of_a_replay_with_a_message(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), frame_every=10**9, pause_every=0)
     before, full = run.file.read_bytes(), tmp_path / "full"
     # this run puts the kernels into the cache before the size of files is limited
@@ -326,7 +328,7 @@ def test_a_full_disk_ends_the_writing_of_a_replay_by_name(tmp_path: Path, capsys
     assert (report.exit_code, report.status, report.divergences) == (3, FileStatus.TRUNCATED, 0)
 
 
-def test_a_part_that_is_no_mcap_file_is_named_and_the_rest_is_read(tmp_path: Path) -> None:
+def test_an_invalid_part_is_named_and_the_others_are_read(tmp_path: Path) -> None:
     run = record_run(
         tmp_path / "run", map(paper_sample, range(COUNT)), part_bytes=200_000, flush_period_s=0.01, chunk_size=50_000
     )
@@ -370,7 +372,7 @@ def test_a_decimated_recording_keeps_every_peak(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("which", [0, 1, -1])
-def test_a_part_that_is_not_there_is_counted_and_no_load_drawn_over_its_hole(which: int, tmp_path: Path) -> None:
+def test_a_missing_part_is_counted_and_the_load_has_a_gap_there(which: int, tmp_path: Path) -> None:
     run = record_run(
         tmp_path / "run", map(paper_sample, range(COUNT)), part_bytes=200_000, flush_period_s=0.01, chunk_size=50_000
     )
@@ -393,9 +395,7 @@ def test_a_part_that_is_not_there_is_counted_and_no_load_drawn_over_its_hole(whi
     assert found.predictions[0].loads.duration_s < whole.predictions[0].loads.duration_s
 
 
-def test_parts_that_are_removed_while_others_are_read_are_passed_over(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_parts_removed_during_reading_are_skipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With `record_keep_mb`, the oldest parts are removed, possibly before a slow reader has read them."""
     # the batches are so small that the reader reads the parts one by one
     monkeypatch.setattr("plow_twin.record.reader._LEAST", 1)
@@ -440,7 +440,7 @@ def test_estimate_and_forecast_report_missing_parts_and_rows_beyond_the_limit(
     assert cli(["forecast", str(empty), *forecast[2:]]) == 1 and "got no .mcap file" in capsys.readouterr().err
 
 
-def test_an_estimate_draws_no_load_over_a_damaged_chunk(tmp_path: Path) -> None:
+def test_an_estimate_does_not_interpolate_the_load_over_a_damaged_chunk(tmp_path: Path) -> None:
     """The gap is detected although it is shorter than half a second, the shortest silence."""
     poses = [Pose(paper_sample(index).stamp_ns, (0.0, 0.0, 0.0)) for index in range(0, COUNT, 10)]
     entries = [entry for index in range(COUNT) for entry in (paper_sample(index), *poses[index : index + 1])]
@@ -459,7 +459,7 @@ def test_an_estimate_draws_no_load_over_a_damaged_chunk(tmp_path: Path) -> None:
     assert found.load[0, 0] > 0.0  # times are counted from the first sample of the whole recording
 
 
-def test_a_part_of_a_foreign_recording_that_is_not_there_is_counted(tmp_path: Path) -> None:
+def test_a_missing_part_of_a_foreign_recording_is_counted(tmp_path: Path) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(10)))
     listing = run.folder / "metadata.yaml"
     text = listing.read_text()
@@ -468,7 +468,7 @@ def test_a_part_of_a_foreign_recording_that_is_not_there_is_counted(tmp_path: Pa
     assert open_source(run.folder).losses.counts == {"missing_parts": 1}
 
 
-def test_a_recording_with_nothing_to_compare_is_not_called_the_same(tmp_path: Path) -> None:
+def test_a_recording_without_comparable_content_is_not_called_equal(tmp_path: Path) -> None:
     Recorder(tmp_path / "run", RunHeader(dump_scene(load_scene(scene_path("paper"))))).close()
     report = replay(tmp_path / "run")
     assert (report.entries, report.nothing, report.exit_code) == (0, True, 3)

@@ -287,7 +287,7 @@ def record_around_a_pause(folder: Path, stop: Callable[[], object], go_on: Calla
 
 
 @pytest.mark.parametrize("kind", ["little space", "no space"])
-def test_a_recording_goes_on_when_the_disk_has_room_again(
+def test_a_recording_continues_when_the_disk_has_space_again(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     full = threading.Event()
@@ -322,7 +322,7 @@ def test_an_incomplete_ring_is_not_written(tmp_path: Path, monkeypatch: pytest.M
     assert os.listdir(tmp_path / "new") == []
 
 
-def test_a_mark_at_the_news_of_a_lost_one_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mark_set_after_the_report_of_a_lost_mark_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     twin = Twin(load_scene(scene_path("paper")), excitation="sampled")
     folder, write, failures = tmp_path / "ring", ring.write_metadata, [OSError(28, "No space left on device")]
 
@@ -350,7 +350,7 @@ def test_a_mark_at_the_news_of_a_lost_one_is_written(tmp_path: Path, monkeypatch
     assert (recorder.counters.marks, recorder.counters.marks_lost, folder.exists()) == (1, 1, True)
 
 
-def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(
+def test_a_ring_stores_the_last_seconds_and_writes_them_at_a_mark(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     dump = RingWriter.dump
@@ -442,7 +442,7 @@ def test_an_open_recorder_is_closed_at_exit(tmp_path: Path) -> None:
     assert (tmp_path / "run" / "metadata.yaml").exists()
 
 
-def test_closing_waits_while_items_are_written_and_then_says_what_is_missing(
+def test_closing_waits_while_items_are_written_and_then_reports_missing_items(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write, stuck = RunWriter.write_samples, threading.Event()
@@ -477,7 +477,9 @@ def test_an_earlier_recording_is_never_written_over(tmp_path: Path) -> None:
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_of_recorders_that_want_one_folder_each_gets_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_recorders_that_request_the_same_folder_get_separate_folders(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     quicker: list[Recorder] = []
 
     def make(folder: Path) -> Recorder:
@@ -553,7 +555,7 @@ def test_with_sync_flushed_data_survive_a_loss_of_power(tmp_path: Path) -> None:
     assert stamps == [BASE_NS + index * STEP_NS for index in range(len(stamps))]
 
 
-def test_without_sync_the_disk_is_not_waited_for_and_with_it_a_closed_run_is_whole_there(tmp_path: Path) -> None:
+def test_only_with_sync_the_recorder_waits_for_the_disk(tmp_path: Path) -> None:
     waited = []
     for sync in (False, True):
         command = writer_command(tmp_path / str(sync), count=20, begin=SYNCS, end="recorder.close()", sync=sync)
@@ -566,7 +568,7 @@ def test_without_sync_the_disk_is_not_waited_for_and_with_it_a_closed_run_is_who
     assert {str(folder / "metadata.yaml.partial"), str(folder)} <= set(waited[1])
 
 
-def test_a_full_disk_beside_a_run_is_reported_at_once_and_when_there_is_room_again(
+def test_a_full_disk_beside_a_run_is_reported_and_so_is_its_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said: list[str] = []

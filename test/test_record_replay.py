@@ -106,7 +106,7 @@ def test_the_last_bit_of_a_sample_is_found_by_the_next_digest(run: Run, tmp_path
     assert 1234 <= report.first_divergence.step < 1300
 
 
-def test_a_changed_output_is_found_and_does_not_spoil_the_rest(run: Run, tmp_path: Path) -> None:
+def test_a_changed_output_is_found_and_does_not_affect_the_others(run: Run, tmp_path: Path) -> None:
     index = 1111
 
     def change(topic: str, message: Any) -> bytes | None:
@@ -148,7 +148,7 @@ def test_a_flipped_bit_anywhere_in_an_output_is_found(run: Run, tmp_path: Path) 
     assert (report.first_divergence.step, report.first_divergence.topic) == (300, "contact_forces")
 
 
-def test_outputs_in_another_order_are_compared_all_the_same(run: Run, tmp_path: Path) -> None:
+def test_outputs_in_another_order_are_compared(run: Run, tmp_path: Path) -> None:
     file = tmp_path / "turned.mcap"
     with run.file.open("rb") as stream, file.open("wb") as out:
         reader, writer = make_reader(stream), Writer(out, chunk_size=64 * 1024)
@@ -184,7 +184,7 @@ def test_a_missing_sample_diverges(run: Run, tmp_path: Path) -> None:
     assert report.first_divergence is not None and report.first_divergence.step == 900
 
 
-def test_a_cut_file_is_replayed_as_far_as_it_goes(run: Run, tmp_path: Path) -> None:
+def test_a_truncated_file_is_replayed_up_to_its_end(run: Run, tmp_path: Path) -> None:
     data = run.file.read_bytes()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(data[: len(data) // 2])
@@ -193,7 +193,7 @@ def test_a_cut_file_is_replayed_as_far_as_it_goes(run: Run, tmp_path: Path) -> N
     assert 0 < report.samples < COUNT and report.messages_compared > 0
 
 
-def test_after_a_damaged_chunk_nothing_is_claimed(run: Run, tmp_path: Path) -> None:
+def test_after_a_damaged_chunk_nothing_is_compared(run: Run, tmp_path: Path) -> None:
     spans = chunk_spans(run.file)
     lost_entries = lost_messages = False
     for start, length in spans:  # the chunks of the journal and of the outputs
@@ -210,7 +210,7 @@ def test_after_a_damaged_chunk_nothing_is_claimed(run: Run, tmp_path: Path) -> N
     assert lost_entries and lost_messages
 
 
-def test_replay_goes_on_from_the_snapshot_after_a_loss(tmp_path: Path) -> None:
+def test_replay_continues_from_the_snapshot_after_a_loss(tmp_path: Path) -> None:
     def rush_then_walk() -> Iterator[Sample]:
         for index in range(COUNT):
             if index > COUNT // 2 and index % 10 == 0:
@@ -250,7 +250,7 @@ def test_a_damaged_scene_in_a_file_is_named_with_its_key(run: Run, tmp_path: Pat
         replay(damaged)
 
 
-def test_a_header_that_lacks_a_key_is_refused(run: Run, tmp_path: Path) -> None:
+def test_a_header_without_a_key_is_refused(run: Run, tmp_path: Path) -> None:
     def metadata(record: dict[str, str]) -> dict[str, str]:
         record.pop("tol", None)
         return record
@@ -259,7 +259,7 @@ def test_a_header_that_lacks_a_key_is_refused(run: Run, tmp_path: Path) -> None:
         replay(rewrite(run.file, tmp_path / "other.mcap", metadata=metadata))
 
 
-def test_a_journal_alone_gives_the_full_recording_again(tmp_path: Path) -> None:
+def test_a_full_recording_is_computed_from_the_journal_alone(tmp_path: Path) -> None:
     bare = record_run(tmp_path / "bare", paper_entries(COUNT), frame_every=10**9)
     full = record_run(tmp_path / "full", paper_entries(COUNT))
     report = replay(bare.folder, write=tmp_path / "made")
@@ -270,7 +270,7 @@ def test_a_journal_alone_gives_the_full_recording_again(tmp_path: Path) -> None:
     assert (again.exit_code, again.compared["contact_forces"]) == (0, COUNT + 1)
 
 
-def test_digests_alone_are_compared_without_opening_the_outputs(run: Run, tmp_path: Path) -> None:
+def test_only_digests_are_compared_without_reading_the_outputs(run: Run, tmp_path: Path) -> None:
     data = bytearray(run.file.read_bytes())
     for start, length in chunk_spans(run.file, journal=False):
         data[start + length // 2] ^= 0xFF  # only chunks of outputs are damaged, and outputs are not read here

@@ -110,7 +110,7 @@ def test_measurements_in_si_pass(share: float, rate: float, pose: float, offset_
     assert unit_doubts(values, offset_s + times, SCENE) == []
 
 
-def test_a_load_of_one_sample_a_second_in_dates_or_with_changes_is_believed() -> None:
+def test_a_load_of_one_sample_a_second_is_accepted() -> None:
     times = np.arange(600.0)
     load = {("excitation", "fx"): 32e3 * np.sin(2.0 * times)}
     assert unit_doubts(load, times, SCENE) == []

@@ -47,7 +47,7 @@ def _saved(keeper: WearKeeper, depth: np.ndarray) -> str:
     return keeper.error
 
 
-def test_saved_wear_is_loaded_to_the_bit_and_no_other_file_stays_behind(tmp_path: Path) -> None:
+def test_saved_wear_is_loaded_exactly_and_no_other_file_remains(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "folder"
     assert _loaded(folder, "head 7", SCENE) is None
     _save(folder)
@@ -80,7 +80,7 @@ def test_another_head_or_scene_and_damage_are_refused(tmp_path: Path) -> None:
             _loaded(tmp_path, "head 7", SCENE)
 
 
-def test_two_twins_do_not_keep_their_wear_in_one_folder(tmp_path: Path) -> None:
+def test_two_twins_cannot_save_their_wear_in_one_folder(tmp_path: Path) -> None:
     first = WearKeeper(tmp_path / "wear", "head 7", SCENE)
     with pytest.raises(WearStateError, match="another twin uses it for its wear"):
         WearKeeper(tmp_path / "wear", "head 7", SCENE)
@@ -92,7 +92,7 @@ def test_two_twins_do_not_keep_their_wear_in_one_folder(tmp_path: Path) -> None:
     assert os.listdir(tmp_path / "wear") == [FILE_NAME]
 
 
-def test_a_disk_that_takes_nothing_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_a_full_disk_the_old_file_remains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _save(tmp_path)
 
     def full(descriptor: int) -> None:
@@ -106,7 +106,7 @@ def test_a_disk_that_takes_nothing_leaves_the_old_file(tmp_path: Path, monkeypat
     assert os.listdir(tmp_path) == [FILE_NAME]
 
 
-def test_a_file_that_came_while_the_twin_ran_is_left_as_it_is(tmp_path: Path) -> None:
+def test_a_foreign_file_that_appears_during_the_run_is_not_replaced(tmp_path: Path) -> None:
     # a volume that is mounted late replaces the folder by another folder with earlier wear
     folder, volume = tmp_path / "wear", tmp_path / "volume"
     volume.mkdir()
@@ -132,7 +132,7 @@ def test_a_file_that_came_while_the_twin_ran_is_left_as_it_is(tmp_path: Path) ->
     assert _loaded(path.parent, "head 7", SCENE) == DEPTH
 
 
-def test_a_folder_that_is_recreated_is_claimed_again(tmp_path: Path) -> None:
+def test_a_recreated_folder_is_locked_again(tmp_path: Path) -> None:
     folder = tmp_path / "wear"
     first = WearKeeper(folder, "head 7", SCENE)
     assert _saved(first, NEW) == ""
@@ -152,7 +152,7 @@ def test_a_folder_that_is_recreated_is_claimed_again(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("replaced", [False, True])
 @pytest.mark.parametrize("waited", [False, True])
-def test_wear_that_could_not_be_saved_goes_on_unless_the_file_is_another_one(
+def test_unsaved_wear_is_used_later_unless_the_file_has_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waited: bool, replaced: bool
 ) -> None:
     keeper = WearKeeper(tmp_path, "head 7", SCENE)

@@ -38,7 +38,7 @@ def _demo(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.skipif(shutil.which("setpriv") is None, reason="needs setpriv")
-def test_the_processes_of_the_demo_end_with_it_however_it_ends(tmp_path: Path) -> None:
+def test_the_processes_of_the_demo_always_end_with_it(tmp_path: Path) -> None:
     text = (
         "import os, pathlib, plow_twin.demo.demo\n"
         f"child = plow_twin.demo.demo.Child(['http.server', '0'], pathlib.Path({str(tmp_path / 'log')!r}))\n"
@@ -130,7 +130,7 @@ def test_the_demo_starts_with_the_compiled_estimator_and_ends_when_each_sample_i
     assert seen[-1] == "stop after 15000 samples"
 
 
-def test_forces_are_compared_with_the_machine_s_and_the_time_of_each_estimate_is_named(tmp_path: Path) -> None:
+def test_forces_are_compared_with_the_machine_s_and_times_of_estimates_are_printed(tmp_path: Path) -> None:
     entries: list[Entry] = [paper_sample(index) for index in range(2000)]
     entries.insert(1500, Estimated(BASE_NS, BASE_NS, 1, 1, (), (0.0,) * 6, ""))
     beside = compare_forces(record_run(tmp_path / "run", entries).folder, 1.5e-3)
@@ -141,7 +141,7 @@ def test_forces_are_compared_with_the_machine_s_and_the_time_of_each_estimate_is
     assert beside.error["nominal"] > 0.02
 
 
-def test_the_synthetic_sensor_is_of_a_wider_guide() -> None:
+def test_the_synthetic_sensor_belongs_to_a_wider_guide() -> None:
     found = plan("paper", 1000.0, 7.0, sensor_mm=3.0)
     assert found.pose is not None and found.pose.shape == (700, 3) and found.pose_every == 10
     poses, _ = Poses.of(np.arange(700) * 0.01, found.pose)
@@ -151,7 +151,7 @@ def test_the_synthetic_sensor_is_of_a_wider_guide() -> None:
     assert reached - own == pytest.approx([3e-3, 3e-3], abs=2e-3)
 
 
-def test_a_program_is_named_as_a_shell_in_this_folder_finds_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_is_named_by_a_path_from_this_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "my project" / ".venv" / "bin"
     folder.mkdir(parents=True)
     (folder / "plow-twin").touch()
@@ -165,7 +165,7 @@ def test_a_program_is_named_as_a_shell_in_this_folder_finds_it(tmp_path: Path, m
     assert program("plow-twin", "plow_twin") in (f"'{folder}/plow-twin'", f"'{str(folder)[1:]}/plow-twin'")
 
 
-def test_a_demo_whose_node_cannot_start_fails_and_says_why(tmp_path: Path) -> None:
+def test_a_demo_fails_with_the_reason_if_its_node_cannot_start(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     done = _demo(tmp_path / "file" / "below", "--seconds", "1", "--quiet")
     assert done.returncode != 0

@@ -94,7 +94,7 @@ def test_late_samples_of_a_publisher_that_was_stopped_are_used(tmp_path: Path) -
         assert int(figures["rolled_back"]) > 0
 
 
-def test_a_publisher_that_is_killed_is_followed_by_the_next_one(tmp_path: Path) -> None:
+def test_after_a_kill_of_its_publisher_the_node_follows_the_next_publisher(tmp_path: Path) -> None:
     with bench(tmp_path, **RELIABLE_INPUT) as running:
         first = running.publisher("--rate", "500", "--seconds", "60")
         running.probe.until(lambda: int(running.probe.figures("input")["samples_used"]) > 500, "samples")
@@ -120,7 +120,7 @@ def test_a_paused_node_counts_the_overrun_of_its_queue_and_continues(tmp_path: P
         assert running.twin.stop() == 0
 
 
-def test_the_publisher_ends_after_a_twin_that_is_behind_has_used_the_last_sample(tmp_path: Path) -> None:
+def test_the_publisher_waits_until_a_late_twin_has_used_the_last_sample(tmp_path: Path) -> None:
     settings = {"input_depth": 20000, "excitation_timeout": 60.0, "jump_forward": 60.0}
     with bench(tmp_path, **settings, **RELIABLE_INPUT) as running:
         publisher = running.publisher("--rate", "1000", "--seconds", "3")
@@ -132,7 +132,7 @@ def test_the_publisher_ends_after_a_twin_that_is_behind_has_used_the_last_sample
         assert figures["samples_used"] == "3000"
 
 
-def test_outputs_come_in_time_while_samples_come_ten_times_as_fast(tmp_path: Path) -> None:
+def test_a_tenfold_rate_of_samples_does_not_delay_outputs(tmp_path: Path) -> None:
     # a best-effort subscriber would not detect the loss of the last samples, so the subscriber is reliable
     settings = {"publish_mode": "fixed_rate", "publish_rate": 100.0, "input_depth": 20000}
     with bench(tmp_path, **settings, **RELIABLE_INPUT) as running:
@@ -144,7 +144,7 @@ def test_outputs_come_in_time_while_samples_come_ten_times_as_fast(tmp_path: Pat
         assert int(figures["published"]) - int(figures["held"]) > 60
 
 
-def test_after_a_kill_the_recording_replays_and_the_wear_goes_on(tmp_path: Path) -> None:
+def test_after_a_kill_the_recording_replays_and_the_wear_continues(tmp_path: Path) -> None:
     wear = Wear(coefficient_m2_n=1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0)
     scene = tmp_path / "scene.yaml"
     scene.write_text(dump_scene(replace(load_scene(scene_path("paper")), wear=wear)))
@@ -168,7 +168,7 @@ def test_after_a_kill_the_recording_replays_and_the_wear_goes_on(tmp_path: Path)
         assert all(found[f"pad_{name}"] >= depth for name, depth in saved.items())
 
 
-def test_a_disk_that_takes_no_more_stops_the_recording_and_not_the_twin(tmp_path: Path) -> None:
+def test_a_full_disk_stops_the_recording_and_not_the_twin(tmp_path: Path) -> None:
     with bench(tmp_path, record_path=tmp_path / "run", **RELIABLE_INPUT) as running:
         # a write beyond this size fails, as on a full disk
         resource.prlimit(running.twin._process.pid, resource.RLIMIT_FSIZE, (200_000, 200_000))
@@ -183,7 +183,7 @@ def test_a_disk_that_takes_no_more_stops_the_recording_and_not_the_twin(tmp_path
         _until_accounted(running, _sent(publisher))
 
 
-def test_one_corrupt_sample_in_a_hundred_is_counted_to_the_last_one(tmp_path: Path) -> None:
+def test_all_corrupt_samples_among_good_samples_are_counted(tmp_path: Path) -> None:
     rng = np.random.default_rng(11)
     expected = dict.fromkeys(("non_finite", "implausible", "unstamped", "duplicate"), 0)
     with bench(tmp_path, excitation_timeout=3600.0, **RELIABLE_INPUT) as running:
@@ -210,7 +210,7 @@ def test_one_corrupt_sample_in_a_hundred_is_counted_to_the_last_one(tmp_path: Pa
     assert sum(expected.values()) > 60
 
 
-def test_damaged_bytes_on_every_input_are_counted_to_the_last_one(tmp_path: Path) -> None:
+def test_all_damaged_messages_on_every_input_are_counted(tmp_path: Path) -> None:
     rng = np.random.default_rng(12)
 
     def damaged(message: Any) -> bytes:
@@ -247,7 +247,7 @@ def test_damaged_bytes_on_every_input_are_counted_to_the_last_one(tmp_path: Path
 
 
 @pytest.mark.parametrize("step_s", [-10.0, 30.0])
-def test_a_step_of_the_sender_s_clock_is_one_reset_and_no_loss(tmp_path: Path, step_s: float) -> None:
+def test_a_step_of_the_sender_s_clock_causes_one_reset_and_no_loss(tmp_path: Path, step_s: float) -> None:
     with bench(tmp_path, excitation_timeout=3600.0, **RELIABLE_INPUT) as running:
         send = running.probe.excitation()
         for index in range(1000):
@@ -395,7 +395,7 @@ def stepped_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[
     return step
 
 
-def test_steps_of_the_node_s_own_clock_stop_reset_and_lose_nothing(
+def test_steps_of_the_node_s_own_clock_have_no_effect_on_samples(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stepped_clock: Callable[[float], None]
 ) -> None:
     settings = {"record_path": tmp_path / "run", "excitation_timeout": 60.0, **RELIABLE_INPUT}
@@ -424,7 +424,7 @@ def test_steps_of_the_node_s_own_clock_stop_reset_and_lose_nothing(
     assert (report.exit_code, report.samples) == (0, sent)
 
 
-def test_the_scene_s_loads_start_again_where_the_node_s_own_clock_steps(
+def test_the_scene_s_loads_restart_at_a_step_of_the_node_s_own_clock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stepped_clock: Callable[[float], None]
 ) -> None:
     with bench(tmp_path, excitation_source="scene", record_path=tmp_path / "run") as running:
@@ -453,7 +453,7 @@ rclpy.spin(node)
 """
 
 
-def test_a_subscriber_that_stands_still_does_not_hold_up_the_twin(tmp_path: Path) -> None:
+def test_a_stopped_subscriber_does_not_delay_the_twin(tmp_path: Path) -> None:
     # the queue is long enough for all samples, because on a busy machine the twin may pause for more than a second
     with bench(tmp_path, jump_forward=60.0, input_depth=10_000, **RELIABLE_INPUT) as running:
         slow = subprocess.Popen(
@@ -535,7 +535,7 @@ def test_two_twins_in_one_process_do_not_disturb_each_other() -> None:
             node.destroy_node()
 
 
-def test_two_minutes_with_the_recorder_account_for_every_message_and_grow_by_nothing() -> None:
+def test_two_minutes_of_recording_account_for_every_message_in_constant_memory() -> None:
     command = [sys.executable, str(ROOT / "benchmark" / "live_load.py"), "--minutes", "2", "--rate", "500"]
     # a separate ROS domain, because other nodes publish reports too
     environment = os.environ | {"ROS_DOMAIN_ID": "97"}
@@ -548,7 +548,7 @@ def test_two_minutes_with_the_recorder_account_for_every_message_and_grow_by_not
     assert last["rss_mib"] - first["rss_mib"] < 4.0
 
 
-def test_a_storm_of_requests_loses_nothing_and_the_journal_repeats_it(tmp_path: Path) -> None:
+def test_a_flood_of_requests_loses_nothing_and_the_journal_repeats_them(tmp_path: Path) -> None:
     run, chance = tmp_path / "run", random.Random(2)
     asked: Counter[str] = Counter()
     numbers = {

@@ -60,5 +60,5 @@ class TestWhileItRuns(unittest.TestCase):
 
 @launch_testing.post_shutdown_test()
 class TestAfterItsEnd(unittest.TestCase):
-    def test_it_has_ended_well(self, proc_info: Any) -> None:
+    def test_the_twin_has_ended_with_code_0(self, proc_info: Any) -> None:
         launch_testing.asserts.assertExitCodes(proc_info)

@@ -87,7 +87,7 @@ def test_a_recording_that_cannot_be_made_refuses_configuration_and_leaves_nothin
     assert managed.probe.node.count_publishers("contact_forces") == 0
 
 
-def test_a_folder_that_takes_no_wear_refuses_configuration_and_is_named(managed: Bench) -> None:
+def test_an_unwritable_wear_folder_refuses_configuration_and_is_named(managed: Bench) -> None:
     # no user can create files in /proc
     assert _set(managed, "wear_state_path", "/proc/self/wear").successful
     assert not _change(managed, Transition.TRANSITION_CONFIGURE)
@@ -116,7 +116,7 @@ def test_only_an_active_node_uses_samples_and_cleanup_closes_its_recording(manag
     probe.until(lambda: probe.node.count_publishers("contact_forces") == 0, "released publishers")
 
 
-def test_an_active_node_refuses_to_be_configured_and_another_scene(managed: Bench) -> None:
+def test_an_active_node_refuses_configuration_and_a_change_of_the_scene(managed: Bench) -> None:
     assert _change(managed, Transition.TRANSITION_CONFIGURE)
     assert _change(managed, Transition.TRANSITION_ACTIVATE)
     assert not _change(managed, Transition.TRANSITION_CONFIGURE)
@@ -124,7 +124,7 @@ def test_an_active_node_refuses_to_be_configured_and_another_scene(managed: Benc
     assert _state(managed) == "active"
 
 
-def test_a_node_configured_again_has_another_scene_and_records_beside_the_first(managed: Bench, tmp_path: Path) -> None:
+def test_a_reconfigured_node_has_another_scene_and_a_second_recording(managed: Bench, tmp_path: Path) -> None:
     for scene in ("paper", "bench_kv"):
         assert _set(managed, "scene", scene).successful
         assert _set(managed, "record_path", str(tmp_path / "run")).successful
@@ -147,7 +147,7 @@ def test_a_shutdown_while_active_ends_in_finalized_and_a_clean_exit(tmp_path: Pa
         assert "Traceback" not in running.twin.output()
 
 
-def test_a_request_beside_a_cleanup_is_answered_and_the_node_lives(tmp_path: Path) -> None:
+def test_a_request_during_a_cleanup_is_answered_and_the_node_continues(tmp_path: Path) -> None:
     with bench(tmp_path) as running:
         node, at = running.probe.node, f"{running.namespace}/plow_twin"
         change = node.create_client(ChangeState, f"{at}/change_state")
@@ -254,7 +254,7 @@ def active(tmp_path_factory: pytest.TempPathFactory) -> Any:
         ("hold_policy", ParameterValue(type=ParameterType.PARAMETER_DOUBLE_ARRAY), False),
     ],
 )
-def test_changes_at_run_time_are_taken_or_refused_with_a_reason(
+def test_changes_at_run_time_are_applied_or_refused_with_a_reason(
     active: Bench, name: str, given: Any, accepted: bool
 ) -> None:
     result = _set(active, name, given)
@@ -263,7 +263,7 @@ def test_changes_at_run_time_are_taken_or_refused_with_a_reason(
     assert active.twin.running
 
 
-def test_a_changed_timeout_works_at_once(active: Bench) -> None:
+def test_a_changed_timeout_takes_effect_at_once(active: Bench) -> None:
     forces = active.probe.listen(JointState, "contact_forces")
     assert _set(active, "excitation_timeout", 3600.0).successful
     active.probe.excitation()(T0, (1.0, 2.0, 3.0))
@@ -272,7 +272,7 @@ def test_a_changed_timeout_works_at_once(active: Bench) -> None:
     active.probe.until(lambda: value(active.probe.status[-1], "stream") == "stale", "the hold policy")
 
 
-def test_the_model_changes_a_motion_comes_back_and_the_journal_gives_it_all_again(tmp_path: Path) -> None:
+def test_the_journal_repeats_changes_of_the_model_and_a_restored_motion(tmp_path: Path) -> None:
     run = tmp_path / "run"
     with bench(tmp_path, record_path=str(run), excitation_timeout=3600.0, **RELIABLE_INPUT) as running:
         probe = running.probe

@@ -230,7 +230,7 @@ def test_one_publisher_is_followed_and_a_second_reported_until_a_switch(tmp_path
     assert senders[0] == senders[39] != senders[40]
 
 
-def test_of_several_publishers_of_an_optional_input_one_is_followed(tmp_path: Path) -> None:
+def test_one_of_several_publishers_of_an_optional_input_is_followed(tmp_path: Path) -> None:
     kinds = {"travel": TwistStamped, "head_pose": PoseStamped, "gaps": JointState}
     with bench(tmp_path, record_path=tmp_path / "run") as running:
         probe, node = running.probe, running.probe.node
@@ -341,7 +341,7 @@ def test_an_alarm_stays_until_it_is_acknowledged_and_writes_the_time_before_it(t
     assert (kinds.count("Parameter"), kinds.count("Mark")) == (2, 1)
 
 
-def test_a_publisher_that_comes_after_the_followed_one_has_gone_is_followed(tmp_path: Path) -> None:
+def test_after_the_followed_publisher_has_left_a_new_publisher_is_followed(tmp_path: Path) -> None:
     with bench(tmp_path, excitation_timeout=60.0, **RELIABLE_INPUT) as running:
         probe = running.probe
         for _ in range(2):
@@ -353,7 +353,7 @@ def test_a_publisher_that_comes_after_the_followed_one_has_gone_is_followed(tmp_
         assert (figures["samples_not_followed"], figures["samples_lost"]) == ("0", "0")
 
 
-def test_a_delay_that_rises_for_good_is_worked_in_marked_and_replayed_exactly(tmp_path: Path) -> None:
+def test_samples_with_a_lasting_delay_are_inserted_marked_and_replayed_exactly(tmp_path: Path) -> None:
     scene = _scene_file(tmp_path, replace(PAPER, wear=WEAR))
     record = tmp_path / "run"
     with bench(tmp_path, scene=scene, excitation_timeout=0.2, record_path=record, **RELIABLE_INPUT) as running:
@@ -400,7 +400,7 @@ def _pads(clearance: JointState) -> list[float]:
     return [float(value) for value in clearance.position[2:10]]
 
 
-def test_wear_outlives_reset_clock_step_cleanup_and_restart_and_is_set_by_its_service_only(tmp_path: Path) -> None:
+def test_wear_survives_reset_clock_step_cleanup_and_restart(tmp_path: Path) -> None:
     scene = _scene_file(tmp_path, replace(PAPER, wear=replace(WEAR, coefficient_m2_n=1e-12)))
     kept = {"scene": scene, "excitation_timeout": 0.2, "wear_state_path": tmp_path / "wear", **RELIABLE_INPUT}
     (tmp_path / "again").mkdir()
@@ -543,7 +543,7 @@ def test_a_stop_under_load_is_clean_and_closes_the_recording(tmp_path: Path, num
     assert report.first_divergence is None
 
 
-def test_a_twin_ends_cleanly_when_its_launch_has_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_twin_ends_cleanly_with_its_launch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # `launch` ends at SIGTERM without passing the signal on, so mocks replace it; the tests check the requests of the
     # launch file
     asked = {name: MagicMock() for name in ("launch", "launch_ros")}
@@ -630,7 +630,7 @@ def test_silence_is_held_and_reported(tmp_path: Path) -> None:
         assert [item.key for item in probe.status[-1].values] == list(STATUS_KEYS)
 
 
-def test_under_sim_time_silence_moves_nothing(tmp_path: Path) -> None:
+def test_under_sim_time_the_model_does_not_advance_in_a_silence(tmp_path: Path) -> None:
     run = tmp_path / "run"
     settings = {"use_sim_time": "true", "record_path": str(run), "input_depth": 200}
     with bench(tmp_path, excitation_timeout=0.05, **settings, **RELIABLE_INPUT) as running:
@@ -671,7 +671,7 @@ def test_under_sim_time_silence_moves_nothing(tmp_path: Path) -> None:
     assert all(record.log_time_ns >= T0 for record in records_of(run))
 
 
-def test_diagnostics_go_on_without_a_clock_and_hold_every_documented_key(tmp_path: Path) -> None:
+def test_diagnostics_are_published_without_a_clock_and_have_every_documented_key(tmp_path: Path) -> None:
     with bench(tmp_path, use_sim_time="true", hardware_id="head 7") as running:
         probe = running.probe
         count = len(probe.reports)
@@ -702,7 +702,7 @@ def test_reset_restores_the_initial_state(tmp_path: Path) -> None:
         assert (position.x, position.y, heads[-1].twist.twist.angular.z) == PAPER.initial.q
 
 
-def test_travel_rules_the_wear_and_a_measured_pose_is_compared(tmp_path: Path) -> None:
+def test_travel_determines_the_wear_and_a_measured_pose_is_compared(tmp_path: Path) -> None:
     scene = _scene_file(tmp_path, replace(PAPER, wear=WEAR))
     with bench(tmp_path, scene=scene, excitation_timeout=60.0, **RELIABLE_INPUT) as running:
         probe = running.probe
@@ -734,7 +734,7 @@ def test_travel_rules_the_wear_and_a_measured_pose_is_compared(tmp_path: Path) -
     assert -0.15 < x < -0.05 and abs(y) < 0.05 and abs(theta) < 0.3
 
 
-def test_tool_forces_drive_the_model_like_their_sum(tmp_path: Path) -> None:
+def test_tool_forces_have_the_effect_of_their_sum(tmp_path: Path) -> None:
     scale = np.sin(np.linspace(0.0, 1.5, 200))
     amplitudes = {load.name: float(np.hypot(*load.force_n)) for load in PAPER.loads}
     reliable = {"qos_overrides.{ns}/tool_forces.subscription.reliability": "reliable"}
@@ -762,7 +762,7 @@ def _at(heads: list[Odometry], stamp: int) -> bool:
     return bool(heads) and stamp_ns(heads[-1].header) == stamp
 
 
-def test_the_scenes_own_loads_run_by_the_nodes_clock(tmp_path: Path) -> None:
+def test_the_scenes_own_loads_follow_the_nodes_clock(tmp_path: Path) -> None:
     with bench(tmp_path, excitation_source="scene", use_sim_time="true") as running:
         probe = running.probe
         heads = probe.listen(Odometry, "head_state")
@@ -778,7 +778,7 @@ def test_the_scenes_own_loads_run_by_the_nodes_clock(tmp_path: Path) -> None:
         assert (head.pose.pose.position.x, head.pose.pose.position.y) == tuple(q[:2]), index
 
 
-def test_two_twins_in_two_namespaces_do_not_meet(tmp_path: Path) -> None:
+def test_twins_in_two_namespaces_are_independent(tmp_path: Path) -> None:
     (tmp_path / "one").mkdir()
     (tmp_path / "two").mkdir()
     with bench(tmp_path / "one") as one, bench(tmp_path / "two") as two:

@@ -26,9 +26,7 @@ def server() -> Iterator[Plant]:
     plant.close()
 
 
-def test_a_node_waits_for_its_server_and_works_a_break_in_by_the_server_s_history(
-    server: Plant, tmp_path: Path
-) -> None:
+def test_a_node_waits_for_its_server_and_fills_a_break_from_the_history(server: Plant, tmp_path: Path) -> None:
     (tmp_path / "map.yaml").write_text(MAP)
     start_ns, run = time.time_ns() // MS * MS - 6_000 * MS, tmp_path / "run"
     server.cut()  # a plant may start its server after the twin

@@ -26,7 +26,7 @@ T0 = 1_795_000_000_000_000_000
 MAP = "head_pose: {topic: %s/camera/pose, type: geometry_msgs/msg/PoseStamped}\n"
 
 
-def test_other_topics_come_into_the_run_s_folder_with_their_types(tmp_path: Path) -> None:
+def test_other_topics_are_recorded_in_the_run_s_folder_with_their_types(tmp_path: Path) -> None:
     run, log = tmp_path / "run", tmp_path / "record.log"
     parameters = {"record_path": run, "qos_overrides.{ns}/excitation.subscription.reliability": "reliable"}
     with bench(tmp_path, excitation_timeout=60.0, **parameters) as running:
@@ -81,7 +81,7 @@ def test_other_topics_come_into_the_run_s_folder_with_their_types(tmp_path: Path
     assert found.comparisons(found.predictions[0])["x"].n == COUNT
 
 
-def test_a_named_topic_without_a_publisher_is_reported_and_no_success(tmp_path: Path) -> None:
+def test_a_named_topic_without_a_publisher_is_an_error(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "plow_twin", "record", str(tmp_path / "run"), "never", "--wait", "0"]
     with started(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as recorder:
         assert recorder.stderr is not None

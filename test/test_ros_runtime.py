@@ -101,7 +101,7 @@ def _typed(values: dict[str, Any]) -> list[tuple[str, Any, Any]]:
     return [(name, Parameter.Type.STRING, str(value)) for name, value in values.items()]
 
 
-def test_whoever_reaches_the_graph_names_no_file_outside_the_root(tmp_path: Path) -> None:
+def test_participants_of_the_graph_cannot_name_files_outside_the_root(tmp_path: Path) -> None:
     with _node() as node:
         for name in ("scene", "record_path", "wear_state_path"):
             assert f"{name}: names a file, and is read-only without" in _refused(node, **{name: tmp_path / "x"})
@@ -152,7 +152,7 @@ def test_no_runtime_outlives_its_cycle() -> None:
     assert gc.get_freeze_count() == 0
 
 
-def test_who_cannot_connect_is_named_though_its_topics_are_discovered_before_it(
+def test_an_incompatible_peer_is_named_although_its_topics_are_discovered_first(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     names = iter(["_NODE_NAME_UNKNOWN_", "sender", "sender", "_NODE_NAME_UNKNOWN_", "_NODE_NAME_UNKNOWN_"])
@@ -172,7 +172,7 @@ def test_who_cannot_connect_is_named_though_its_topics_are_discovered_before_it(
     assert ["publisher sender: type" in line for line in said] == [True, False]
 
 
-def test_wear_that_the_disk_did_not_take_outlives_a_cleanup(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unsaved_wear_survives_a_cleanup(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
@@ -189,9 +189,7 @@ def test_wear_that_the_disk_did_not_take_outlives_a_cleanup(tmp_path: Path, monk
         assert node.runtime.driver.session.wear_depth.tolist() == [2e-4] * 8
 
 
-def test_a_ring_that_the_disk_does_not_take_is_trouble_and_counted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_ring_that_cannot_be_written_is_reported_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     room, usage = threading.Event(), shutil.disk_usage
     monkeypatch.setattr(
         shutil, "disk_usage", lambda path: usage(path) if room.is_set() else usage(path)._replace(free=9)
@@ -268,7 +266,7 @@ def test_the_covariance_of_each_pose_goes_into_the_journal_and_the_estimate(tmp_
     assert replay(run).exit_code == 0
 
 
-def test_loads_without_a_direction_may_be_named_and_count_nothing() -> None:
+def test_loads_without_a_direction_may_be_named_and_have_no_effect() -> None:
     bias = Constant(name="bias", force_n=(0.0, 0.0))
     table = Table(name="cut", t=(0.0, 1.0), wrench=((0.0, 0.0, 0.0), (1.0, 2.0, 3.0)))
     tools = ToolForces(replace(PAPER, loads=(*PAPER.loads, bias, table)))
@@ -282,7 +280,7 @@ def test_loads_without_a_direction_may_be_named_and_count_nothing() -> None:
     assert tools.wrench(every, [1.0]) is None
 
 
-def test_under_a_flood_of_samples_due_work_is_done_and_others_have_their_turn() -> None:
+def test_a_flood_of_samples_delays_neither_timers_nor_other_threads() -> None:
     flood, turns, errors = _Flood(), Turns(), list[Exception]()
     done, at = threading.Semaphore(0), list[int]()
     loop = InputLoop(turns, errors.append)
@@ -305,7 +303,7 @@ def test_under_a_flood_of_samples_due_work_is_done_and_others_have_their_turn() 
     assert not errors and len(set(at)) == len(at) and at[-1] > 20
 
 
-def test_a_queue_that_fills_while_it_is_emptied_is_emptied_to_its_end() -> None:
+def test_a_queue_that_fills_during_reading_is_read_completely() -> None:
     # a turn requests as many messages as were announced; newer messages must not displace the remaining ones
     with _node() as node:
         heard: list[int] = []
@@ -356,7 +354,7 @@ def test_loss_is_counted_by_the_publishers_numbers() -> None:
         assert node.runtime.inputs.lost == 1
 
 
-def test_messages_from_before_the_subscription_are_no_loss_whenever_their_publisher_is_discovered() -> None:
+def test_messages_before_the_subscription_are_no_loss_at_any_time_of_discovery() -> None:
     period_ns = 5_000_000
 
     def hear(node: TwinNode, sender: bytes, after_s: float, *numbers: int) -> int:
@@ -383,7 +381,7 @@ def test_messages_from_before_the_subscription_are_no_loss_whenever_their_publis
         assert hear(node, b"after", 3600.0, *range(63, 100), 103) == 63
 
 
-def test_the_middleware_is_asked_for_no_events() -> None:
+def test_no_events_of_the_middleware_are_used() -> None:
     with _node(estimate=True) as node:
         assert node.start()
         topics = [*node.publishers, *node.subscriptions, *node._front.subscriptions._taken_from.values()]  # type: ignore[union-attr]

@@ -52,7 +52,7 @@ def in_lanes() -> dict[str, list[Scene]]:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_member_beside_the_lanes_is_its_single_run_bit_for_bit(workers: int) -> None:
+def test_a_member_outside_the_lanes_has_the_bits_of_its_single_run(workers: int) -> None:
     paper, wear = preset("paper").contact, Wear(1e-9, 0.015, 2.0)
     scenes = [dataclasses.replace(one, contact=paper, wear=wear) for one in members()]
     wrench = samples(len(scenes))
@@ -106,7 +106,7 @@ def test_a_sample_soon_after_a_touch_leaves_no_false_peak() -> None:
         assert rows.impulse[850, 4] == pytest.approx(alone.impulse[850, 4], rel=1e-9)
 
 
-def test_a_twin_at_rest_costs_next_to_nothing() -> None:
+def test_a_twin_at_rest_takes_almost_no_steps() -> None:
     scene = fallen()
     twins, twin = TwinBatch([scene] * 3), Twin(scene, excitation="sampled")
     for t in (600.0, 3600.0):
@@ -135,7 +135,7 @@ def test_one_sample_a_call_a_pause_and_a_restored_snapshot_change_no_bit() -> No
     assert np.array_equal(one.advance_samples(TIMES, wrench).q, whole.q)
 
 
-def test_twins_moved_between_calls_go_on_like_twins_restored_there_and_no_sample_changes_nothing() -> None:
+def test_moved_twins_continue_like_restored_twins_and_an_empty_call_has_no_effect() -> None:
     scenes = members()
     wrench = samples(len(scenes))
     twins, other = TwinBatch(scenes), TwinBatch(scenes)

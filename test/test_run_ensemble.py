@@ -38,7 +38,7 @@ def members() -> list[Scene]:
 
 
 @pytest.mark.parametrize("workers", [1, 3])
-def test_each_member_is_its_single_run_bit_for_bit(workers: int) -> None:
+def test_each_member_has_the_bits_of_its_single_run(workers: int) -> None:
     seen: list[int] = []
     ensemble = simulate_many(members(), 4.0, output_dt=0.1, tol=1e-7, workers=workers, on_progress=seen.append)
     assert max(seen) == len(members()) and (ensemble.status == Status.OK).all()
@@ -55,7 +55,7 @@ def test_each_member_is_its_single_run_bit_for_bit(workers: int) -> None:
         assert ensemble.steps[index] == single.solver["steps"]
 
 
-def test_members_with_other_terms_leave_nothing_behind() -> None:
+def test_members_with_other_terms_do_not_affect_later_members() -> None:
     """The members of a thread share its scratch memory: scenes for lanes, a flight and a rest."""
     scene = preset("bench_kv")
     swing = Harmonic("swing", (200.0, 50.0), 20.0)
@@ -66,7 +66,7 @@ def test_members_with_other_terms_leave_nothing_behind() -> None:
     assert all(np.array_equal(one, q) for one, q in zip(together.q, reversed(alone), strict=True))
 
 
-def test_a_run_within_the_progress_of_another_changes_no_bit() -> None:
+def test_a_run_inside_the_callback_of_another_run_changes_no_bit() -> None:
     scene, within = preset("bench_kv"), []
     expected = simulate(scene, 60.0, 0.1, 1e-11)
     inner = dataclasses.replace(scene, loads=())
@@ -79,7 +79,7 @@ def test_a_run_within_the_progress_of_another_changes_no_bit() -> None:
     assert all(np.array_equal(q, within[0]) for q in within)
 
 
-def test_scenes_one_after_the_other_share_what_their_equal_parts_need(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_equal_parts_of_successive_scenes_are_converted_once(monkeypatch: pytest.MonkeyPatch) -> None:
     summed: list[object] = []
 
     def counted(loads: object) -> object:
@@ -97,7 +97,7 @@ def test_scenes_one_after_the_other_share_what_their_equal_parts_need(monkeypatc
     assert len(summed) == 3
 
 
-def test_parts_that_the_clearance_does_not_decide_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parts_independent_of_the_clearance_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     rows, computed = geometry.arm_rows, list[Scene]()
 
     def counted(scene: Scene) -> object:
@@ -135,7 +135,7 @@ def test_times_are_checked_as_in_simulate(t_end: float) -> None:
 SMALL_LOAD = Harmonic("load", (-3.0931353695787673, -2.0267345092034312), 21.16137888565331, 1.7436965700134877, 0.08)
 
 
-def test_a_head_that_starts_between_its_walls_has_the_same_bits_in_company() -> None:
+def test_a_head_between_its_walls_has_the_same_bits_in_an_ensemble() -> None:
     """The guard of a pair that separates at once falls from a double zero. Its root is 0, wherever the search ends."""
     scene = Scene(
         Head(0.2376573288673373, 0.001142509680508577),

@@ -42,7 +42,7 @@ from plow_twin.solve.state import Status
 BENCH = preset("paper")
 
 
-def test_a_run_stops_at_its_limits_and_says_where_it_stood() -> None:
+def test_a_run_stops_at_its_limits_and_reports_its_state() -> None:
     scene = preset("paper")
     whole = simulate(scene, 10.0, output_dt=0.01)
     with pytest.raises(
@@ -75,7 +75,7 @@ def test_a_run_stops_at_its_limits_and_says_where_it_stood() -> None:
         assert isinstance(refused.value, PlowTwinError) and isinstance(refused.value, ValueError)
 
 
-def test_looking_at_a_run_does_not_change_it() -> None:
+def test_observing_a_run_does_not_change_it() -> None:
     scene, shares = preset("paper"), []
     whole = simulate(scene, 200.0, output_dt=0.1)
     looked = simulate(scene, 200.0, output_dt=0.1, on_progress=shares.append)
@@ -172,7 +172,7 @@ def test_ctrl_c_ends_the_work_of_a_twin_and_of_an_ensemble() -> None:
     ],
     ids=["friction 5", "wear 1", "frame of 1000 km", "head of 1 mg", "no clearance"],
 )
-def test_no_scene_works_without_bound(scene: Scene, tol: float) -> None:
+def test_the_work_of_every_scene_is_bounded(scene: Scene, tol: float) -> None:
     try:
         simulate(scene, 10.0, tol=tol, max_steps=200_000)
     except PlowTwinError as error:

@@ -185,7 +185,7 @@ def test_a_largest_admissible_value_is_changed_downwards(contact: Contact, path:
     assert changed.change < 0.0
 
 
-def test_derivatives_where_errors_grow_follow_a_motion_that_is_known_better(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_derivatives_of_an_amplifying_motion_follow_a_more_accurate_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     """Stiff walls amplify errors, so at the first tolerance the motion would soon be a different motion."""
     scene = replace(preset("bench_kv"), contact=Contact("kelvin_voigt", 1e9, damping=1e4))
     tolerances, follow = [], sensitivity._by_equations
@@ -201,7 +201,7 @@ def test_derivatives_where_errors_grow_follow_a_motion_that_is_known_better(monk
     assert sensitivity.sensitivity_of(preset("bench_kv"), 2.0, 1e-9).trusted and tolerances == [1e-6]
 
 
-def test_products_of_stretches_grow_as_their_matrices_do() -> None:
+def test_products_of_stretches_grow_like_their_matrices() -> None:
     """The growth agrees with matrix norms of numpy, in one call and in portions that end at various places."""
     random = np.random.default_rng(3)
     matrices = 0.5 * random.normal(size=(300, 4, 4))
@@ -226,7 +226,7 @@ def test_products_of_stretches_grow_as_their_matrices_do() -> None:
         assert found[0].tobytes() == totals[part].tobytes() and found[2].tobytes() == growth[part].tobytes()
 
 
-def test_a_live_twin_has_the_derivatives_too() -> None:
+def test_a_live_twin_has_the_same_derivatives() -> None:
     scene = replace(preset("bench_kv"), initial=Initial((0.001, 0.002, 0.003), (0.1, 0.0, 0.2)))
     times = np.arange(1, 501) * 1e-3
     loads = compile_loads(scene.loads).at(times)
@@ -258,7 +258,7 @@ def test_a_live_twin_has_the_derivatives_too() -> None:
 
 
 @pytest.mark.parametrize("e", [1.0, 0.7])
-def test_a_live_twin_has_the_derivative_by_restitution_also_where_nothing_damps(e: float) -> None:
+def test_a_live_twin_has_the_derivative_by_restitution_without_damping(e: float) -> None:
     """At e = 1, the displaced scene is damped. An existing contact retains the damping of its touch."""
     scene = replace(preset("paper"), initial=Initial((0.001, 0.002, 0.003), (0.4, 0.1, 0.8)))
     contact = Contact("exact_restitution", scene.contact.stiffness, restitution=e, impact_speed_floor_m_s=0.05)

@@ -63,7 +63,7 @@ def test_samples_in_any_batches_give_the_same_bits(cuts: list[int]) -> None:
     assert np.array_equal([row.peak for row in one_by_one], expected.peak[:50])
 
 
-def test_the_same_time_can_be_asked_for_twice() -> None:
+def test_a_twin_can_be_advanced_twice_to_the_same_time() -> None:
     twin = Twin(preset("paper"))
     for t in np.random.default_rng(1).uniform(0.0, 2e-3, 500).cumsum():
         assert twin.advance(t).q.tolist() == twin.advance(t).q.tolist()
@@ -72,7 +72,7 @@ def test_the_same_time_can_be_asked_for_twice() -> None:
 
 @settings(max_examples=10)
 @given(st.lists(st.floats(0.0, 2.0), max_size=20))
-def test_asking_in_between_does_not_change_the_motion(times: list[float]) -> None:
+def test_intermediate_advances_do_not_change_the_motion(times: list[float]) -> None:
     asked, direct = Twin(preset("paper")), Twin(preset("paper"))
     rows = [asked.advance(t) for t in sorted(times)]
     last, expected = asked.advance(2.0), direct.advance(2.0)
@@ -84,7 +84,7 @@ def test_asking_in_between_does_not_change_the_motion(times: list[float]) -> Non
 
 
 @pytest.mark.parametrize("excitation", ["scene", "sampled"])
-def test_a_restored_twin_goes_on_with_the_same_bits(excitation: str) -> None:
+def test_a_restored_twin_continues_with_the_same_bits(excitation: str) -> None:
     # wear under the scene's own loads would compile kernels of its own
     wear = Wear(1e-12, 0.015, 2.0) if excitation == "sampled" else None
     scene = dataclasses.replace(preset("paper"), wear=wear)
@@ -125,7 +125,7 @@ def test_bad_input_is_named_and_changes_nothing(t: float, wrench: tuple[float, .
 
 
 @pytest.mark.parametrize("wrench", [(0.0, 0.0, 1e7), (1e12, 0.0, 0.0), (1e300, 0.0, 0.0)])
-def test_a_failed_advance_keeps_the_last_good_state_and_the_next_one_goes_on(wrench: tuple[float, ...]) -> None:
+def test_after_a_failed_advance_the_twin_continues_from_its_last_good_state(wrench: tuple[float, ...]) -> None:
     twin = Twin(preset("paper"), excitation="sampled")
     good = twin.advance(0.5, (0.0, 0.0, 0.0))
     bad = twin.advance(0.6, wrench)
@@ -157,7 +157,7 @@ def test_a_failed_advance_leaves_no_trace_in_later_ones(depth: float) -> None:
     assert after.q == pytest.approx(expected.q, abs=1e-13) and after.v == pytest.approx(expected.v, rel=1e-9)
 
 
-def test_a_pose_out_of_range_is_never_handed_out_as_good() -> None:
+def test_a_pose_outside_the_range_is_never_returned_as_valid() -> None:
     """A step that ends at the requested time is checked too."""
     for dt in (1e-3, 7e-4):
         twin = Twin(preset("paper"), excitation="sampled")
@@ -183,7 +183,7 @@ def test_a_scene_compiles_only_its_own_terms() -> None:
     assert bare in compiled, compiled
 
 
-def test_in_free_flight_nothing_of_the_contact_runs() -> None:
+def test_in_free_flight_no_contact_code_runs() -> None:
     scene = wall_and_point(preset("bench_kv").contact, speed=0.0, gap=2.0)
     twin = Twin(scene)
     twin.advance(3600.0)
@@ -216,7 +216,7 @@ def test_warm_up_leaves_nothing_to_compile() -> None:
     assert [len(kernel.signatures) for kernel in (loop.advance_rows, loop.interrupt_step, loop.lay_out_again)] == before
 
 
-def test_a_bound_on_evaluations_is_kept_and_the_error_estimated() -> None:
+def test_the_limit_of_evaluations_is_kept_and_the_error_estimated() -> None:
     scene, t = preset("bench_kv"), np.arange(1, 4001) * 1e-3
     wrench = compile_loads(scene.loads).at(t)
     exact = Twin(scene, excitation="sampled").advance_samples(t, wrench)

@@ -47,7 +47,7 @@ contact: {law: hunt_crossley, stiffness: 9.6975e6, damping: 0.72154}
 """
 
 
-def test_numbers_are_read_as_people_write_them() -> None:
+def test_numbers_are_read_in_common_notations() -> None:
     scene = loads_scene(MINIMAL)
     assert scene.contact.stiffness == 9.6975e6  # YAML 1.1 reads a number in this notation as a text
     assert type(scene.head.mass_kg) is float
@@ -104,7 +104,7 @@ def test_paper_preset_is_reconstruction_r1() -> None:
     assert "fitted to the paper's published figures" in scene_path("paper").read_text().lower()
 
 
-def test_every_problem_comes_in_one_error(tmp_path: Path) -> None:
+def test_one_error_lists_every_problem(tmp_path: Path) -> None:
     text = """
 version: 2
 head: {mass_kg: -1, inertia_kg_m2: heavy, mas: 3, rotation: papr}
@@ -182,12 +182,12 @@ gravty: 3
         "version: 1" + "0" * 5000,
     ],
 )
-def test_a_text_that_is_no_scene_is_a_scene_error(text: str) -> None:
+def test_an_invalid_text_raises_a_scene_error(text: str) -> None:
     with pytest.raises(SceneError):
         loads_scene(text)
 
 
-def test_a_machine_of_one_s_own_has_the_exact_restitution_unless_it_says_otherwise() -> None:
+def test_a_scene_has_the_exact_restitution_by_default() -> None:
     text = """
 version: 1
 head: {mass_kg: 10, inertia_kg_m2: 1}
@@ -208,7 +208,7 @@ def test_texts_are_no_numbers() -> None:
         loads_scene(MINIMAL.replace("2430", "'2430'"))
 
 
-def test_table_from_a_file_stands_in_the_dump(tmp_path: Path) -> None:
+def test_the_dump_contains_the_table_from_a_file(tmp_path: Path) -> None:
     t = np.linspace(0.0, 1.0, 11)
     wrench = np.random.default_rng(3).normal(size=(11, 3))
     rows = "\n".join(

@@ -92,7 +92,7 @@ def test_corners_balance_energy_and_momentum(falls) -> None:
     assert np.abs(balance.momentum_imbalance).max() < 1e-8
 
 
-def test_corners_pass_their_contact_on_at_45_degrees() -> None:
+def test_contact_continues_at_45_degrees_under_the_corner_s_new_name() -> None:
     # the block is pressed on the table by ten times its weight, and rolls over its lower right corner
     push = Constant("push", force_n=(0.0, -90.0), moment_n_m=-3.3)
     lying = Initial(q=(0.0, -WALL + 0.5 * SIDE, 0.0), v=(0.0, 0.0, -0.3))
@@ -115,7 +115,7 @@ def test_corners_pass_their_contact_on_at_45_degrees() -> None:
 
 
 @pytest.mark.parametrize("spin", [40.0, -25.0])
-def test_corners_fly_and_turn_without_end(spin: float) -> None:
+def test_a_block_in_flight_turns_without_limit(spin: float) -> None:
     thrown = Initial(q=(0.0, 0.5, 1.0), v=(0.2, 1.0, spin))
     result = simulate(block(initial=thrown), t_end=0.5, output_dt=0.01, tol=1e-9, energy_balance=True)
     t = result.t

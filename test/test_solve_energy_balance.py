@@ -56,7 +56,7 @@ def test_the_balance_changes_no_bit_of_the_motion_and_costs_nothing_when_off() -
     assert _start(compile_scene(BENCH, 1e-9), 1, energy_balance=False).sums is None
 
 
-def test_a_wrong_motion_does_not_balance() -> None:
+def test_a_wrong_motion_violates_the_balance() -> None:
     """The balance computes its own forces, so that a solver with another stiffness is detected."""
     compiled = compile_scene(BENCH, 1e-9)
     motion = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)), outputs=True)
@@ -68,7 +68,7 @@ def test_a_wrong_motion_does_not_balance() -> None:
 
 
 @pytest.mark.stress  # this test compiles additional kernels
-def test_the_balance_of_fixed_steps_balance_to_their_order() -> None:
+def test_fixed_steps_balance_energy_to_their_order() -> None:
     coarse, fine = (
         simulate(PAPER, 2.0, method="rk4", dt=dt, output_dt=0.1, energy_balance=True).energy_balance
         for dt in (4e-4, 1e-4)

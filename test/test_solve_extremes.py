@@ -64,7 +64,7 @@ def test_mass_and_restitution_over_their_range(mass: float, e: float) -> None:
 
 @pytest.mark.parametrize("n", [1.0, 1.5])
 @pytest.mark.parametrize("gap", [1.0, 1e-9])
-def test_clearance_from_nothing_to_a_metre(gap: float, n: float) -> None:
+def test_clearance_from_zero_to_a_metre(gap: float, n: float) -> None:
     contact = Contact("exact_restitution", 1e8, n, restitution=0.3 if n == 1.0 else 0.7, impact_speed_floor_m_s=1e-2)
     scene = dataclasses.replace(preset("paper"), clearance=Clearance(gap, gap), contact=contact)
     scene = dataclasses.replace(scene, frame=dataclasses.replace(scene.frame, width_m=3.3, height_m=2.7))
@@ -76,7 +76,7 @@ def test_clearance_from_nothing_to_a_metre(gap: float, n: float) -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_loads_that_are_no_numbers_are_refused(bad: float) -> None:
+def test_loads_with_non_finite_numbers_are_refused(bad: float) -> None:
     twin = Twin(preset("paper"), excitation="sampled")
     before = twin.digest()
     for wrench in ((bad, 0.0, 0.0), (0.0, 0.0, bad)):

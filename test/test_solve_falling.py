@@ -89,7 +89,7 @@ def test_drop_returns_the_restitution_that_its_speed_leaves(speed: float, expone
 
 
 @pytest.mark.parametrize("law", [name for name, law in LAWS.items() if law.takes_restitution])
-def test_every_law_is_asked_for_what_is_left(law: str) -> None:
+def test_every_law_uses_the_reduced_restitution(law: str) -> None:
     falling = impact(replace(LAW, law=law), (0.0, -2.0, 0.0), head=HEAVY, pairs=("bottom_left_bottom",))
     left = E * (2.0 / SPEED) ** -FALL
     # this restitution is practically constant, and has the same compiled kernels
@@ -159,7 +159,7 @@ def test_no_impact_gains_energy(fall, along, omega, angle, e, power, least, mass
     assert abs(result.energy_balance.imbalance_j) < 1e-8 * (energy[0] + 1.0)
 
 
-def test_impact_under_way_at_the_start_goes_on_as_it_would_have() -> None:
+def test_impact_that_contains_the_start_continues_unchanged() -> None:
     whole = impact(LAW, (0.0, -3.0, 0.0), head=HEAVY, pairs=("bottom_left_bottom",))
     run = simulate(whole, t_end=3e-4, output_dt=1e-6, energy_balance=True)
     inside = int(np.argmax(run.penetration[:, 6] > 1e-5))
@@ -204,7 +204,7 @@ def test_live_twin_and_batch_have_the_motion_of_the_run() -> None:
         TwinBatch([scene, constant])
 
 
-def test_off_is_not_compiled_and_scenes_say_nothing_of_it() -> None:
+def test_a_constant_restitution_compiles_no_further_code() -> None:
     plain = Scene(
         Head(1.0, 1.0), Frame(1.0, 1.0), Clearance(0.1, 0.1), Contact("exact_restitution", 1e6, restitution=E)
     )
@@ -226,7 +226,7 @@ def test_off_is_not_compiled_and_scenes_say_nothing_of_it() -> None:
         (lambda: replace(LAW, restitution_speed_m_s=math.inf), "restitution_speed_m_s"),
     ],
 )
-def test_what_a_falling_restitution_cannot_be_is_named(make: Callable[[], Contact], expected: str) -> None:
+def test_invalid_falling_restitutions_are_named(make: Callable[[], Contact], expected: str) -> None:
     with pytest.raises(SceneError, match=expected):
         impact(make(), (0.0, -1.0, 0.0))
 

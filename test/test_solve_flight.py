@@ -40,7 +40,7 @@ def run(compiled: CompiledScene, t_end: float, output_dt: float) -> Motion:
     return motion
 
 
-def test_an_hour_of_swinging_costs_36_steps_and_is_exact() -> None:
+def test_an_hour_of_swinging_takes_36_steps_and_is_exact() -> None:
     scene, amplitude, omega = swaying(), 1e-3, 20.0
     result = simulate(scene, 3600.0, 3.7, energy_balance=True)
     assert result.solver["steps"] == 36 and len(result.events) == 0
@@ -87,7 +87,7 @@ def test_long_linear_pieces_and_harmonics_are_flown_together() -> None:
     assert np.abs(flown.v - v + 20.0 * shape * np.cos(20.0 * t)[:, None]).max() < 1e-10
 
 
-def test_a_twin_in_flight_is_asked_saved_and_restored_without_a_trace() -> None:
+def test_advances_and_snapshots_in_flight_do_not_change_the_motion() -> None:
     # with this law, the kernels of other twins are used
     scene = dataclasses.replace(swaying((2e-4, 0.0, 0.0)), contact=preset("paper").contact)
     twin, other = Twin(scene), Twin(scene)

@@ -116,7 +116,7 @@ def assert_within_the_gate(scene: Scene, tolerances: tuple[float, ...]) -> None:
 
 
 @pytest.mark.parametrize("damping", [1e8, 1e9, 1e10])
-def test_the_tolerance_holds_however_loose_it_is(damping: float) -> None:
+def test_even_a_loose_tolerance_is_met(damping: float) -> None:
     """The tolerance affects the accuracy of a step, but not the choice of its method."""
     scene = replace(BENCH, contact=overdamped("kelvin_voigt", damping))
     assert_within_the_gate(scene, (1e-2, 1e-4, 1e-6, 1e-8, 1e-10))
@@ -136,7 +136,7 @@ def test_growth_while_dampers_hold_the_head_is_reported() -> None:
 
 
 @pytest.mark.parametrize(("law", "damping"), [("exact_restitution", 0.05), ("hunt_crossley", 1e8)])
-def test_the_tolerance_holds_for_a_factor_of_the_force_too(law: str, damping: float) -> None:
+def test_the_tolerance_is_met_for_laws_with_a_damping_factor(law: str, damping: float) -> None:
     assert_within_the_gate(replace(BENCH, contact=overdamped(law, damping)), (1e-2, 1e-6, 1e-10))
 
 
@@ -148,7 +148,7 @@ def test_the_tolerance_holds_for_a_factor_of_the_force_too(law: str, damping: fl
     + [("hunt_crossley", 10.0**k) for k in range(4, 10)]
     + [(law, e) for law, entry in LAWS.items() if entry.takes_restitution for e in (0.0, 0.05, 0.4, 0.9)],
 )
-def test_every_law_keeps_to_the_tolerance_and_to_bounded_work(start: Scene, law: str, damping: float) -> None:
+def test_every_law_meets_the_tolerance_in_bounded_work(start: Scene, law: str, damping: float) -> None:
     scene = replace(start, contact=overdamped(law, damping))
     assert_within_the_gate(scene, (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10))
 
@@ -168,7 +168,7 @@ def test_damping_beyond_double_precision_or_the_model_is_refused(damping: float)
             replace(worn, contact=overdamped(law, damping))
 
 
-def test_a_start_inside_a_wall_leaves_as_from_the_middle_of_an_impact() -> None:
+def test_a_start_inside_a_wall_continues_like_an_impact() -> None:
     """The head starts at depth d and leaves with e v0, as after an impact at v0 that turns back at d.
 
     At e = 1, v0 = d sqrt(2 K / m).
@@ -205,7 +205,7 @@ def test_scenes_that_are_not_overdamped_do_not_compile_it() -> None:
     assert implicit_of(damped(1e9)) is not None
 
 
-def test_a_restored_twin_goes_on_with_the_same_bits() -> None:
+def test_a_restored_twin_continues_with_the_same_bits() -> None:
     twin, other = Twin(damped(1e9)), Twin(damped(1e9))
     for t in np.linspace(0.01, 0.4, 23):
         expected = twin.advance(t)

@@ -123,7 +123,7 @@ def same(one: Ensemble, i: int, other: Ensemble, k: int) -> bool:
 
 
 @pytest.mark.parametrize(("powers", "friction", "seed"), [(False, False, 1), (True, False, 2), (False, True, 4)])
-def test_a_scene_has_the_same_bits_alone_and_in_any_company(powers: bool, friction: bool, seed: int) -> None:
+def test_a_scene_has_the_same_bits_alone_and_with_others(powers: bool, friction: bool, seed: int) -> None:
     scenes = drawn(seed, 19, powers=powers, friction=friction)
     together = simulate_many(scenes, 1.0, 0.05, 1e-7, workers=1)
     # the lanes end at very different times and are filled again
@@ -134,7 +134,7 @@ def test_a_scene_has_the_same_bits_alone_and_in_any_company(powers: bool, fricti
         assert same(together, index, backwards, len(scenes) - 1 - index)
 
 
-def test_rows_and_limits_on_the_time_between_two_looks_move_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_and_slices_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     scenes = drawn(7, 9)
     whole = simulate_many(scenes, 0.5, 0.05, 1e-7)
     monkeypatch.setattr("plow_twin.run.lane_run.next_slice", lambda size, took_s: 7)
@@ -205,7 +205,7 @@ def test_the_bench_scene_with_exponent_one_and_a_half_meets_its_reference_with_e
 
 
 @pytest.mark.parametrize("build", [fallen, swaying])
-def test_rest_and_flight_are_left_to_their_methods(build: Callable[[], Scene]) -> None:
+def test_scenes_at_rest_and_in_flight_leave_the_lanes(build: Callable[[], Scene]) -> None:
     scene = build()
     many, alone = simulate_many([scene] * 3, 3600.0, 7.3), simulate(scene, 3600.0, 7.3)
     assert many.steps.max() <= alone.solver["steps"] + 64 and (many.status == Status.OK).all()

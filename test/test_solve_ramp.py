@@ -81,7 +81,7 @@ def laws_restored() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("laws_restored")
-def test_a_law_of_one_s_own_works_like_the_others() -> None:
+def test_a_user_defined_law_works_like_the_others() -> None:
     """Scenes, checks and all solvers use a single definition of the law."""
     add_law("half_exact", ContactLaw("half exact", "of this test", lambda e: 0.5 * exact_damping_number(e)))
     stiffness, e = 1e8, 0.6
@@ -138,7 +138,7 @@ def test_a_clipped_pair_does_not_push_before_its_time() -> None:
         ({"ramped": True}, "ramped=True: expected additive=True"),
     ],
 )
-def test_a_law_that_no_solver_could_follow_is_refused(options: dict[str, object], named: str) -> None:
+def test_a_law_with_contradictory_options_is_refused(options: dict[str, object], named: str) -> None:
     with pytest.raises(ArgumentError, match=named):
         ContactLaw("mine", "nowhere", **options)  # type: ignore[arg-type]
 

@@ -79,7 +79,7 @@ VARIANTS = {
 }
 
 
-def test_an_exponent_that_is_no_integer_keeps_to_the_tolerance_when_separations_are_slow() -> None:
+def test_a_fractional_exponent_meets_the_tolerance_at_slow_separations() -> None:
     """The slower a separation, the larger is the neglected force before it. Here, damping slows a thrown head."""
     scene = preset("bench_hc")
     contact = Contact("hunt_crossley", 3e9 * 1e-3**-1.2, 2.2, damping=3.0)
@@ -160,7 +160,7 @@ def test_output_times_do_not_change_a_bit() -> None:
     assert coarse.statistics == fine.statistics and coarse.solver == fine.solver
 
 
-def test_more_events_than_the_first_log_holds_are_all_there() -> None:
+def test_all_events_are_logged_beyond_the_first_size_of_the_log() -> None:
     scene = preset("bench_kv")
     long = simulate(scene, 300.0, output_dt=100.0, tol=1e-5)
     assert len(long.events) > 4096
@@ -176,7 +176,7 @@ def test_more_events_than_the_first_log_holds_are_all_there() -> None:
         pytest.param("bench_hc", 1e-4, 1e-4, marks=pytest.mark.stress),
     ],
 )
-def test_fixed_step_rk4_follows_the_reference_as_far_as_it_can(name: str, dt: float, bound: float) -> None:
+def test_fixed_step_rk4_agrees_with_the_reference_up_to_its_error(name: str, dt: float, bound: float) -> None:
     scene, expected = preset(name), reference("paper_r1" if name == "paper" else name)
     result = simulate(scene, 5.0, output_dt=0.01, method="rk4", dt=dt)
     assert pose_error(scene, result.q, expected["q"][:501]) < bound
@@ -184,7 +184,7 @@ def test_fixed_step_rk4_follows_the_reference_as_far_as_it_can(name: str, dt: fl
     assert result.force == pytest.approx(located.force, abs=2e3 * bound / 1e-5)
 
 
-def test_the_last_row_of_a_fixed_step_run_is_where_it_says() -> None:
+def test_the_last_row_of_a_fixed_step_run_has_the_stated_time() -> None:
     scene = preset("paper")
     uneven, even = (simulate(scene, 1.0, output_dt=dt, method="rk4", dt=1e-3) for dt in (0.3, 0.1))
     assert uneven.t[-1] == 1.0 and uneven.solver["steps"] == 1000

@@ -53,7 +53,7 @@ balanced = partial(simulate, energy_balance=True)
 
 # the other law needs additional compiled kernels
 @pytest.mark.parametrize("law", ["kelvin_voigt", pytest.param("exact_restitution", marks=pytest.mark.stress)])
-def test_an_hour_at_rest_costs_next_to_nothing_and_is_in_balance(law: str) -> None:
+def test_an_hour_at_rest_takes_few_steps_and_is_in_balance(law: str) -> None:
     scene = fallen(law)
     result = balanced(scene, 3600.0, 360.0)
     settled = balanced(scene, 120.0, 1.0)
@@ -70,7 +70,7 @@ def test_an_hour_at_rest_costs_next_to_nothing_and_is_in_balance(law: str) -> No
     assert carried == pytest.approx(before + result.force[-1].sum() * (3600.0 - 120.0), rel=1e-9)
 
 
-def test_a_load_that_changes_wakes_the_head() -> None:
+def test_a_change_of_the_load_ends_a_rest() -> None:
     """The head rests for 50 s under samples and is then pushed.
 
     A run with a tolerance at which the rest begins later gives the same motion.
@@ -111,7 +111,7 @@ def test_an_unstable_balance_is_not_rest(corners: tuple[str, ...]) -> None:
     assert theta.max() < 2e-9 if stable else theta.max() > 1e-3
 
 
-def test_a_twin_at_rest_is_asked_saved_and_restored_without_a_trace() -> None:
+def test_advances_and_snapshots_at_rest_do_not_change_the_motion() -> None:
     # with these degrees of freedom locked, the kernels of other tests are used
     scene = dataclasses.replace(fallen(), locked=("x", "theta"))
     twin, other = Twin(scene), Twin(scene)
@@ -140,7 +140,7 @@ def test_rest_is_compiled_only_where_it_can_be() -> None:
 @pytest.mark.parametrize(
     ("law", "damping"), [("kelvin_voigt", 1e-9), pytest.param("hertz", None, marks=pytest.mark.stress)]
 )
-def test_a_spring_that_nothing_damps_goes_on_ringing(law: str, damping: float | None) -> None:
+def test_an_undamped_spring_keeps_oscillating(law: str, damping: float | None) -> None:
     contact = dataclasses.replace(preset("bench_kv").contact, law=law, damping=damping, stiffness=2e5)
     scene = wall_and_point(contact, speed=0.0, gravity=9.81)
     result = simulate(scene, 60.0, 0.01, tol=1e-9)
@@ -149,9 +149,7 @@ def test_a_spring_that_nothing_damps_goes_on_ringing(law: str, damping: float | 
 
 
 @pytest.mark.parametrize(("force", "omega"), [(1e-5, 2.0), (3e-7, 23.2), (3e-5, 300.0)])
-def test_a_harmonic_that_cannot_be_seen_lets_the_head_rest(
-    force: float, omega: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_negligible_harmonic_allows_rest(force: float, omega: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The harmonic moves the head by less than a thousandth of the tolerance, as a run without rest confirms."""
     tol, scene = 1e-6, fallen_under_a_harmonic(force, omega)
     rested = simulate(scene, 400.0, 0.317, tol=tol)
@@ -174,7 +172,7 @@ def test_loose_tolerances_find_the_same_rest() -> None:
     assert steps[1] == steps[0] + 9
 
 
-def test_a_load_that_is_nothing_does_not_keep_a_head_awake() -> None:
+def test_a_zero_load_allows_rest() -> None:
     still = fallen()
     silent = dataclasses.replace(still, loads=(*still.loads, Harmonic("nothing", (0.0, 0.0), 2.0)))
     assert balanced(silent, 1000.0).solver == balanced(still, 1000.0).solver

@@ -190,7 +190,7 @@ def test_rounded_corners_hold_with_implicit_steps_and_wear() -> None:
     assert result.wear_depth.max() > 0.0
 
 
-def test_sliding_rounded_corner_is_painleves_case_at_the_point_that_touches() -> None:
+def test_painleves_case_of_a_rounded_corner_is_at_its_touching_point() -> None:
     scene = block(initial=Initial())
     half, arm = 0.5 * SIDE - RADIUS, 0.5 * SIDE
     expected = (INERTIA / MASS + half**2) / (half * arm)
@@ -208,7 +208,7 @@ def test_sliding_rounded_corner_is_painleves_case_at_the_point_that_touches() ->
         (lambda: in_guide("walls", support=Support(1.0, 1.0, 1e6, 1e6, 1e6)), "none with frame.corner_radius_m"),
     ],
 )
-def test_what_rounded_corners_cannot_be_is_named(make: Callable[[], Scene], expected: str) -> None:
+def test_invalid_rounded_corners_are_named(make: Callable[[], Scene], expected: str) -> None:
     with pytest.raises(SceneError, match=expected):
         make()
 

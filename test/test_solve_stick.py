@@ -148,7 +148,7 @@ def belt(speed: float) -> tuple[Scene, Slider]:
     return scene, Slider(MASS, 4.0 * stiffness, 4e7, static * normal, kinetic * normal, (0.0, pull / omega, omega))
 
 
-def test_a_block_on_a_moving_belt_sticks_and_slips_for_ever() -> None:
+def test_a_block_on_a_moving_belt_keeps_sticking_and_slipping() -> None:
     speed, seconds = 2e-3, 2.0
     scene, slider = belt(speed)
     result = simulate(scene, seconds, output_dt=0.01, tol=1e-11, energy_balance=True)
@@ -173,11 +173,11 @@ def test_a_load_below_the_limit_is_held_without_creep() -> None:
     assert creeping.q[-1, 0] > 1000.0 * swing
 
 
-# this test compiles additional kernels; in the quick run, `test_a_corner_grips_at_its_touch_as_with_fixed_steps`
+# this test compiles additional kernels; in the quick run, `test_a_corner_sticks_at_its_touch_as_with_fixed_steps`
 # replaces it
 @pytest.mark.stress
 @pytest.mark.parametrize("name", ["paper", "bench_hc"])
-def test_fixed_steps_come_to_the_same_motion_and_the_energy_balances(name: str) -> None:
+def test_fixed_steps_give_the_same_motion_and_the_energy_balances(name: str) -> None:
     friction = Friction(0.3, stick_stiffness_n_m=5e7, stick_damping_n_s_m=1e5, static_coefficient=0.3)
     scene = replace(preset(name), friction=friction)
     events = simulate(scene, 1.0, output_dt=0.1, energy_balance=True)
@@ -200,7 +200,7 @@ HYSTERETIC = Contact("exact_restitution", 1.6e10, 1.5, restitution=0.5)
         *(pytest.param(block(0.0, 0.0).contact, damping, marks=pytest.mark.stress) for damping in (1e10, 1e7)),
     ],
 )
-def test_strong_dampers_keep_to_the_tolerance(contact: Contact, damping: float) -> None:
+def test_strong_dampers_meet_the_tolerance(contact: Contact, damping: float) -> None:
     """A grip with a damper that is far stronger than its spring needs implicit steps."""
     friction = Friction(MU, stick_stiffness_n_m=GRIP, stick_damping_n_s_m=damping)
     push, omega = 1.3 * MU * MASS * G, 9.0
@@ -211,14 +211,14 @@ def test_strong_dampers_keep_to_the_tolerance(contact: Contact, damping: float) 
     assert pose_error(scene, loose.q, tight.q) < 1e-4 and loose.solver["steps"] < 3000
 
 
-def test_whether_a_corner_holds_from_its_touch_on_is_not_decided_by_rounding() -> None:
+def test_rounding_does_not_decide_whether_a_corner_sticks_at_its_touch() -> None:
     """The Kelvin-Voigt force exists from the touch on, so a grip without tension sticks."""
     scene = replace(preset("bench_kv"), friction=Friction(0.3, stick_stiffness_n_m=5e7))
     loose, tight = (simulate(scene, 1.0, output_dt=0.1, tol=tol, energy_balance=True) for tol in (1e-6, 1e-10))
     assert pose_error(scene, loose.q, tight.q) < 1e-8
 
 
-def test_whether_a_clipped_corner_that_pushes_again_holds_is_not_decided_by_rounding() -> None:
+def test_rounding_does_not_decide_whether_a_clipped_corner_sticks() -> None:
     """The force of the corner begins at zero. With mu_s > mu, both stick and slip are then possible."""
     friction = Friction(0.2, stick_stiffness_n_m=1e8, static_coefficient=0.28)
     scene = replace(
@@ -231,7 +231,7 @@ def test_whether_a_clipped_corner_that_pushes_again_holds_is_not_decided_by_roun
 
 
 @pytest.mark.parametrize("damping", [1e5, 1e6])
-def test_a_corner_grips_at_its_touch_as_with_fixed_steps(damping: float) -> None:
+def test_a_corner_sticks_at_its_touch_as_with_fixed_steps(damping: float) -> None:
     """The Kelvin-Voigt force exists from the touch on.
 
     The corner sticks from the touch on, or slips if its damper is too strong.
@@ -273,7 +273,7 @@ def test_painleves_case_is_an_impact_without_collision() -> None:
 # in the quick run, `test_solve_rounded` restores a twin with stick
 @pytest.mark.stress
 @pytest.mark.parametrize("most", [None, 2000])
-def test_a_restored_twin_a_batch_and_a_bounded_twin_go_on_alike(most: int | None) -> None:
+def test_a_restored_twin_a_batch_and_a_limited_twin_have_the_same_motion(most: int | None) -> None:
     scene = replace(preset("paper"), friction=Friction(0.3, stick_stiffness_n_m=5e7, stick_damping_n_s_m=1e5))
     times = np.linspace(0.01, 0.4, 23)
     loads = np.stack([4e4 * np.sin(20.0 * times), -1e4 * np.cos(9.0 * times), 2e4 * np.sin(7.0 * times)], axis=1)
@@ -367,13 +367,13 @@ def furthest_off(scene: Scene, tolerances: tuple[float, ...]) -> float:
         pytest.param("exact_restitution", 237, marks=pytest.mark.stress),
     ],
 )
-def test_a_force_too_small_to_move_the_head_still_decides_whether_its_corner_holds(law: str, seed: int) -> None:
+def test_even_a_tiny_force_decides_whether_a_corner_sticks(law: str, seed: int) -> None:
     """Steps that are accurate only for the motion would release sticking corners and move their anchors."""
     assert furthest_off(held_scene(law, seed), (1e-3, 1e-4, 1e-6, 1e-7, 1e-8)) < 10.0
 
 
 @pytest.mark.parametrize("seed", [6, 17])
-def test_a_soft_grip_at_a_tight_tolerance_stays_finite(seed: int) -> None:
+def test_a_soft_tangential_spring_at_a_tight_tolerance_stays_finite(seed: int) -> None:
     """The corner must not cross the release penetration faster than the series can resolve."""
     scene = held_scene("hertz", seed)
     assert scene.friction is not None
@@ -385,7 +385,7 @@ def test_a_soft_grip_at_a_tight_tolerance_stays_finite(seed: int) -> None:
 @pytest.mark.stress
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("law", ["kelvin_voigt", "exact_restitution", "hertz"])
-def test_calm_random_scenes_keep_to_the_tolerance(law: str) -> None:
+def test_random_scenes_without_amplification_meet_the_tolerance(law: str) -> None:
     """In these scenes, a displacement grows by less than a factor of 1e4."""
     checked = 0
     for seed in range(200):

@@ -113,7 +113,7 @@ def test_two_corners_at_the_same_instant_touch_together() -> None:
 
 
 @pytest.mark.parametrize("request_s", [0.0, 1e-12, 1e4])
-def test_any_request_in_time_is_served(request_s: float) -> None:
+def test_any_order_of_advances_in_time_is_possible(request_s: float) -> None:
     twin = Twin(wall_and_point(Contact("kelvin_voigt", 1e9, damping=1e-3), speed=1.0, gravity=9.81))
     row = twin.advance(request_s)
     assert row.status is Status.OK and row.t == request_s and np.isfinite(row.q).all()

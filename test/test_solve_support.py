@@ -48,7 +48,7 @@ def pressed(load: Harmonic) -> Scene:
     )  # fmt: skip
 
 
-def test_two_masses_pressed_together_move_as_their_eigenmodes() -> None:
+def test_two_masses_pressed_together_move_in_their_eigenmodes() -> None:
     """Under the weight and a harmonic load, the contact remains closed, so the system is linear."""
     omega, amplitude = 40.0, 4e3
     scene = pressed(Harmonic("up and down", (0.0, amplitude), omega_rad_s=omega))
@@ -123,7 +123,7 @@ def reference(scene: Scene, times: np.ndarray) -> np.ndarray:
     return np.asarray(found.y[:6].T)
 
 
-def test_a_tilted_throw_agrees_with_equations_of_its_own() -> None:
+def test_a_tilted_throw_agrees_with_independent_equations() -> None:
     """All six coordinates move, and corners touch and separate.
 
     q is the pose of the head relative to the frame, in the rotated axes of the frame.
@@ -142,7 +142,7 @@ def test_a_tilted_throw_agrees_with_equations_of_its_own() -> None:
     assert np.abs(result.frame[:, :3] - frame).max() < 1e-9
 
 
-def test_a_restored_twin_and_a_batch_go_on_alike() -> None:
+def test_a_restored_twin_and_a_batch_have_the_same_motion() -> None:
     """The state contains the motion of the frame."""
     scene = replace(pressed(Harmonic("unused", (1.0, 1.0))), initial=Initial())
     times = np.linspace(0.01, 0.4, 23)
@@ -174,7 +174,7 @@ def test_a_scene_without_a_support_compiles_no_support() -> None:
     assert Twin(preset("paper")).frame is None
 
 
-def test_a_file_holds_a_support_and_bad_ones_are_refused(tmp_path: Path) -> None:
+def test_a_support_is_read_from_a_file_and_invalid_supports_are_refused(tmp_path: Path) -> None:
     scene = replace(preset("paper"), support=SUPPORT)
     path = tmp_path / "scene.yaml"
     path.write_text(dump_scene(scene), encoding="utf-8")
@@ -186,7 +186,7 @@ def test_a_file_holds_a_support_and_bad_ones_are_refused(tmp_path: Path) -> None
 
 
 @pytest.mark.stress
-def test_free_bodies_part_with_the_restitution_asked_for_and_keep_their_momentum() -> None:
+def test_free_bodies_separate_with_the_requested_restitution_and_conserve_momentum() -> None:
     floating = Support(800.0, 60.0, 0.0, 0.0, 0.0)
     scene = Scene(
         HEAD, Frame(0.33, 0.27), Clearance(0.025, 0.030), Contact("exact_restitution", 1e9, restitution=0.4),
@@ -202,7 +202,7 @@ def test_free_bodies_part_with_the_restitution_asked_for_and_keep_their_momentum
 @pytest.mark.stress
 @pytest.mark.parametrize("friction", [None, Friction(0.2), Friction(0.3, stick_stiffness_n_m=5e7)], ids=str)
 @pytest.mark.parametrize("name", ["paper", "bench_kv", "bench_hc"])
-def test_fixed_steps_come_to_the_same_motion_and_energy_is_kept(name: str, friction: Friction | None) -> None:
+def test_fixed_steps_give_the_same_motion_and_conserve_energy(name: str, friction: Friction | None) -> None:
     # with fixed steps, wear is accurate to first order only
     wear = Wear(1e-11, 0.015, 2.0)
     scene = replace(preset(name), support=SUPPORT, friction=friction, wear=wear)
@@ -220,7 +220,7 @@ def test_fixed_steps_come_to_the_same_motion_and_energy_is_kept(name: str, frict
     ("damping", "support"),
     [(1e10, SUPPORT), (6e4, replace(SUPPORT, horizontal_damping_n_s_m=1e10)), (1e8, SUPPORT)],
 )
-def test_strong_dampers_in_contact_or_support_keep_to_the_tolerance(damping: float, support: Support) -> None:
+def test_strong_dampers_in_contact_or_support_meet_the_tolerance(damping: float, support: Support) -> None:
     scene = replace(preset("bench_kv"), contact=replace(LAW, damping=damping), support=support)
     tight = simulate(scene, 1.0, output_dt=0.1, tol=1e-12)
     for tol in (1e-3, 1e-6, 1e-9):

@@ -99,7 +99,7 @@ def test_sliding_in_the_plane_and_running_in_under_a_constant_load(contact: Cont
     assert worn[0] > exposure + 1.5e-5
 
 
-def test_sliding_in_the_plane_wears_by_the_way_of_the_corner() -> None:
+def test_sliding_in_the_plane_wears_by_the_distance_of_the_corner() -> None:
     """The depth of each pad is the integral of its force times its speed over the rows, with fixed steps too."""
     wear = dataclasses.replace(RUBBED, travel_speed_m_s=0.05)
     scene = dataclasses.replace(preset("paper"), wear=wear)
@@ -125,7 +125,7 @@ def test_sliding_in_the_plane_wears_by_the_way_of_the_corner() -> None:
     assert fixed.wear_depth == pytest.approx(worn, rel=0.02, abs=1e-11)
 
 
-def test_a_twin_goes_on_wearing_from_a_snapshot_and_stands_still_without_wear() -> None:
+def test_a_twin_continues_its_wear_from_a_snapshot() -> None:
     scene = dataclasses.replace(preset("paper"), wear=dataclasses.replace(RUBBED, coefficient_m2_n=1e-13))
     t = np.arange(1, 31) * 0.1
     wrench = compile_loads(scene.loads).at(t)

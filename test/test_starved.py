@@ -71,7 +71,7 @@ def folder(compiled: None, tmp_path: Path) -> Path:
     ],
     ids=["3 GB of addresses", "64 files", "no home", "a home that is not there", "the locale C", "no terminal"],
 )
-def test_a_run_works_and_is_repeated_where_little_is_there(lacking: dict[str, object], folder: Path) -> None:
+def test_a_run_and_its_replay_work_with_few_resources(lacking: dict[str, object], folder: Path) -> None:
     assert _run(folder, *LIVE, **lacking) == (0, [])  # type: ignore[arg-type]
     report = replay(folder / "run")
     assert (report.exit_code, report.samples) == (0, 1500)
@@ -91,7 +91,7 @@ exec "$@"
 NAMESPACE = ("unshare", "--user", "--map-root-user", "--mount")
 
 
-def test_a_run_works_with_what_another_user_has_compiled_where_nothing_else_can_be_written(folder: Path) -> None:
+def test_a_run_uses_the_cache_of_another_user_without_write_access(folder: Path) -> None:
     if subprocess.run([*NAMESPACE, "true"], stderr=subprocess.DEVNULL).returncode:
         pytest.skip("the system allows no mounts of one's own")
     (folder / "home").mkdir()
@@ -103,7 +103,7 @@ def test_a_run_works_with_what_another_user_has_compiled_where_nothing_else_can_
     assert (report.exit_code, report.samples) == (0, 1500)
 
 
-def test_a_recording_is_replayed_while_it_is_written_as_far_as_it_goes(folder: Path) -> None:
+def test_a_recording_in_progress_is_replayed_up_to_its_end(folder: Path) -> None:
     stale = ("--set", "excitation_timeout=3600")
     with _live("load.csv", "--follow", "--record", "run", *stale, cwd=folder) as live:
         live.until_count("samples_used", 1500)
@@ -183,7 +183,7 @@ def test_a_missing_library_is_named_with_its_extra(tmp_path: Path) -> None:
         assert part in line
 
 
-def test_two_runs_into_one_folder_both_end_and_are_both_whole(folder: Path) -> None:
+def test_two_runs_into_one_folder_are_both_complete(folder: Path) -> None:
     words = [sys.executable, "-m", "plow_twin", *LIVE]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     runs = [subprocess.Popen(words, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True) for _ in range(2)]

@@ -35,7 +35,7 @@ def _levels(alarms: Alarms) -> tuple[Level, Level]:
     return alarms.levels["force"]
 
 
-def test_an_alarm_comes_after_its_duration_goes_below_its_hysteresis_and_stays_latched() -> None:
+def test_an_alarm_has_a_duration_a_hysteresis_and_a_latch() -> None:
     alarms = Alarms({"force": Thresholds(100.0, 200.0)}, duration_s=0.003)
     assert not any(_changes(alarms, _publication(stamp, 150.0)) for stamp in range(3))
     assert _changes(alarms, _publication(3, 150.0))
@@ -62,14 +62,14 @@ def test_an_alarm_comes_after_its_duration_goes_below_its_hysteresis_and_stays_l
     assert raised is not None and (raised.value, raised.threshold) == (300.0, 100.0)
 
 
-def test_a_threshold_of_zero_is_no_alarm() -> None:
+def test_a_threshold_of_zero_disables_an_alarm() -> None:
     alarms = Alarms({"force": Thresholds(0.0, 200.0)})
     assert not _changes(alarms, _publication(0, 199.0))
     assert alarms.worst is Level.NONE
     assert _changes(alarms, _publication(1, 201.0))
 
 
-def test_a_residual_is_that_at_the_stamp_of_the_pose_early_and_late_alike() -> None:
+def test_a_residual_belongs_to_the_stamp_of_an_early_or_late_pose() -> None:
     alarms = Alarms({"residual": Thresholds(0.004, 0.0)})
 
     def moved(stamp_ms: int) -> Published:
@@ -90,7 +90,7 @@ def test_a_residual_is_that_at_the_stamp_of_the_pose_early_and_late_alike() -> N
     assert abs(alarms.alarms["residual"].value - 0.005) < 1e-12
 
 
-def test_the_growth_of_the_clearance_is_that_of_ten_seconds() -> None:
+def test_the_growth_rate_of_the_clearance_covers_ten_seconds() -> None:
     alarms = Alarms({"clearance_rate": Thresholds(1e-3, 0.0)})
     for tenth in range(200):
         clearance = np.zeros(30)
@@ -100,7 +100,7 @@ def test_the_growth_of_the_clearance_is_that_of_ten_seconds() -> None:
 
 
 @pytest.mark.parametrize("names", [("force",), ("wear_rate",), ("clearance", "clearance_rate"), ()])
-def test_many_publications_at_once_raise_the_alarms_of_one_by_one(names: tuple[str, ...]) -> None:
+def test_many_publications_together_raise_the_same_alarms_as_single_ones(names: tuple[str, ...]) -> None:
     rng = np.random.default_rng(len(names))
     run = []
     for index in range(4000):

@@ -27,7 +27,7 @@ MS = NS_PER_S // 1000
 LOAD = (32e3, 0.0, -45e3)
 
 
-def test_silences_are_counted_alike_one_by_one_and_together_and_none_by_late_samples_or_across_a_reset() -> None:
+def test_silences_are_counted_equally_for_single_and_many_samples() -> None:
     stamps = T0 + MS * np.array([0, 40, 1100, 600, 1150, 2000, 2001])
     single, many = Silences(0.5), Silences(0.5)
     for stamp in stamps.tolist():
@@ -41,7 +41,7 @@ def test_silences_are_counted_alike_one_by_one_and_together_and_none_by_late_sam
     assert many.add(stamps[-1:] + 3600 * NS_PER_S) == [] and many.count == 2
 
 
-def test_a_log_with_long_intervals_is_silent_only_where_it_stops() -> None:
+def test_a_log_with_long_intervals_has_a_silence_only_at_its_end() -> None:
     random = np.random.default_rng(0)
     stamps = T0 + np.cumsum(random.integers(900, 1100, 200)) * MS
     stamps[60:] += 30 * NS_PER_S
@@ -80,7 +80,7 @@ class Bench:
 
 
 @pytest.mark.parametrize("hold", ["hold", "zero"])
-def test_silence_is_bridged_that_far_behind_the_clock(hold: str) -> None:
+def test_in_a_silence_the_model_lags_behind_the_clock_by_the_timeout(hold: str) -> None:
     bench = Bench(Policy(excitation_timeout_s=0.1, hold=hold))
     driver = bench.driver
     assert bench.silence(5 * NS_PER_S) is None
@@ -102,7 +102,7 @@ def test_silence_is_bridged_that_far_behind_the_clock(hold: str) -> None:
     assert counters(driver)["holds"] == 2
 
 
-def test_a_long_silence_is_caught_up_by_bounded_calls() -> None:
+def test_a_long_silence_is_processed_in_bounded_calls() -> None:
     bench = Bench(Policy(excitation_timeout_s=0.1))
     bench.sample(T0, LOAD, now_ns=0)
     for _ in range(3):
@@ -110,7 +110,7 @@ def test_a_long_silence_is_caught_up_by_bounded_calls() -> None:
     assert [entry.stamp_ns - T0 for entry in bench.journal[1:]] == [NS_PER_S, 2 * NS_PER_S, 3 * NS_PER_S]
 
 
-def test_time_spent_inactive_is_not_caught_up() -> None:
+def test_the_model_does_not_advance_over_inactive_time() -> None:
     bench = Bench(Policy(excitation_timeout_s=0.1))
     bench.sample(T0, LOAD, now_ns=0)
     bench.driver.resume(100 * NS_PER_S)
@@ -131,7 +131,7 @@ def test_a_jump_of_the_stamps_resets_the_model(jump_ns: int, key: str) -> None:
     assert bench.kinds().count("Reset") == counters(bench.driver)[key] == counters(bench.driver)["resets"] == 1
 
 
-def test_a_late_burst_after_a_long_silence_is_dropped_and_the_model_goes_on() -> None:
+def test_a_late_burst_after_a_long_silence_is_dropped_and_the_model_continues() -> None:
     bench = Bench(Policy(excitation_timeout_s=0.1))
     driver = bench.driver
     bench.sample(T0, LOAD, now_ns=0)
@@ -167,7 +167,7 @@ def test_a_failed_advance_publishes_nothing_and_after_the_limit_the_model_is_res
     assert driver.state is StreamState.RUNNING
 
 
-def test_a_model_that_leaves_its_range_says_by_how_much_and_begins_again_as_soon_as_it_can() -> None:
+def test_a_model_outside_its_range_reports_the_value_and_restarts_soon() -> None:
     bench, direct = Bench(), Twin(SCENE, excitation="sampled")
     failed = bench.driver.failed
     load = compile_loads(SCENE.loads).at(np.arange(4000) * 1e-3) * 3.0
@@ -189,7 +189,7 @@ def test_a_model_that_leaves_its_range_says_by_how_much_and_begins_again_as_soon
     ]
 
 
-def test_a_model_that_fails_at_once_after_each_restart_begins_again_ever_less_often() -> None:
+def test_a_model_that_fails_after_each_restart_restarts_less_and_less_often() -> None:
     bench, absurd, count = Bench(), (1e200, -1e200, 1e200), 3000
     for index in range(count):
         bench.sample(T0 + index * MS, absurd if index % 2 else LOAD, now_ns=0)
@@ -211,7 +211,7 @@ def test_the_scenes_own_loads_follow_the_clock_that_is_passed_in() -> None:
     assert isinstance(bench.journal[-2], Reset)
 
 
-def test_model_time_goes_on_where_it_was_after_an_inactive_hour() -> None:
+def test_model_time_continues_unchanged_after_an_inactive_hour() -> None:
     bench, hour = Bench(excitation="scene"), 3600 * NS_PER_S
     driver = bench.driver
     driver.resume(0)
@@ -235,7 +235,7 @@ def test_model_time_goes_on_where_it_was_after_an_inactive_hour() -> None:
 
 
 @pytest.mark.parametrize("batch", [1, 7, 300, 900])
-def test_batches_give_the_bits_of_single_samples_and_a_journal_that_repeats_them(batch: int) -> None:
+def test_batches_give_the_bits_and_the_journal_of_single_samples(batch: int) -> None:
     def arrivals(index: int) -> tuple[int, tuple[float, float, float]]:
         share = math.sin(0.01 * index)
         return T0 + index * MS, (share * LOAD[0], 0.0, share * LOAD[2])
@@ -255,7 +255,7 @@ def test_batches_give_the_bits_of_single_samples_and_a_journal_that_repeats_them
 
 @pytest.mark.parametrize("batch", [1, 40])
 @pytest.mark.parametrize("every", [900, 100, 2])
-def test_single_wrong_stamps_move_nothing_and_keep_no_right_one_out(every: int, batch: int) -> None:
+def test_single_wrong_stamps_have_no_effect_and_exclude_no_correct_stamp(every: int, batch: int) -> None:
     right, bench = Bench(every_sample=False), Bench(every_sample=False)
     arrived, wrong = [], 0
     for index in range(2000):
@@ -272,7 +272,7 @@ def test_single_wrong_stamps_move_nothing_and_keep_no_right_one_out(every: int, 
     assert bench.driver.unsteady(len(arrived) * MS) == (wrong >= 5)
 
 
-def test_wrong_stamps_one_after_another_reset_no_more_than_five_times_and_keep_no_right_one_out() -> None:
+def test_successive_wrong_stamps_cause_at_most_five_resets() -> None:
     bench = Bench()
     for index in range(2000):
         ahead_ns = (86_400 if index % 3 else -3600) * NS_PER_S if index % 100 >= 97 else 0
@@ -285,7 +285,7 @@ def test_wrong_stamps_one_after_another_reset_no_more_than_five_times_and_keep_n
     assert counted["samples_used"] + counted["dropped_unsteady"] + counted["dropped_stray"] == 2000
 
 
-def test_a_sample_that_jumps_is_used_without_a_successor_and_counted_when_the_twin_is_paused() -> None:
+def test_a_sample_with_a_jump_is_used_at_a_silence_and_counted_at_a_pause() -> None:
     bench = Bench(Policy(excitation_timeout_s=0.1))
     bench.sample(T0, LOAD, now_ns=0)
     assert bench.sample(T0 + 60 * NS_PER_S, LOAD, now_ns=MS) is None
@@ -300,7 +300,7 @@ def test_a_sample_that_jumps_is_used_without_a_successor_and_counted_when_the_tw
 
 
 @pytest.mark.parametrize("every_sample", [True, False])
-def test_silence_is_seen_after_a_reset_within_the_last_batch(every_sample: bool) -> None:
+def test_a_silence_is_detected_after_a_reset_in_the_last_batch(every_sample: bool) -> None:
     bench = Bench(Policy(failure_limit=3), every_sample=every_sample)
     absurd = (1e200, -1e200, 1e200)
     batch = [(T0 + i * MS, absurd if 95 <= i < 99 else LOAD) for i in range(110)]
@@ -310,7 +310,7 @@ def test_silence_is_seen_after_a_reset_within_the_last_batch(every_sample: bool)
     assert bench.driver.state is StreamState.STALE
 
 
-def test_failures_within_a_batch_end_in_a_reset_and_count_for_nothing() -> None:
+def test_failures_in_a_batch_cause_a_reset() -> None:
     bench = Bench(Policy(failure_limit=3), every_sample=False)
     absurd = (1e200, -1e200, 1e200)
     list(bench.driver.samples([(T0 + i * MS, absurd if 10 <= i < 13 else LOAD) for i in range(13)], now_ns=0))
@@ -354,7 +354,7 @@ def _troubled(seed: int, count: int) -> list[tuple[str, list[tuple[int, tuple[fl
 
 
 @pytest.mark.parametrize("max_steps", [DEFAULT_BUDGET, 3])
-def test_single_calls_of_the_session_give_the_driver_s_bits_for_any_input(max_steps: int) -> None:
+def test_the_session_alone_gives_the_driver_s_bits_for_any_input(max_steps: int) -> None:
     """Messages, journal and the state for later samples are equal. With 3 steps, an advance sometimes fails."""
 
     def new_session(journal: list[Entry]) -> Session:

@@ -13,7 +13,7 @@ from plow_twin.stream.health import DurationHistogram, Periods, RealTimeFactor
 
 
 @given(st.lists(st.floats(2e-6, 90.0), min_size=1, max_size=300), st.sampled_from((0.5, 0.9, 0.99, 1.0)))
-def test_quantiles_are_good_to_half_a_bin(durations: list[float], share: float) -> None:
+def test_quantiles_are_accurate_to_half_a_bin(durations: list[float], share: float) -> None:
     histogram = DurationHistogram()
     for duration in durations:
         histogram.add(duration)
@@ -23,7 +23,7 @@ def test_quantiles_are_good_to_half_a_bin(durations: list[float], share: float) 
     assert histogram.count == len(durations)
 
 
-def test_durations_out_of_range_stay_counted_and_nonsense_does_not() -> None:
+def test_durations_out_of_range_are_counted_and_negative_durations_are_not() -> None:
     histogram = DurationHistogram()
     assert math.isnan(histogram.quantile(0.5))
     for duration in (0.0, 1e-9, 1e9, -1.0, math.nan):
@@ -43,7 +43,7 @@ def test_real_time_factor_is_model_time_over_wall_time() -> None:
     assert factor.recent(22_000_000_000) == pytest.approx(0.5)
 
 
-def test_periods_left_out_are_counted_and_the_others_described_since_the_last_look() -> None:
+def test_missed_periods_are_counted_and_statistics_begin_at_the_last_call() -> None:
     periods = Periods(0.01)
     for now_s in (1.0, 1.011, 1.02, 1.051, 1.06):  # the turn at 1.05 follows two missed periods
         periods.turn(now_s)

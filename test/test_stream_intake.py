@@ -76,7 +76,7 @@ def test_used_samples_rise_strictly_and_every_sample_is_counted(arrivals: list[t
 
 
 @given(st.permutations(range(1, 12)), st.integers(0, 3))
-def test_any_order_with_repeats_uses_the_rising_records_only(order: list[int], repeats: int) -> None:
+def test_of_samples_in_any_order_only_rising_stamps_are_used(order: list[int], repeats: int) -> None:
     intake = Intake(jump_back_s=1.0)
     arriving = [number for number in order for _ in range(repeats + 1)]
     used = [number for number in arriving if intake.judge(T0 + number * MS, (0.0,)).used]

@@ -87,7 +87,7 @@ def _replayed(journal: list[Entry]) -> Session:
     st.lists(st.integers(1, 40), min_size=1, max_size=20),
     st.booleans(),
 )
-def test_any_order_and_any_batches_end_in_the_bits_of_the_samples_in_order(
+def test_samples_in_any_order_and_batches_give_the_bits_of_ordered_samples(
     delays: list[int], sizes: list[int], every_sample: bool
 ) -> None:
     ordered, live = Live(), Live(every_sample=every_sample)
@@ -168,7 +168,7 @@ def test_the_load_at_the_stamp_of_a_speed_is_computed_again_from_a_late_sample()
     assert live.motion == ordered.motion
 
 
-def test_a_lasting_rise_of_the_delay_does_not_stop_the_twin() -> None:
+def test_a_lasting_delay_does_not_stop_the_twin() -> None:
     live, ordered = Live(policy=Policy(excitation_timeout_s=0.1)), Live()
     ordered.send(*(_arrival(index) for index in range(1500)))
     for index in range(500):
@@ -201,7 +201,7 @@ def test_samples_older_than_the_memory_are_counted() -> None:
     assert (counters(live.driver)["rolled_back"], counters(live.driver)["dropped_duplicate"]) == (1, 1)
 
 
-def test_wear_outlives_resets_failures_and_clock_steps_and_a_held_load_wears_nothing() -> None:
+def test_wear_survives_resets_failures_and_clock_steps() -> None:
     live = Live(policy=Policy(excitation_timeout_s=0.1, failure_limit=2))
     live.driver.intake.limits = None
     live.send(*(_arrival(index) for index in range(1000)), now_ns=1000 * MS)
@@ -230,7 +230,7 @@ def test_wear_outlives_resets_failures_and_clock_steps_and_a_held_load_wears_not
     assert _replayed(live.journal).wear_depth.tolist() == list(pads)
 
 
-def test_speeds_of_another_clock_act_from_the_time_reached_on_and_are_counted_and_nothing_grows() -> None:
+def test_speeds_of_another_clock_act_at_once_and_are_counted() -> None:
     right = None
     for ahead_s in (0, 3600, -3600):
         live = Live()
@@ -252,7 +252,7 @@ def test_speeds_of_another_clock_act_from_the_time_reached_on_and_are_counted_an
     assert _replayed(live.journal).wear_depth.tolist() == live.wear.tolist()
 
 
-def test_a_hold_without_end_ends() -> None:
+def test_an_endless_hold_ends_at_its_limit() -> None:
     live = Live(policy=Policy(excitation_timeout_s=0.1, hold_limit_s=2.0))
     live.send(_arrival(0))
     for now in range(0, 9000, 100):
@@ -263,7 +263,7 @@ def test_a_hold_without_end_ends() -> None:
     assert live.driver.state is StreamState.RUNNING
 
 
-def test_clocks_out_of_step_end_in_an_error_and_not_in_resets_for_ever() -> None:
+def test_different_clocks_cause_an_error_and_not_endless_resets() -> None:
     live = Live()
     for index in range(0, 200, 2):
         for behind in (2000, 0):
@@ -280,7 +280,7 @@ def test_clocks_out_of_step_end_in_an_error_and_not_in_resets_for_ever() -> None
 
 
 @pytest.mark.parametrize("absurd", [(1e8, 0.0, 0.0), (0.0, -1e8, 0.0), (0.0, 0.0, 1e8)])
-def test_the_loads_line_never_passes_through_a_refused_sample(absurd: tuple[float, float, float]) -> None:
+def test_a_refused_sample_does_not_affect_the_interpolated_load(absurd: tuple[float, float, float]) -> None:
     live, without = Live(), Live()
     good = [_arrival(index) for index in range(100)]
     without.send(*good[:50], *good[51:])

@@ -84,7 +84,7 @@ def test_a_restored_motion_continues_as_after_its_snapshot_for_any_stamps() -> N
     assert _again(PAPER, bench.journal) == bench.journal
 
 
-def test_wear_outlives_a_restored_motion() -> None:
+def test_wear_survives_a_restored_motion() -> None:
     bench = Bench(WORN)
     bench.send(0, 700)
     kept = bench.driver.snapshot()
@@ -99,7 +99,7 @@ def test_wear_outlives_a_restored_motion() -> None:
     assert _again(WORN, bench.journal) == bench.journal
 
 
-def test_a_changed_model_goes_on_from_pose_rates_and_wear_and_a_snapshot_of_it_holds_it() -> None:
+def test_a_changed_model_continues_from_pose_rates_and_wear() -> None:
     bench = Bench(WORN)
     bench.send(0, 731)
     before, depth = bench.out[-1], bench.session.wear_depth.copy()
@@ -126,7 +126,7 @@ def test_a_changed_model_goes_on_from_pose_rates_and_wear_and_a_snapshot_of_it_h
     assert _again(WORN, bench.journal[index:]) == bench.journal[index:]
 
 
-def test_the_same_model_again_is_no_change() -> None:
+def test_setting_the_same_model_has_no_effect() -> None:
     bench = Bench(PAPER)
     for _ in range(2):
         bench.driver.set_model(T0, {"clearance.vertical_m": 0.031})

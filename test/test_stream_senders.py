@@ -33,7 +33,7 @@ def test_messages_from_before_the_subscription_are_no_loss() -> None:
     assert senders.lost == 2
 
 
-def test_one_sender_is_followed_until_it_has_gone_or_a_switch_is_asked_for() -> None:
+def test_one_sender_is_followed_until_it_leaves_or_a_switch_is_requested() -> None:
     senders = Senders()
     assert not senders.switch()
     assert [senders.hear(ONE, 1), senders.hear(OTHER, 1), senders.hear(ONE, 2)] == [True, False, True]

@@ -125,7 +125,7 @@ def test_one_flipped_bit_of_a_sample_shows_in_the_next_digest(reference: Run) ->
     assert [equal for _, equal in same[: before + 1]] == [True] * before + [False]
 
 
-def test_frames_carry_the_twins_own_numbers(reference: Run) -> None:
+def test_publications_contain_the_twins_numbers(reference: Run) -> None:
     twin = Twin(SCENE, excitation="sampled")
     series = twin.advance_samples(np.arange(200) * 2 * MS * 1e-9, WRENCH[:200])
     for index, publication in enumerate(reference.publications[:200]):
@@ -138,7 +138,7 @@ def test_frames_carry_the_twins_own_numbers(reference: Run) -> None:
 
 @settings(max_examples=8)
 @given(st.sets(st.integers(1, STEPS - 1), max_size=12))
-def test_nothing_is_lost_however_rarely_frames_are_taken(cuts: set[int]) -> None:
+def test_rare_publications_lose_no_peak_impulse_or_touch(cuts: set[int]) -> None:
     every, rare = Run(), Run()
     entries = [_sample(index) for index in range(STEPS)]
     every.apply(entries)
@@ -157,7 +157,7 @@ def test_nothing_is_lost_however_rarely_frames_are_taken(cuts: set[int]) -> None
 
 
 @pytest.mark.parametrize("at", [0, 1, 333, 801])
-def test_a_snapshot_goes_on_with_the_same_bits(reference: Run, at: int) -> None:
+def test_a_session_continues_from_a_snapshot_with_the_same_bits(reference: Run, at: int) -> None:
     before = Run().apply(_entries()[:at])
     after = Run().apply([Loss(at), before.session.snapshot(), *_entries()[at:]])
     # an entry that advances nothing publishes nothing
@@ -211,7 +211,7 @@ def test_the_wear_rate_times_the_time_is_the_growth(reference: Run) -> None:
     assert slow["wear_rate"].max() > 0.0
 
 
-def test_running_in_and_sliding_in_the_plane_wear_live_as_offline_and_go_on_after_a_restart(tmp_path: Path) -> None:
+def test_running_in_and_sliding_in_the_plane_wear_equally_live_and_offline(tmp_path: Path) -> None:
     wear = Wear(1e-12, 0.015, 2.0, sliding="total", running_in_ratio=4.0, running_in_depth_m=2e-5)
     scene = replace(SCENE, wear=wear)
 
@@ -238,7 +238,7 @@ def test_running_in_and_sliding_in_the_plane_wear_live_as_offline_and_go_on_afte
     assert (worn - new).max() < 0.6 * new.max()
 
 
-def test_a_speed_at_which_the_damping_lets_no_contact_last_is_refused_by_name() -> None:
+def test_a_speed_beyond_the_limit_of_the_damping_is_refused_by_name() -> None:
     """A force would wear a pad faster than it moves the head. The speed is rejected before it is journaled."""
     damping, area = 2e5, 0.015
     contact = Contact("kelvin_voigt", 1e9, damping=damping)

@@ -53,7 +53,7 @@ def check(found: Analysis, bias: tuple[float, ...] = BIAS) -> None:
 
 
 @pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
-def test_a_bag_shows_bias_and_lag_of_the_sensor_and_becomes_a_run(plugin: StoragePlugin, tmp_path: Path) -> None:
+def test_an_analysis_of_a_bag_finds_bias_and_lag_and_writes_a_run(plugin: StoragePlugin, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", motion(), plugin)
     found = analyse(bag, scene=PAPER, mapping=tmp_path / "map.yaml", out=tmp_path / "out")
     check(found)
@@ -104,7 +104,7 @@ def test_values_of_another_clock_and_impossible_ones_are_counted(tmp_path: Path)
     assert found.lost == {"measured_outside_the_load": 120} and found.lossy and found.facts()["signals"] == {}
 
 
-def test_other_scenes_are_predicted_beside_it_in_one_pass(tmp_path: Path) -> None:
+def test_other_scenes_are_predicted_in_the_same_pass(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", motion(), StoragePlugin.MCAP)
     words = ["analyse", bag, "--scene", "paper", "--with", BEST_FIT, "--map", tmp_path / "map.yaml"]
     done = plow_twin(*words, "--out", tmp_path / "out", "--json")
@@ -121,14 +121,14 @@ def test_other_scenes_are_predicted_beside_it_in_one_pass(tmp_path: Path) -> Non
     assert names >= {"report.html", "analysis.json", "predicted.parquet", "predicted_1.parquet", "measured.parquet"}
 
 
-def test_a_run_of_ours_is_analysed_by_its_journal(tmp_path: Path) -> None:
+def test_a_run_of_plow_twin_is_analysed_from_its_journal(tmp_path: Path) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(1000)), frame_every=10**9)
     found = analyse(run.folder)
     assert found.input == {"samples_used": 1000} and not found.lossy and not found.comparisons(found.predictions[0])
     assert found.predictions[0].loads.duration_s == pytest.approx(0.999)
 
 
-def test_poses_in_the_journal_are_measured_ones(tmp_path: Path) -> None:
+def test_poses_in_the_journal_are_measurements(tmp_path: Path) -> None:
     entries: list[Entry] = [paper_sample(index) for index in range(500)]
     entries[20::21] = [Pose(BASE_NS + index * STEP_NS, (1e-3, 2e-3, 3e-3)) for index in range(20, 500, 21)]
     run = record_run(tmp_path / "run", entries)
@@ -138,7 +138,7 @@ def test_poses_in_the_journal_are_measured_ones(tmp_path: Path) -> None:
     )
 
 
-def test_a_run_is_predicted_with_all_that_was_done_to_the_model_while_it_ran(tmp_path: Path) -> None:
+def test_the_prediction_of_a_run_includes_changes_of_the_model(tmp_path: Path) -> None:
     """The forces are the recorded forces despite parameter changes, a restored motion, poses and speeds."""
     samples = [*map(paper_sample, range(1500))]
     session = Session(Twin(load_scene(PAPER), excitation="sampled"))
@@ -167,7 +167,7 @@ def test_a_run_is_predicted_with_all_that_was_done_to_the_model_while_it_ran(tmp
     assert [item.start_s for item in mine.loads.passes] == pytest.approx([0.0, 0.301], abs=1e-9)
 
 
-def test_late_samples_of_a_run_take_their_places_among_other_entries(tmp_path: Path) -> None:
+def test_late_samples_of_a_run_are_inserted_at_their_stamps(tmp_path: Path) -> None:
     samples = [*map(paper_sample, range(1000))]
     entries: list[Entry] = sorted(samples, key=lambda one: (n := one.stamp_ns - BASE_NS) + 5.5 * STEP_NS * (n % 7 == 3))
     entries[500:500] = [Pose(BASE_NS, (0.0, 0.0, 0.0))] * 3
@@ -249,7 +249,7 @@ def test_a_unit_of_stamps_that_would_be_left_out_is_refused(tmp_path: Path) -> N
         analyse(bag / "run", scene=PAPER, mapping=mapping)
 
 
-def test_travel_makes_passes_of_the_face(tmp_path: Path) -> None:
+def test_the_travel_determines_the_passes_of_the_face(tmp_path: Path) -> None:
     with (tmp_path / "load.csv").open("w") as stream:
         stream.write("t,fx,fy,m\n")
         stream.writelines(f"{t},{w[0]},{w[1]},{w[2]}\n" for t, w in zip(motion()[0], motion()[1], strict=True))
@@ -318,7 +318,7 @@ def test_lag_and_correlation_stay_within_their_bounds() -> None:
         assert found.coherence is not None and found.coherence <= 1.0
 
 
-def test_duty_is_a_share_of_time_however_coarsely_the_load_is_sampled(tmp_path: Path) -> None:
+def test_duty_is_a_share_of_time_at_any_sampling_rate(tmp_path: Path) -> None:
     """One load, linear between four knots, is given by its knots, or by many samples on the lines."""
     knots, count = np.array([0.0, 0.7, 1.5, 2.0]), 2001
     wrench = np.array([[0, 0, 0], [32e3, -11e3, -45e3], [-32e3, 11e3, 45e3], [0, 0, 0]])
@@ -343,7 +343,7 @@ def test_duty_is_a_share_of_time_however_coarsely_the_load_is_sampled(tmp_path: 
 
 
 @pytest.mark.parametrize("clock_s", [2.0, 3600.0])
-def test_measured_values_are_compared_with_the_stretch_they_belong_to(clock_s: float, tmp_path: Path) -> None:
+def test_measured_values_are_compared_with_their_stretch(clock_s: float, tmp_path: Path) -> None:
     """The clock steps back, or ahead by an hour. The stretches before and after the step are predicted as measured."""
     times, wrench, q = motion()
     short = 3000
@@ -363,7 +363,7 @@ def test_measured_values_are_compared_with_the_stretch_they_belong_to(clock_s: f
 
 # each rotation needs its own compiled kernel
 @pytest.mark.parametrize("rotation", ["paper", pytest.param("consistent", marks=pytest.mark.stress)])
-def test_contacts_under_gravity_alone_take_the_energy_of_the_height_lost(rotation: str, tmp_path: Path) -> None:
+def test_contacts_under_gravity_dissipate_the_potential_energy(rotation: str, tmp_path: Path) -> None:
     """In flight, contacts dissipate nothing. Up to rest, they dissipate m g times the drop minus the stored energy."""
     scene = load_scene(PAPER)
     arm, height = scene.gravity.arm_m, 0.1
@@ -390,7 +390,7 @@ def test_contacts_under_gravity_alone_take_the_energy_of_the_height_lost(rotatio
         assert loads.impulse.any() == (end > 1.0)
 
 
-def test_energy_stored_where_a_recording_begins_is_no_gain_of_the_contacts(tmp_path: Path) -> None:
+def test_energy_stored_at_the_start_of_a_recording_is_no_gain(tmp_path: Path) -> None:
     """Contacts almost without damping dissipate nothing, although 66 J are stored at the start of the recording."""
     scene = load_scene(PAPER)
     scene = replace(scene, initial=Initial(q=(0.0151, 0.0, 0.0)), contact=replace(scene.contact, damping=1e-9))
@@ -427,7 +427,7 @@ def test_speeds_act_at_the_stamps_that_the_mapping_reads(
         assert one == pytest.approx(known, abs=0.05)
 
 
-def test_late_repeated_and_non_finite_samples_are_counted_as_live(tmp_path: Path) -> None:
+def test_late_repeated_and_non_finite_samples_are_counted_as_in_a_live_run(tmp_path: Path) -> None:
     stamps = [BASE_NS + i * STEP_NS for i in range(200)]
     arrivals = [(stamp, motion()[1][i]) for i, stamp in enumerate(stamps)]
     arrivals[50], arrivals[51] = arrivals[51], arrivals[50]
@@ -526,7 +526,7 @@ def test_rows_beyond_the_limit_are_thinned_evenly(monkeypatch: pytest.MonkeyPatc
         np.testing.assert_array_equal(values.ravel(), 2.0 * stamps)
 
 
-def test_cycles_are_those_of_the_whole_series_for_any_length(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rainflow_cycles_of_long_and_short_series_are_exact(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loads, "_IN_MEMORY", 4096)  # this limit is below the 40,000 bytes of the series
     forces, series = np.abs(np.random.default_rng(1).normal(size=5000)), loads.Series()
     for part in np.array_split(forces, 7):

@@ -93,7 +93,7 @@ def test_the_same_seed_gives_the_same_bits_on_any_number_of_threads() -> None:
     assert one.population.tobytes() == two.population.tobytes()
 
 
-def test_an_unseen_parameter_is_reported_as_such() -> None:
+def test_an_undetermined_parameter_is_reported() -> None:
     scene = with_parameters(preset("paper"), {"contact.impact_speed_floor_m_s": 2e-3})
     # a constant damping does not depend on the floor of the speed, so the recording does not determine the floor
     unknowns = Space(
@@ -181,7 +181,7 @@ def test_the_command_fits_a_recording_and_marks_the_fitted_numbers(
         assert message in capsys.readouterr().err
 
 
-def test_a_recording_of_the_node_brings_its_load(tmp_path: Path) -> None:
+def test_a_recording_of_the_node_provides_its_load(tmp_path: Path) -> None:
     record_run(tmp_path / "run", map(paper_sample, range(1500)), frame_every=5)
     poses = load_poses(tmp_path / "run" / "run_0.mcap")
     assert poses.load is not None and len(poses.load.t) > 1000 and poses.t[-1] > 1.0
@@ -192,7 +192,7 @@ def test_a_recording_of_the_node_brings_its_load(tmp_path: Path) -> None:
     assert found.best.values["contact.stiffness"] == pytest.approx(preset("paper").contact.stiffness, rel=1e-4)
 
 
-def test_targets_are_judged_as_they_say(tmp_path: Path) -> None:
+def test_targets_are_judged_by_their_rules(tmp_path: Path) -> None:
     def residual(target: Target, *rows: list[float]) -> float:
         return float(target.residual(np.array([rows]))[0])
 
@@ -230,7 +230,7 @@ def test_targets_are_judged_as_they_say(tmp_path: Path) -> None:
         load_targets(tmp_path / "bad.yaml", preset("paper"))
 
 
-def test_a_fitted_scene_survives_its_file(tmp_path: Path) -> None:
+def test_a_fitted_scene_is_written_and_read_unchanged(tmp_path: Path) -> None:
     values = {
         "frame.labels": "top_left_cw",
         "contact.restitution": 0.5,

@@ -48,7 +48,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Run]:
     return _run(folder / "monday", 1.0), _run(folder / "tuesday", 1.3)
 
 
-def test_windows_hold_the_recorded_numbers(runs: tuple[Run, Run]) -> None:
+def test_windows_contain_the_recorded_numbers(runs: tuple[Run, Run]) -> None:
     windows = windows_of(read_recording(runs[0].folder), 1.0)
     assert len(windows.start_ns) == SECONDS and (windows.start_ns % 10**9 == 0).all()
     peaks = [m for topic, m in runs[0].outputs if topic == "/contact_peaks" and isinstance(m, JointState)]
@@ -71,13 +71,13 @@ def test_windows_hold_the_recorded_numbers(runs: tuple[Run, Run]) -> None:
     np.testing.assert_allclose(windows.load[0], np.sqrt([(load[:, :2] ** 2).sum() / 1e3, (load[:, 2] ** 2).mean()]))
 
 
-def test_a_window_without_a_message_of_the_clearance_has_that_of_its_neighbours(runs: tuple[Run, Run]) -> None:
+def test_a_clearance_without_a_message_is_interpolated_between_windows(runs: tuple[Run, Run]) -> None:
     windows = windows_of(read_recording(runs[0].folder), 0.05)
     scene = load_scene("paper").clearance
     np.testing.assert_allclose(windows.clearance, [[scene.horizontal_m, scene.vertical_m]] * len(windows.start_ns))
 
 
-def test_new_pads_are_no_negative_wear(runs: tuple[Run, Run], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_new_pads_do_not_count_as_negative_wear(runs: tuple[Run, Run], monkeypatch: pytest.MonkeyPatch) -> None:
     """After `set_wear` the mean wear of a run was negative, and no pad of the run had a change of wear."""
     recording = read_recording(runs[0].folder)
     batches = type(recording).batches
@@ -128,7 +128,7 @@ def change(
     return changes(*(Drawn(values[:, None], load, random, draws) for values, load in (before, after)))[0]
 
 
-def test_of_fifty_cells_judged_together_chance_takes_none_for_a_change_in_nineteen_tables_of_twenty() -> None:
+def test_at_most_one_table_in_twenty_shows_a_random_change() -> None:
     random = np.random.default_rng(1)
     tables, found_again = [], 0
     for _ in range(60):
@@ -158,7 +158,7 @@ def test_a_change_of_the_machine_is_distinguished_from_a_change_of_the_load(
     assert change((force[0][:5], load[0][:5]), (force[1], load[1]), random) is None
 
 
-def test_a_lasting_change_of_a_load_that_windows_cut_through_is_the_load_s() -> None:
+def test_a_lasting_change_of_the_load_is_attributed_to_the_load() -> None:
     random = np.random.default_rng(4)
     verdicts = []
     for _ in range(40):
@@ -186,7 +186,7 @@ def test_a_lasting_change_of_a_load_that_windows_cut_through_is_the_load_s() -> 
     assert constant is not None and constant.verdict == "chance"
 
 
-def test_days_and_shifts_begin_in_their_zone() -> None:
+def test_days_and_shifts_follow_their_time_zone() -> None:
     late = 1_800_000_000 - 1_800_000_000 % 86_400 + 23 * 3600  # 23:00 UTC
     stamp = late * 10**9
     assert by_time("day")("run", stamp) == "2027-01-15"
@@ -308,7 +308,7 @@ def test_overlapping_runs_other_rates_and_other_scenes_are_named(runs: tuple[Run
     assert rates.endswith("them: a 1000 Hz, b 1000 Hz, c 500 Hz") and scenes.endswith("its description: a a, b b, c c")
 
 
-def test_names_of_pads_are_whole_in_eighty_columns(runs: tuple[Run, Run], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_of_pads_are_complete_in_eighty_columns(runs: tuple[Run, Run], monkeypatch: pytest.MonkeyPatch) -> None:
     windows, text = windows_of(read_recording(runs[0].folder), 1.0), io.StringIO()
     monkeypatch.setattr(compare_verb, "output_console", lambda: PlainConsole(file=text, width=80))
     shares = dict(zip(QUANTITIES, (-0.999, 0.9994, 1.0, 12.34, -1.0, -1e-17), strict=True))

@@ -109,7 +109,7 @@ def mcap(path: Path, encoding: str, schema: tuple[str, str, bytes], messages: li
         ("cdr", ("other_msgs/msg/Thing", "ros2msg", b"\xff\xfe no text")),
     ],
 )
-def test_a_recording_that_is_not_of_ros_2_is_named_and_not_guessed_at(
+def test_a_recording_without_ros_2_messages_is_refused(
     encoding: str, schema: tuple[str, str, bytes], tmp_path: Path
 ) -> None:
     file = mcap(tmp_path / "odd.mcap", encoding, schema, [(BASE_NS, json.dumps({"fx": 1.0}).encode())])
@@ -122,7 +122,7 @@ def test_a_recording_that_is_not_of_ros_2_is_named_and_not_guessed_at(
     assert encoding == "cdr" or encoding in source.losses.unknown_types["/load"]
 
 
-def test_stamps_of_any_size_are_counted_and_move_nothing(tmp_path: Path) -> None:
+def test_stamps_of_any_size_are_counted_and_harmless(tmp_path: Path) -> None:
     good = [(BASE_NS + i * STEP_NS, paper_sample(i).wrench) for i in range(COUNT)]
     odd = [0, -(2**31) * 10**9, (2**31 - 1) * 10**9, -1]
     messages = [(time_ns, wrench_message(time_ns, wrench)) for time_ns, wrench in good]
@@ -160,7 +160,7 @@ def test_a_spreadsheet_s_csv_gives_the_numbers_of_a_plain_one(tmp_path: Path) ->
         assert peaks(analyse(sheet(tmp_path / "load.csv", delimiter, comma=True, mark=True), scene=PAPER)) == plain
 
 
-def test_columns_that_are_missing_or_there_twice_are_named(tmp_path: Path) -> None:
+def test_missing_and_repeated_columns_are_named(tmp_path: Path) -> None:
     twice = sheet(tmp_path / "load.csv", ",", comma=False, mark=True, header=("t", "fx", "fx", "m"))
     with pytest.raises(RecordingError, match="'fx' occurs more than once"):
         analyse(twice, scene=PAPER)
@@ -235,7 +235,7 @@ def test_a_full_disk_is_named_with_the_file_being_written(tmp_path: Path) -> Non
     assert error.value.filename == str(out / "analysis.json")
 
 
-def test_columns_of_any_name_dates_and_rows_of_several_signals_are_read(tmp_path: Path) -> None:
+def test_columns_with_any_name_dates_and_mixed_rows_are_read(tmp_path: Path) -> None:
     lines = ['head;when;"Fx, N";2;"M;Nm";x']
     for index in range(COUNT):
         start = f"A;2026-01-02T03:04:05.{index:03}Z;"
@@ -254,7 +254,7 @@ def test_columns_of_any_name_dates_and_rows_of_several_signals_are_read(tmp_path
     assert (stamps[0], len(stamps), set(rows[:, 0])) == (1_767_323_045_000_000_000, COUNT, {0.25e-3})
 
 
-def test_a_part_that_a_killed_recorder_has_only_named_costs_nothing_before_it(tmp_path: Path) -> None:
+def test_an_empty_last_part_of_a_killed_recorder_loses_no_earlier_data(tmp_path: Path) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)))
     (run.folder / "run_1.mcap").touch()
     report = replay(run.folder)
@@ -285,7 +285,7 @@ def bag_of_parts(folder: Path, kind: StoragePlugin) -> list[Path]:
 
 
 @pytest.mark.parametrize("kind", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
-def test_of_a_bag_with_a_damaged_or_missing_part_the_others_are_used(kind: StoragePlugin, tmp_path: Path) -> None:
+def test_the_other_parts_of_a_damaged_bag_are_used(kind: StoragePlugin, tmp_path: Path) -> None:
     """No load is interpolated over a gap of any length, and a damaged file does not make the whole bag unreadable."""
     parts = bag_of_parts(tmp_path / "bag", kind)
     plain = analyse(tmp_path / "bag", scene=PAPER)

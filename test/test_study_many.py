@@ -106,7 +106,7 @@ def test_an_interrupt_ends_the_call_and_its_workers_at_once(number: signal.Signa
     until(lambda: not any(map(is_running, workers)), "the end of the workers")
 
 
-def test_the_others_go_on_together_when_a_worker_died_before_the_first_result(
+def test_the_other_tasks_continue_after_the_early_death_of_a_worker(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rounds: list[list[int]] = []
@@ -136,7 +136,7 @@ def test_a_cluster_gives_the_same_results(runs: Path, tmp_path: Path) -> None:
     assert all(task.stored() is not None for task in some)
 
 
-def test_a_cluster_without_workers_is_not_waited_for_without_end(
+def test_the_wait_for_a_cluster_without_workers_is_limited(
     runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from distributed import LocalCluster
@@ -183,7 +183,7 @@ def test_a_run_is_analysed_while_it_is_recorded(tmp_path: Path) -> None:
     assert 0 < first["input"]["samples_used"] <= 2000 and last["input"]["samples_used"] == 4000
 
 
-def test_the_failure_of_one_of_many_recordings_is_its_row(tmp_path: Path) -> None:
+def test_a_failed_recording_among_many_has_a_row_with_the_error(tmp_path: Path) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(10)))
     (tmp_path / "taken").write_text("no folder")
     found = run_task(Task(run.folder, None, None, (), tmp_path / "taken"))
@@ -191,7 +191,7 @@ def test_the_failure_of_one_of_many_recordings_is_its_row(tmp_path: Path) -> Non
 
 
 @pytest.mark.usefixtures("without_workers")
-def test_no_recording_of_a_folder_is_left_out_unsaid(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_omitted_recording_of_a_folder_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("good", "gone"):
         record_run(tmp_path / name, map(paper_sample, range(10)))
     for part in (tmp_path / "gone").glob("*.mcap"):
@@ -241,7 +241,7 @@ def test_a_run_that_was_killed_before_its_header_is_repeated(runs: Path, tmp_pat
     assert not part.exists()
 
 
-def test_recordings_of_one_name_have_results_of_their_own(tmp_path: Path) -> None:
+def test_recordings_with_equal_names_have_separate_results(tmp_path: Path) -> None:
     files = [tmp_path / "a" / "load.csv", tmp_path / "a" / "load.mcap", tmp_path / "a" / "pose.csv"]
     folders = [tmp_path / "jan" / "1" / "run", tmp_path / "feb" / "1" / "run", tmp_path / "run.1", tmp_path / "run.2"]
     for folder in folders:
@@ -253,7 +253,7 @@ def test_recordings_of_one_name_have_results_of_their_own(tmp_path: Path) -> Non
     assert names == ["load.csv", "load.mcap", "pose", "jan_1_run", "feb_1_run", "run.1", "run.2"]
 
 
-def test_an_interrupted_analysis_goes_on_and_a_run_that_a_twin_recorded_stays(runs: Path, tmp_path: Path) -> None:
+def test_an_interrupted_analysis_continues_and_removes_no_recorded_run(runs: Path, tmp_path: Path) -> None:
     task = Task(runs / "r0", PAPER, None, (), tmp_path / "out")
     first = task.run()
     assert task.stored() == first
@@ -269,7 +269,7 @@ def test_an_interrupted_analysis_goes_on_and_a_run_that_a_twin_recorded_stays(ru
     assert recorded.exists()
 
 
-def test_no_input_is_removed_and_results_of_two_recordings_never_stand_side_by_side(runs: Path, tmp_path: Path) -> None:
+def test_no_input_is_removed_and_results_of_two_recordings_are_not_mixed(runs: Path, tmp_path: Path) -> None:
     out, narrow = tmp_path / "out", tmp_path / "narrow.yaml"
     scene = load_scene(scene_path("paper"))
     narrow.write_text(dump_scene(replace(scene, clearance=replace(scene.clearance, horizontal_m=0.02))))
@@ -296,7 +296,7 @@ def test_no_input_is_removed_and_results_of_two_recordings_never_stand_side_by_s
     assert Task(runs / "r0", PAPER, None, (narrow,), out).stored() is None
 
 
-def test_files_beside_the_data_are_part_of_the_question(runs: Path, tmp_path: Path) -> None:
+def test_files_beside_the_data_are_inputs_of_the_analysis(runs: Path, tmp_path: Path) -> None:
     (data := tmp_path / "data").mkdir()
     load = data / "load.csv"
     load.write_text((runs / "r0" / "load.csv").read_text())

@@ -39,7 +39,7 @@ def energy(states: np.ndarray) -> np.ndarray:
     return 0.5 * (states[:, 3] ** 2 + states[:, 4] ** 2 + (GYRATION * states[:, 5]) ** 2)
 
 
-def test_measured_impacts_are_met_better_than_by_a_rigid_impact(impacts) -> None:
+def test_measured_impacts_are_predicted_better_than_by_a_rigid_impact(impacts) -> None:
     before, after = impacts
     missed = misses(impact(before), after)
     assert np.sqrt((missed**2).mean()) < 0.245
@@ -49,7 +49,7 @@ def test_measured_impacts_are_met_better_than_by_a_rigid_impact(impacts) -> None
     assert np.sqrt((misses(impact(before, plain), after) ** 2).mean()) > 0.27
 
 
-def test_preset_computes_measured_impacts_whole_as_the_function_does(impacts) -> None:
+def test_preset_and_function_give_the_same_measured_impacts(impacts) -> None:
     before, after = impacts
     found = simulated_impact(before)
     # during an impact of finite duration, the ellipse rotates slightly, so the two results differ
@@ -129,7 +129,7 @@ def test_flight_is_fitted_to_its_measured_rows(drops) -> None:
     assert fit_flight(np.delete(pose[:given], 4, axis=0)).times[0] == pytest.approx(fit_flight(pose[:given]).times[0])
 
 
-def test_bands_hold_nine_of_ten_measured_rows(drops) -> None:
+def test_bands_contain_nine_of_ten_measured_rows(drops) -> None:
     shares = []
     for index in drops.usable()[::3]:
         rows = drops.until(index, 2) + 1
@@ -188,7 +188,7 @@ def test_marker_is_turned_as_the_angles_at_rest_show(drops) -> None:
     assert np.median((angle + 0.5 * right) % right - 0.5 * right) == pytest.approx(MARKER.turn, abs=5e-3)
 
 
-def test_marker_s_state_is_the_block_s_and_back() -> None:
+def test_the_state_of_the_marker_is_converted_to_the_block_and_back() -> None:
     state = np.random.default_rng(0).standard_normal((20, 6))
     np.testing.assert_allclose(MARKER.state_of_block(MARKER.measured(state)), state, atol=1e-12)
     # the marker moves like a point of the block

@@ -46,7 +46,7 @@ def row(study: PaperStudy, what: str) -> Row:
     return found
 
 
-def test_the_command_leaves_a_report_its_table_and_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_a_report_a_table_and_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "report"
     command = [
         sys.executable,
@@ -172,7 +172,7 @@ def test_another_stiffness_gives_other_verdicts(study: PaperStudy) -> None:
     assert after["clockwise: largest force, at b"].difference > 0.2
 
 
-def test_sets_from_the_events_are_the_solver_s_own(study: PaperStudy) -> None:
+def test_contact_sets_from_the_events_agree_with_the_solver(study: PaperStudy) -> None:
     for sense in ("ccw", "cw"):
         timeline = paper_sets.holds(study.runs.scene, study.runs.case, sense)
         assert (timeline[0].start_s, timeline[-1].end_s) == (0.0, 60.0)
@@ -192,7 +192,7 @@ def test_published_forces_are_those_of_the_calibration_s_targets() -> None:
     assert ours == {target["statistic"]: target["value"] for target in targets if "value" in target}
 
 
-def test_a_set_counts_from_five_milliseconds_on() -> None:
+def test_a_contact_set_counts_if_it_lasts_five_milliseconds() -> None:
     timeline = [Hold(0.0, 1.0, ""), Hold(1.0, 1.004, "a"), Hold(1.004, 1.010, "ab"), Hold(1.010, 1.014, "a")]
     figures = paper_sets.figures(timeline)
     # two times of 4 ms do not count as one time of 5 ms
@@ -218,7 +218,7 @@ def test_trends_rise_and_fall_by_the_stated_rule(values: list[float], up: bool, 
     assert (rises(np.array(values)), rises_then_falls(np.array(values))) == (up, up_and_down)
 
 
-def test_a_failed_run_is_no_verdict(study: PaperStudy) -> None:
+def test_a_failed_run_gives_no_verdict(study: PaperStudy) -> None:
     forces = study.runs.vertical.largest_n.copy()
     forces[10] = np.nan
     table = rows(replace(study.runs, vertical=Sweep(study.runs.vertical.clearance_m, forces)))
@@ -227,7 +227,7 @@ def test_a_failed_run_is_no_verdict(study: PaperStudy) -> None:
     assert all(entry.verdict is not Verdict.NOT_COMPUTED for entry in table if not entry.group.startswith("Vertical"))
 
 
-def test_a_run_that_fails_leaves_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_run_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     def failing(scene: Scene, t_end: float, output_dt: float) -> Result:
         if (scene.clearance.horizontal_m, scene.clearance.vertical_m) == (0.020, 0.030):
             raise SolverError("at t = 1 s: for this test")

@@ -36,7 +36,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return run.folder, folder / "monday.html"
 
 
-def test_its_tables_are_those_of_the_run(made: tuple[Path, Path]) -> None:
+def test_the_tables_of_the_page_agree_with_the_run(made: tuple[Path, Path]) -> None:
     run, page = made
     text = page.read_text(encoding="utf-8")
     rows = dict(re.findall(r"<tr><td>(\w+)</td>((?:<td>[^<]*</td>)+)</tr>", text))
@@ -52,7 +52,7 @@ def test_its_tables_are_those_of_the_run(made: tuple[Path, Path]) -> None:
 
 
 @pytest.mark.skipif(browser.CHROMIUM is None, reason="no Chromium is installed")
-def test_a_browser_draws_it_without_a_request_or_an_error(made: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_browser_draws_the_page_without_requests_or_errors(made: tuple[Path, Path], tmp_path: Path) -> None:
     with browser.page(tmp_path, made[1].as_uri()) as page:
         assert page.evaluate("document.querySelectorAll('#plots canvas').length") == 3
         assert page.evaluate("document.images[0].naturalWidth") > 1000

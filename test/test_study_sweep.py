@@ -102,7 +102,7 @@ def test_parameters_are_set_and_refused_by_path() -> None:
         with_parameters(scene, {"contact.stiffness": -1.0})
 
 
-def test_a_killed_sweep_goes_on_where_it_was(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_killed_sweep_continues(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["study", "sweep", "paper", *GRID, "--statistic", "max.ccw.a", "--statistic", "events"]
     arguments += ["--t-end", "40", "--chunk", "2", "--out"]
     killed, whole = tmp_path / "killed", tmp_path / "whole"
@@ -128,7 +128,7 @@ def test_a_killed_sweep_goes_on_where_it_was(tmp_path: Path, capsys: pytest.Capt
     assert "15 already stored, 0 to compute" in capsys.readouterr().err
 
 
-def test_failed_members_are_listed_and_other_questions_refused(
+def test_failed_members_are_listed_and_invalid_arguments_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("plow_twin.study.cluster.CONNECT_TIMEOUT_S", 0.5)
@@ -185,7 +185,7 @@ def test_a_missing_library_is_named_before_the_work(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_dask_worker_killed_in_the_middle_loses_nothing(tmp_path: Path) -> None:
+def test_killing_a_dask_worker_loses_no_result(tmp_path: Path) -> None:
     from distributed import LocalCluster
 
     sweep = sweep_of(GRID[1], GRID[3], t_end=40.0)

@@ -79,7 +79,7 @@ async def _soon(reached: Callable[[], Any]) -> None:
         await asyncio.sleep(0.05)
 
 
-def test_opcua_clients_read_a_typed_model_and_acknowledge_alarms_where_that_is_allowed(tmp_path: Path) -> None:
+def test_opcua_clients_read_a_typed_model_and_may_acknowledge_alarms(tmp_path: Path) -> None:
     path, run, url = _csv(tmp_path / "load.csv", 1500), tmp_path / "run", f"opc.tcp://127.0.0.1:{_free_port()}"
     arguments = (str(path), "--follow", "--opcua", url, "--out-rate", "5", "--set", "alarm_force=[20e3,1e9]", *STALE)
 
@@ -133,7 +133,7 @@ async def _is_good(node: Any) -> bool:
     return bool(found.StatusCode.is_good())
 
 
-def test_an_opcua_server_for_other_machines_encrypts_and_admits_whom_it_trusts(tmp_path: Path) -> None:
+def test_an_opcua_server_for_other_machines_encrypts_and_admits_trusted_clients(tmp_path: Path) -> None:
     for name in ("server", "client", "other"):
         _certificate(tmp_path, name)
     (tmp_path / "trusted").mkdir()
@@ -202,7 +202,7 @@ class Database(BaseHTTPRequestHandler):
         """Log nothing."""
 
 
-def test_influxdb_gets_lines_also_from_the_time_while_it_was_down(tmp_path: Path) -> None:
+def test_influxdb_receives_the_lines_of_its_downtime(tmp_path: Path) -> None:
     path = _csv(tmp_path / "load.csv", 500)
     (tmp_path / "token").write_text("a-token\n")
     (tmp_path / "out.yaml").write_text("influx: {token_file: token}\n")
@@ -255,7 +255,9 @@ def _answer(listening: socket.socket, answer: bytes) -> None:
         time.sleep(1.0)
 
 
-def test_an_ipv6_address_keeps_its_brackets_and_a_bad_token_is_refused_unseen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_ipv6_address_keeps_its_brackets_and_a_bad_token_is_refused_without_printing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setenv("PLOW_TWIN_INFLUX_TOKEN", "a-token")
     assert influx_out("http://[::1]:8086/mine/face", Credentials(), plain=False).first["url"] == "http://[::1]:8086"
     served = opcua_out("opc.tcp://[::1]:4841", Credentials(), plain=False, acknowledges=False)

@@ -18,7 +18,7 @@ MS = 1_000_000
 RELIABLE_INPUT = {"qos_overrides.{ns}/excitation.subscription.reliability": "reliable"}
 
 
-def test_a_process_beside_a_node_sends_its_results_and_ends_with_them(tmp_path: Path) -> None:
+def test_the_telemetry_of_a_node_sends_its_results_and_ends_cleanly(tmp_path: Path) -> None:
     port = _free_port()
     parameters = {"alarm_force": "[1.0, 1e9]", "excitation_timeout": 60.0, **RELIABLE_INPUT}
     with _open_broker(tmp_path, port), bench(tmp_path, **parameters) as running:
@@ -46,7 +46,7 @@ def test_a_process_beside_a_node_sends_its_results_and_ends_with_them(tmp_path: 
             heard.close()
 
 
-def test_a_node_that_is_not_there_is_named(tmp_path: Path) -> None:
+def test_a_missing_node_is_named(tmp_path: Path) -> None:
     words = ["telemetry", "--namespace", f"/none_{os.getpid()}", "--wait", "0.5"]
     for more, code, said in (
         (["--mqtt-out", f"mqtt://127.0.0.1:{_free_port()}/face"], 2, "a running node within 0.5 s"),

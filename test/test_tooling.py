@@ -82,7 +82,7 @@ def test_that_hangs():
 """
 
 
-def test_a_test_that_hangs_is_named_and_ends_the_run(tmp_path: Path) -> None:
+def test_a_hanging_test_is_named_and_ends_the_run(tmp_path: Path) -> None:
     (tmp_path / "test_hanging.py").write_text(HANGING)
     options = f"-n 1 -p no:cacheprovider -c {ROOT}/pyproject.toml --rootdir={tmp_path} {tmp_path}"
     options += " -o faulthandler_timeout=1"
@@ -125,7 +125,7 @@ def test_the_processes_of_a_suite_compile_a_kernel_once(tmp_path: Path) -> None:
     assert re.search(r" 1 times  doubling\.double", done.stdout), done.stdout
 
 
-def test_the_files_that_come_first_exist() -> None:
+def test_the_test_files_that_run_first_exist() -> None:
     names = [line for line in (ROOT / "test" / "first.txt").read_text().splitlines() if not line.startswith("#")]
     assert names and all((ROOT / "test" / name).is_file() for name in names)
 
@@ -145,7 +145,7 @@ def test_ci_is_bounded_and_runs_every_check() -> None:
     )
 
 
-def test_a_screenshot_leaves_the_settings_of_the_user_s_viewer_alone(
+def test_a_screenshot_does_not_change_the_settings_of_the_user_s_viewer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "tools"))

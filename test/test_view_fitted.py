@@ -28,7 +28,7 @@ def picture() -> FittedPicture:
     return estimate_picture(result, prior, truth.poses, labels, "Estimate of a truth")
 
 
-def test_the_fitted_motion_leaves_the_sensor_s_noise_alone(picture: FittedPicture) -> None:
+def test_the_residuals_of_the_fitted_motion_are_the_sensor_s_noise(picture: FittedPicture) -> None:
     assert picture.noise is not None
     residual = picture.motion.residual
     assert np.isfinite(residual).mean() > 0.5
@@ -37,7 +37,7 @@ def test_the_fitted_motion_leaves_the_sensor_s_noise_alone(picture: FittedPictur
     assert (np.nanstd(picture.motion.measured, axis=0) > 3.0 * np.array(picture.noise)).all()
 
 
-def test_each_value_stands_with_its_interval_in_that_of_the_prior(picture: FittedPicture) -> None:
+def test_each_value_is_drawn_with_its_interval_relative_to_the_prior(picture: FittedPicture) -> None:
     values = {value.label: value for value in picture.values}
     horizontal = values["horizontal clearance [mm]"]
     assert horizontal.prior is not None and horizontal.note == "estimated"
@@ -48,7 +48,7 @@ def test_each_value_stands_with_its_interval_in_that_of_the_prior(picture: Fitte
     assert FittedValue("", (-1.5, -2.0, -1.0), None, ".1f").text == "−1.5 (−2.0 to −1.0)"
 
 
-def test_its_picture_has_words_and_units_and_nothing_over_the_data(picture: FittedPicture) -> None:
+def test_the_picture_has_words_and_units_and_hides_no_data(picture: FittedPicture) -> None:
     figure = picture.figure()
     check_figure(figure)
     labels = {axis.get_ylabel() for axis in figure.axes}
@@ -56,7 +56,7 @@ def test_its_picture_has_words_and_units_and_nothing_over_the_data(picture: Fitt
     assert "model ok, sensor ok" in figure.get_suptitle()
 
 
-def test_without_a_fit_the_residuals_say_so(picture: FittedPicture) -> None:
+def test_without_a_fit_the_panel_of_residuals_has_a_note(picture: FittedPicture) -> None:
     nothing = np.full_like(picture.motion.measured, np.nan)
     figure = replace(picture, motion=Motion(picture.motion.t, picture.motion.measured, nothing)).figure()
     below = [axis for axis in figure.axes if axis.get_ylabel().startswith("residual")]
@@ -74,7 +74,7 @@ def test_a_component_that_was_not_measured_has_a_fitted_motion_without_residuals
     assert "fitted" in angle.get_legend_handles_labels()[1]
 
 
-def test_its_rerun_file_has_the_same_numbers(picture: FittedPicture, tmp_path: Path) -> None:
+def test_the_rerun_file_of_a_fit_has_the_same_numbers(picture: FittedPicture, tmp_path: Path) -> None:
     write_fit_picture(picture, tmp_path / "fit.rrd")
     rows, table = {}, ""
     for chunk in RrdReader(str(tmp_path / "fit.rrd")).stream():

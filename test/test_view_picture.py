@@ -43,7 +43,7 @@ def test_an_hour_of_load_fills_the_same_band_everywhere() -> None:
 
 
 @given(st.lists(st.integers(1, 40), min_size=1, max_size=12), st.integers(0, 2**31))
-def test_an_envelope_loses_no_extreme_and_joins_no_segments(sizes: list[int], seed: int) -> None:
+def test_an_envelope_keeps_extremes_and_gaps(sizes: list[int], seed: int) -> None:
     random = np.random.default_rng(seed)
     envelope = Envelope(2, most_rows=32, most_bins=8)
     parts = []
@@ -62,7 +62,9 @@ def test_an_envelope_loses_no_extreme_and_joins_no_segments(sizes: list[int], se
         assert len(at) == len(everything) + len(sizes) - 1
 
 
-def test_an_estimate_and_a_changed_parameter_are_marked_and_are_no_wear(tmp_path: Path, figures: list[Figure]) -> None:
+def test_estimates_and_changed_parameters_are_marked_and_not_drawn_as_wear(
+    tmp_path: Path, figures: list[Figure]
+) -> None:
     first = [paper_sample(index) for index in range(400)]
     stamp = BASE_NS + 400 * STEP_NS
     estimated = Estimated(BASE_NS, stamp - 100 * STEP_NS, 300, 30, (), (1e-3, 5e-4, 1.5e-3, 0.0, 0.0, 0.0), "{}")

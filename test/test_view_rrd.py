@@ -160,7 +160,7 @@ def test_the_cross_section_moves_with_the_head(run: Run, view: tuple[ViewSummary
 
 
 @pytest.mark.parametrize("follow", [(), ("--follow", "--wait", "0")])
-def test_a_file_without_room_on_the_disk_is_reported_and_no_half_of_it_stays(
+def test_a_full_disk_is_reported_and_leaves_no_incomplete_file(
     run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], follow: tuple[str, ...]
 ) -> None:
     out, before = tmp_path / "run.rrd", resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -237,7 +237,7 @@ def test_each_change_of_the_corners_that_carry_force_is_drawn(
     assert set_color(0b1) != set_color(0b10) != set_color(0)
 
 
-def test_a_touch_that_is_over_is_not_drawn_on_in_a_thinned_run(tmp_path: Path) -> None:
+def test_a_touch_ends_at_the_right_time_in_a_thinned_run(tmp_path: Path) -> None:
     stream = rr.RecordingStream("test")
     stream.save(tmp_path / "sets.rrd")
     sets = ContactSets(stream, TimeAxis(), ("a", "b", "c", "d"), span_ns=40)
@@ -275,7 +275,7 @@ def test_finished_pieces_are_not_redrawn(tmp_path: Path) -> None:
     assert 0 in drawn[1:] and drawn[0] and drawn[-1]
 
 
-def test_an_arrow_pushes_the_wall_off_its_corner() -> None:
+def test_an_arrow_has_the_direction_of_the_force_on_the_head() -> None:
     section = Section.of(load_scene(scene_path("paper")))
     force = np.zeros(8)
     force[2] = 1e5  # at the top right corner, the top wall pushes the head up, which is -y on the screen
@@ -337,12 +337,12 @@ def test_a_long_run_is_thinned_without_losing_a_peak(run: Run, tmp_path: Path) -
     assert thin.section_rows < COUNT // 10
 
 
-def test_places_of_extremes_are_kept_in_order() -> None:
+def test_places_of_extremes_are_in_order() -> None:
     spans, values = np.array([0, 0, 0, 1, 1, 2]), np.array([1.0, 5.0, -2.0, 3.0, 3.0, 7.0])
     assert np.flatnonzero(extremes(spans, values[:, None])).tolist() == [1, 2, 3, 5]
 
 
-def test_gaps_are_drawn_as_wide_as_asked_with_their_wear() -> None:
+def test_gaps_are_drawn_with_the_requested_factor_and_the_wear() -> None:
     section = Section.of(load_scene(scene_path("paper")))
     gaps = np.array([-0.01, -0.02, -0.01, -0.03, -0.005, -0.03, -0.005, 0.001])
     walls, touching = section.exaggerated(gaps, 2.0)
@@ -360,7 +360,7 @@ def test_gaps_are_drawn_as_wide_as_asked_with_their_wear() -> None:
     assert touching.tolist() == [False, False, False, True]
 
 
-def test_wear_depths_are_written_inside_the_frame_in_rows_apart() -> None:
+def test_wear_depths_are_printed_inside_the_frame_without_overlap() -> None:
     section = Section.of(load_scene(scene_path("paper")))
     places = section.pads(np.full(8, 1e-3))[2]
     assert (np.abs(places) < [0.3 * section.frame[0], 0.4 * section.frame[1]]).all()
@@ -402,14 +402,14 @@ def test_progress_runs_from_the_first_record_to_the_whole(run: Run, tmp_path: Pa
     assert len(shares) > 1 and shares == sorted(shares) and shares[-1] == 1.0
 
 
-def test_a_place_that_cannot_be_written_is_named(run: Run, tmp_path: Path) -> None:
+def test_an_unwritable_path_is_named(run: Run, tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("")
     with pytest.raises(RecordingError, match="cannot be written"):
         to_rrd(run.file, blocked / "run.rrd")
 
 
-def test_the_lane_of_contact_sets_has_room_in_a_low_window() -> None:
+def test_contact_sets_are_visible_in_a_low_window() -> None:
     blueprint = layout.blueprint(Section.of(load_scene(scene_path("paper"))), 3.0)
     curves = blueprint.root_container.contents[1]
     names = [getattr(part, "name", None) for part in curves.contents]
@@ -419,7 +419,7 @@ def test_the_lane_of_contact_sets_has_room_in_a_low_window() -> None:
     assert share * 555.0 > 87.0
 
 
-def test_the_legends_of_the_clearance_are_not_cut_in_a_low_window(
+def test_the_legends_of_the_clearance_are_complete_in_a_low_window(
     view: tuple[ViewSummary, dict[str, pa.Table]],
 ) -> None:
     curves = layout.blueprint(Section.of(load_scene(scene_path("paper"))), 3.0).root_container.contents[1]
@@ -436,7 +436,7 @@ def test_the_legends_of_the_clearance_are_not_cut_in_a_low_window(
         assert names >= {"horizontal", "vertical"} and 23 * len(names) + 2 < 0.77 * height
 
 
-def test_no_line_is_drawn_over_a_part_that_is_not_there(
+def test_no_line_is_drawn_over_a_missing_part(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first, second = map(paper_sample, range(100)), (paper_sample(index) for index in range(100, 3000))
