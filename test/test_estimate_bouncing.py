@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -234,10 +235,16 @@ def test_a_clearance_at_its_bound_is_not_observable() -> None:
     rng = np.random.default_rng(1)
     poses = Poses.of(np.arange(100) * 0.01, 1e-3 * rng.standard_normal((100, 3)))[0]
     found = np.zeros(3), np.zeros(3), (-12.0, 1.0), (0.0, 1.0), np.ones(3), 1.0, 1.0, 0.0, -np.inf
+    two = np.full(2, 0.02)
     bounced = Bounced(np.array([-2e-3, 0.02]), np.full(2, 5e-5), *found)
     result = summarise_bounced(Unknowns(preset("paper")), poses, bounced, 0, 0)
     assert result.horizontal_state is State.NOT_OBSERVABLE and result.vertical_state is State.ESTIMATED
     assert result.horizontal.p95 - result.horizontal.p05 > 0.02
+    contact = np.ones((4, 8))
+    contact[:, [4, 6]] = 0.0  # the head never touches the bottom
+    first = Mock(point=Mock(contact=contact))
+    result = summarise_bounced(Unknowns(preset("paper")), poses, replace(bounced, clearance=two), 0, 0, first)
+    assert result.horizontal_state is State.ESTIMATED and result.vertical_state is State.NOT_OBSERVABLE
 
 
 def test_the_most_likely_clearances_are_found_from_few_drawn_motions() -> None:

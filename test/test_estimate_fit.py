@@ -16,7 +16,7 @@ from plow_twin.estimate.fit import fit, link_weights, unmoved_span
 from plow_twin.estimate.forward import Forward, Start
 from plow_twin.estimate.result import Interval, State
 from plow_twin.estimate.summary import summarise
-from plow_twin.estimate.unknowns import GAIN, GX, LEAST_CLEARANCE, MOVING, SIZE, SOFTNESS, Unknowns
+from plow_twin.estimate.unknowns import BIAS, GAIN, GX, LEAST_CLEARANCE, MOVING, SIZE, SOFTNESS, Unknowns
 from plow_twin.estimate.verdict import Verdict
 from plow_twin.kernel.low_pass import lagged
 from plow_twin.model.scene import Scene
@@ -94,6 +94,29 @@ def test_a_clearance_at_its_bound_is_not_observable() -> None:
         result = summarise(problem, one, Verdict(broken=True), 0)
         assert result.horizontal_state is state and result.vertical_state is State.ESTIMATED
     assert result.horizontal.p95 - result.horizontal.p05 > 5e-3
+
+
+def test_a_wall_that_is_not_touched_is_behind_the_range_of_motion_minus_the_penetrations() -> None:
+    truth = draw(replace(GROUPS["plain"], periods=3.0), 2)
+    unknowns = Unknowns(truth.nominal)
+    problem, found = search.candidate(
+        Forward(truth.nominal, truth.load), unknowns, truth.poses, truth.load.period()
+    ) or (None, None)
+    assert problem is not None and found is not None
+    contact, turn = found.point.contact.copy(), np.array([0.0, 0.0, 0.1])
+    contact[:, [1, 7]] = 0.0
+    ends = []
+    for bias in (0.0 * turn, turn):  # an angle of the sensor makes the range of motion larger
+        window, shared = problem.window, found.shared.copy()
+        shared[BIAS] += bias
+        problem.window = replace(window, poses=window.poses.moved(bias))
+        point = replace(found.point, contact=contact, shared=shared)
+        result = summarise(problem, replace(found, point=point), Verdict(broken=True), 0)
+        problem.window = window
+        assert result.horizontal_state is State.NOT_OBSERVABLE
+        ends.append(result.horizontal.p05)
+    assert ends[0] == pytest.approx(ends[1], abs=1e-4)
+    assert 0.016 < ends[0] < truth.clearance[0], "the prior's interval begins at 0.012"
 
 
 def test_a_change_without_effect_on_the_motion_has_no_derivative() -> None:

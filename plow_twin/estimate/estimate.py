@@ -294,14 +294,14 @@ def _searched(
             bounced = compare(forward, unknowns, poses.moved(-first.shared[BIAS]), period, first.shared)
             bounced = bounced and replace(bounced, bias=bounced.bias + first.shared[BIAS])
     if bounced is not None and (first is None or bounced.ln_penetration[0] < math.log(tuning.FITTED)):
-        return summarise_bounced(unknowns, poses, bounced, lost, forward.work), ()
+        return summarise_bounced(unknowns, poses, bounced, lost, forward.work, first), ()
     if first is None:
         return under_uncertain_load(without_fit(unknowns, poses, lost), unknowns, forward.load, poses, period), ()
     start = first.shared if bounced is None else _from_bounced(unknowns, first.shared, bounced)
     spent, forward = forward.work, forward.renewed() if bounced else forward
     found = refine(forward, unknowns, poses, period, start, first.noise, drift, close=bounced is not None)
     if bounced is not None and (found is None or not found[1].finished):
-        return summarise_bounced(unknowns, poses, bounced, lost, spent + forward.work), ()
+        return summarise_bounced(unknowns, poses, bounced, lost, spent + forward.work, first), ()
     if found is None:
         return under_uncertain_load(without_fit(unknowns, poses, lost), unknowns, forward.load, poses, period), ()
     verdict, plain = judge(*found, period), found

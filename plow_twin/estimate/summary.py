@@ -19,7 +19,7 @@ from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.pads import by_group, of_differences
 from plow_twin.estimate.priors import UNSTATED
 from plow_twin.estimate.result import NORMAL_P95, Estimate, ForcesUsed, Interval, Motion, State
-from plow_twin.estimate.start import range_of_motion
+from plow_twin.estimate.start import range_of_motion, reaches
 from plow_twin.estimate.unknowns import (
     BIAS,
     DAMPING,
@@ -75,15 +75,14 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     if not finished and not suspect:
         gain = f"the cost would still fall by {fit.gain_left:.0f}, expected at most {tuning.OUTLYING**2:g}"
         reasons = [f"the fit has not reached an optimum: {gain}"]
-    # the range of motion can exceed the clearance by the penetrations
-    given = tuning.GIVEN * float(np.exp(shared[SOFTNESS] + NORMAL_P95 * min(deviation[SOFTNESS], 1.0)))
-    least = range_of_motion(unknowns.scene, poses)[0] - given
+    least = _least(unknowns, poses, fit, float(shared[SOFTNESS]), float(deviation[SOFTNESS]))
+    seconds = _touched(fit)
     share = predicted(fit).sum(axis=0) / np.maximum(np.isfinite(fit.point.residual).sum(axis=0), 1)
     # the equations of motion couple the components: a measured component tests both clearances
     share = np.where(poses.measured, share, share[poses.measured].min())
     apparent, clearances, states = [], [], []
     untested: dict[int, Interval] = {}
-    for index, sides in ((GX, ("left", "right")), (GY, ("top", "bottom"))):
+    for index in (GX, GY):
         # only a predicted motion tests a clearance; hard contacts are exempt, because their bounces are unpredictable
         tested = share[index] > tuning.PREDICTED or unknowns.penetration_of(float(shared[SOFTNESS])) < tuning.HARD
         if not tested and finished and not suspect:
@@ -91,8 +90,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
                 f"{'horizontal' if index == GX else 'vertical'} clearance not observable: {share[index]:.0%} of "
                 f"{COMPONENTS[index]} is predicted, expected {tuning.PREDICTED:.0%} or more"
             )
-        touched = min(float(fit.point.contact[:, _SIDES[side]].sum()) for side in sides)
-        observed = tested and touched > tuning.TOUCHED and shared[index] > LEAST_CLEARANCE
+        observed = tested and seconds[index] > tuning.TOUCHED and shared[index] > LEAST_CLEARANCE
         observed &= deviation[index] < (2.0 * tuning.OBSERVED if rough else tuning.OBSERVED) and (finished or rough)
         apparent.append(Interval.normal(shared[index], deviation[index]))
         value = Interval.of_halves(published[index], *spread[:, index])
@@ -244,6 +242,28 @@ def _scatter(problem: Problem, fit: Fit, variance: Array) -> float:
     return freed(swings, len(moving)) * float((scattered / variance)[moving].mean())
 
 
+def _touched(fit: Fit) -> Array:
+    """Return the time in s in contact with the less touched of two opposite walls, horizontal and vertical."""
+    left, right, top, bottom = (fit.point.contact[:, pads].sum() for pads in _SIDES.values())
+    return np.array([min(left, right), min(top, bottom)])
+
+
+def _least(unknowns: Unknowns, poses: Poses, fit: Fit, softness: float, deviation: float) -> Array:
+    """Return lower bounds on the clearances in m, shape (2,): the range of motion minus the penetrations of both walls.
+
+    The penetration of a wall that the head does not touch is at most that of the opposite wall. Before an optimum, the
+    penetrations of the fit mean nothing.
+    """
+    wider = math.exp(NORMAL_P95 * min(deviation, 1.0))
+    if fit.finished:
+        deepest = np.nanmax(reaches(unknowns.scene, fit.point.predicted), axis=0).reshape(2, 2).max(axis=1)
+        given = 2.0 * wider * np.maximum(deepest - 0.5 * fit.shared[[GX, GY]], 0.0)
+    else:
+        given = np.full(2, tuning.GIVEN * wider * math.exp(softness))
+    least: Array = range_of_motion(unknowns.scene, poses.moved(-fit.shared[BIAS]))[0] - given
+    return least
+
+
 def _unseen(fit: Fit) -> Array:
     """Return the standard deviation of clearances in m, shape (2,), due to rotations of walls with an untouched pad.
 
@@ -326,9 +346,15 @@ def state_of(withdrawn: bool, observed: bool, rough: bool = False) -> State:
     return known if observed else State.NOT_OBSERVABLE
 
 
-def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: int, work: int) -> Estimate:
-    """Return the estimate for a hard contact. It was found by comparing simulated motions with the measured motion."""
-    sensor = judge_sensor(poses)
+def summarise_bounced(
+    unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: int, work: int, first: Fit | None = None
+) -> Estimate:
+    """Return the estimate for a hard contact. It was found by comparing simulated motions with the measured motion.
+
+    All simulated motions touch all walls. If the motion of the fit `first` does not touch a wall, the clearance is not
+    observable.
+    """
+    sensor, touched = judge_sensor(poses), np.ones(2) if first is None else _touched(first)
     found = (
         ("motion", bounced.distance, tuning.MOST_DISTANCE),
         ("path over the load's period", bounced.path, tuning.MOST_PATH),
@@ -355,6 +381,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         lowest = math.hypot(value.mean - value.p05, _HALF_NORMAL_P95 * bounced.rounded[index])
         value = replace(value, p05=value.mean - lowest)
         observed = deviation < 2.0 * tuning.OBSERVED and bounced.clearance[index] > LEAST_CLEARANCE
+        observed &= bool(touched[index] > 0.0)
         if not observed:
             value = _unobserved(unknowns, np.zeros(2), index, 0.0, bounced.noise)
         clearances.append(value.above(0.0))
