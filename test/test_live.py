@@ -789,6 +789,7 @@ print(os.sched_getaffinity(0) == {one})
         (["twice.csv"], 1, "column 'fx' occurs more than once"),
         (["load.csv", "--map", "twice.yaml"], 2, "the key twice, in lines 1 and 2"),
         (["junk.csv"], 1, "\\x1b"),
+        (["wide.csv"], 2, "10001 columns, expected at most 10000"),
         (["mqtt://localhost:1"], 1, "expected a mapping that assigns the topics"),
     ],
 )
@@ -803,6 +804,7 @@ def test_a_wrong_call_is_refused_with_the_expected_call(
     monkeypatch.chdir(tmp_path)
     _csv(tmp_path / "load.csv", 3)
     (tmp_path / "other.csv").write_text("t,a,b\n1,2,3\n")
+    (tmp_path / "wide.csv").write_text("t" + ",c" * 10_000 + "\n")
     (tmp_path / "twice.csv").write_text("t,fx,fx,fy,m\n1,2,3,4,5\n")
     (tmp_path / "twice.yaml").write_text("excitation: {topic: load}\nexcitation: {topic: other}\n")
     (tmp_path / "junk.csv").write_bytes(b"\x1b[31m" + bytes(range(256)) * 100)

@@ -15,6 +15,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Final
 
+from plow_twin.errors import ExcessError
 from plow_twin.live.bridge.source import BATCH, Bridge, BridgeError, Lines, Messages, Rows
 from plow_twin.live.bridge.table import Table
 from plow_twin.record.merging import StampOf, merged
@@ -63,10 +64,12 @@ class _Tail:
                     if grows and not line.endswith(b"\n") and len(line) < _BLOCK:
                         break
                     if len(line) == _BLOCK:
-                        raise csv.Error(f"got a first line of more than {_BLOCK} bytes, expected a header")
+                        found = f"a first line of more than {_BLOCK} bytes"
+                        raise ExcessError(f"{self.path}: got {found}, expected a header")
                     rows.read(line)
                     if len(rows.columns or ()) > MOST_COLUMNS:
-                        raise csv.Error(f"got {len(rows.columns or ())} columns, expected at most {MOST_COLUMNS}")
+                        found = f"{len(rows.columns or ())} columns"
+                        raise ExcessError(f"{self.path}: got {found}, expected at most {MOST_COLUMNS}")
         except FileNotFoundError:
             return None
         return rows.columns
