@@ -179,6 +179,7 @@ def test_a_request_during_a_cleanup_is_answered_and_the_node_continues(tmp_path:
 def test_all_bad_parameters_are_named_at_once(tmp_path: Path) -> None:
     given = ["excitation_source:=drum", "tolerance:=.nan", "jump_back:=-3", "input_depth:=5.5", "autostart:=1"]
     given += [r'frame_id:="a\x1b[2J"', f"child_frame_id:={'h' * 5000}"]
+    given += [f"alarm_wear_rate:=[{', '.join(['-1.0'] * 10_000)}]"]  # not a problem for each of its items
     settings = [word for item in given for word in ("-p", item)]
     twin = Process("plow_twin.ros.main", ["--ros-args", *settings], tmp_path / "twin.log")
     assert twin.wait() == 2
@@ -192,6 +193,7 @@ def test_all_bad_parameters_are_named_at_once(tmp_path: Path) -> None:
         ("autostart", "1"),
         ("frame_id", r"'a\x1b[2J'"),
         ("child_frame_id", "'hhh"),
+        ("alarm_wear_rate", "[-1.0, -1.0"),
     ):
         assert f"{name}: got {got}" in said
     assert said.count("expected one line of at most 4096 characters") == 2 and len(said) < 4000

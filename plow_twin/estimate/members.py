@@ -32,6 +32,7 @@ from plow_twin.model.scene import DOF_NAMES, Clearance, Friction, Gravity, Scene
 from plow_twin.run.batch import TwinBatch
 from plow_twin.run.twin import Twin
 from plow_twin.solve.state import ADVANCE, FOLLOWED, WITH_INTERVALS
+from plow_twin.stream.driven import MOST_STEPS
 from plow_twin.stream.outputs import clearances
 
 Array = NDArray[np.float64]
@@ -97,8 +98,8 @@ class Ensemble:
             self.moved_before = np.where([[state.known] for state in states], widening(scene, worn)[:, None], 0.0)
             scenes = [_worn(one, scene, worn, self.moved_before[:, 0]) for one in scenes]
         #: the first member, which is advanced alone so that its forces are available first
-        self.first = Twin(scenes[0], tol=tol, excitation="sampled", start=start)
-        self.others = TwinBatch(scenes[1:], tol=tol, start=start) if members > 1 else None
+        self.first = Twin(scenes[0], tol=tol, excitation="sampled", start=start, max_steps=MOST_STEPS)
+        self.others = TwinBatch(scenes[1:], tol=tol, start=start, max_steps=MOST_STEPS) if members > 1 else None
         self._scene, self._gain, self._rng, self._speed = scene, gain, rng, 0.0
         self._numbers = numbers_of(scenes, gain, draw_biases(known, members, rng))
         # index of the next member that adopts learned parameters, and number of members that are due

@@ -245,6 +245,8 @@ SPECS: Final[Mapping[str, Field[Any]]] = {spec.name: spec for spec in fields(Set
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 #: Largest length of a text [characters]. A path on Linux has the same limit.
 _LONGEST: Final = 4096
+#: Number of items of a list that are checked. The lists of parameters are shorter.
+_MOST_ITEMS: Final = 20
 #: Pattern of a line without control characters, which could change the state of a terminal.
 _ONE_LINE: Final = r"^[^\x00-\x1f\x7f-\x9f]*\Z"
 _FOREIGN: Final = ("use_sim_time", "start_type_description_service")
@@ -293,9 +295,14 @@ def problems(values: Mapping[str, Any]) -> list[Problem]:
     """Return the problems of parameter values. Unknown names are ignored."""
     from plow_twin.scene_file.validation import validate
 
-    known = {name: coerce(name, value) for name, value in values.items() if name in SPECS}
+    known = {name: _bounded(coerce(name, value)) for name, value in values.items() if name in SPECS}
     found = validate(known, schema(), "parameters")
     return [Problem(problem.key, values.get(problem.key, problem.got), problem.expected) for problem in found]
+
+
+def _bounded(value: Any) -> Any:
+    """Return a list without the items that no parameter has, because the check of each of them takes time."""
+    return value[:_MOST_ITEMS] if isinstance(value, Sequence) and not isinstance(value, str) else value
 
 
 @cache

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 from plow_twin.errors import PlowTwinError
 from plow_twin.live.parameters import Settings
@@ -16,7 +16,7 @@ from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream import outputs
-from plow_twin.stream.driven import Driven
+from plow_twin.stream.driven import MOST_STEPS, Driven
 
 #: Interval between checks for a requested stop [s].
 _LOOK_S: Final = 0.05
@@ -85,7 +85,8 @@ def _prepare(settings: Settings, warm_up: Callable[[], None]) -> Prepared:
         twin = follower(scene, settings.follows, settings.follow_members, settings.tolerance)
     else:
         bound = settings.max_evaluations or None
-        twin = Twin(scene, tol=settings.tolerance, excitation="scene" if own else "sampled", max_evaluations=bound)
+        excitation: Literal["scene", "sampled"] = "scene" if own else "sampled"
+        twin = Twin(scene, tol=settings.tolerance, excitation=excitation, max_evaluations=bound, max_steps=MOST_STEPS)
     compile_s = twin.warm_up()
     outputs.warm_up()
     warm_up()

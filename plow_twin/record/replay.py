@@ -52,7 +52,7 @@ from plow_twin.record.unused import InputCounts
 from plow_twin.run.twin import Twin
 from plow_twin.solve.state import ROW
 from plow_twin.stream import journal
-from plow_twin.stream.driven import Driven
+from plow_twin.stream.driven import MOST_STEPS, Driven
 from plow_twin.stream.outputs import NONE, NOTHING, Published
 from plow_twin.stream.session import Applied, Session
 from plow_twin.stream.topics import TOPICS
@@ -139,7 +139,7 @@ class _Replay:
         twin: Driven = (
             following_twin(header, scene)
             if self.follows
-            else Twin(scene, tol=header.tol, excitation=excitation, max_evaluations=bound)
+            else Twin(scene, tol=header.tol, excitation=excitation, max_evaluations=bound, max_steps=MOST_STEPS)
         )
         twin.warm_up()
         templates = publication_templates(header.frame_id, header.child_frame_id)
