@@ -17,8 +17,8 @@ Array = NDArray[np.float64]
 #: Largest number of measured poses that are stored for a repeated computation of the motion. It is reached after ten
 #: seconds at 1 kHz.
 MOST_MEASURED: Final = 10_000
-#: Number of steps after which an advance of a live twin fails. They take two to three seconds, in which the node answers
-#: no request. A motion with impacts needs up to 2,000 steps a second, with contacts of 1e7 to 1e18 N/m.
+#: Number of steps after which an advance of a live twin fails. They take two to three seconds, in which the node
+#: answers no request. A motion with impacts needs up to 2,000 steps a second, with contacts of 1e7 to 1e18 N/m.
 MOST_STEPS: Final = 2_000_000
 
 
