@@ -16,6 +16,7 @@ from typing import Any
 
 from asyncua import Server, ua
 from asyncua.crypto.permission_rules import User, UserRole
+from asyncua.server.history import HistoryDict
 from asyncua.server.user_managers import UserManager
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
@@ -40,6 +41,14 @@ class OneUser(UserManager):
 class Plant:
     def __init__(self, server: Server, nodes: list[Any]) -> None:
         self._server, self._nodes = server, nodes
+
+    async def forget(self) -> None:
+        """Empty the history, and set the nodes to 0."""
+        storage = HistoryDict()
+        self._server.iserver.history_manager.set_storage(storage)
+        for node in self._nodes:
+            await storage.new_historized_node(node.nodeid, None)
+            await node.write_value(0.0)
 
     async def write(self, stamp_ns: int, values: list[Any], status: str = "Good", keep: bool = True) -> None:
         time = EPOCH + timedelta(microseconds=stamp_ns // 1000)
@@ -106,9 +115,8 @@ async def serve() -> None:
         await server.nodes.objects.add_variable(ua.NodeId(name, index), name, 0.0, ua.VariantType.Double)
         for name in NODES
     ]
-    for node in nodes:
-        await server.iserver.history_manager.storage.new_historized_node(node.nodeid, None)
     plant = Plant(server, nodes)
+    await plant.forget()
     async with server:
         print("ready", flush=True)
         while line := await asyncio.to_thread(sys.stdin.readline):
