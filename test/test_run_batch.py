@@ -47,7 +47,8 @@ def in_lanes() -> dict[str, list[Scene]]:
         name: [dataclasses.replace(one, contact=dataclasses.replace(one.contact, **law)) for one in members()]
         for name, law in laws.items()
     }
-    rubbing = zip(found["d^1.5"], np.linspace(0.05, 0.5, 9), strict=True)
+    # with the kernels of `test_estimate_follow`
+    rubbing = zip(found["lambda d'"], np.linspace(0.05, 0.5, 9), strict=True)
     return found | {"friction": [dataclasses.replace(one, friction=Friction(mu, 0.02)) for one, mu in rubbing]}
 
 
