@@ -425,8 +425,8 @@ class TwinBatch:
         """Return the previous and the new samples of some twins, divided by mass and inertia, shape (k, n + 1, 3)."""
         before, masses = self._samples_before()[members, None], self._masses[members, None]
         own = samples[members] if len(samples) > 1 else np.broadcast_to(samples, (len(before), *samples.shape[1:]))
-        joined: NDArray[np.float64] = np.concatenate([before, own], axis=1) / masses
-        return joined
+        # in one layout, for which a single kernel is compiled
+        return np.ascontiguousarray(np.concatenate([before, own], axis=1) / masses)
 
     def _stop(self, begun: Sequence[Future[None]]) -> None:
         for worker in self._workers:
