@@ -16,11 +16,14 @@ from plow_twin.estimate.result import State
 @pytest.mark.parametrize(
     ("kept", "deviation", "reasons", "most"),
     [
-        pytest.param((None,) * 3, (0.0, 1.0, 0.0), ("y: stated deviation 1, expected at most 0.05",), 2e-4, id="y"),
+        pytest.param(
+            (None,) * 3, (0.0, 1.0, 0.0), ("y: stated deviation 1, expected at most 0.05",), 2e-4, id="y",
+            marks=pytest.mark.stress,
+        ),
         pytest.param((None, None, 7), (0.0,) * 3, ("theta: measured 7 times, expected at least 20",), 4e-4, id="theta"),
         pytest.param(
             (0, 0, None), (0.0,) * 3, tuple(f"{name}: measured 0 times, expected at least 20" for name in "xy"), 1e-3,
-            id="x and y",
+            id="x and y", marks=pytest.mark.stress,
         ),
     ],
 )  # fmt: skip
