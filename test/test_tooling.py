@@ -16,7 +16,7 @@ import pytest
 from hypothesis import Phase, settings
 from scenes import ROOT
 
-VERSION = re.compile(r"^([\w.-]+)>=([\d.]+)$")
+VERSION = re.compile(r"^([\w.-]+)>=([\d.]+)(,<[\d.]+)?$")
 
 
 def dry_run(target: str, *variables: str) -> str:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 #: Largest number of lines in the queue. If there are more lines, the oldest lines are dropped.
 MOST_WAITING: Final = 1000
-#: Longest wait at the end for a reader that does not read a line [s].
+#: Longest time at the end without progress of the reader [s].
 _PATIENCE_S: Final = 2.0
 _LEVELS: Final = ("OK", "WARN", "ERROR")
 

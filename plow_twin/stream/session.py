@@ -328,7 +328,7 @@ class Session:
         """
         if self._is_late(int(stamps[0])) or (stamps[1:] < stamps[:-1]).any():
             raise ValueError(
-                f"stamp: got {stamps[0]} ns first, expected stamps that do not fall, after {self.stamp_ns} ns"
+                f"stamp: got {stamps[0]} ns first, expected stamps after {self.stamp_ns} ns that do not decrease"
             )
         advance = self._advance_in_pieces if self.held or self._travels else self._advance
         found = advance(stamps, wrench, rows, taken, digest_after)

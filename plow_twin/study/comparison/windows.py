@@ -128,8 +128,8 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
     numbers = sorted(number for number, row in sums.messages.rows.items() if row[0] >= full and number not in silent)
     if not numbers:
         raise RecordingError(
-            f"{recording.path}: each window has a stretch without samples, expected some complete windows; "
-            "samples further apart than excitation_timeout are such a stretch"
+            f"{recording.path}: got a silence in each window, expected some complete windows; "
+            "a silence is an interval between samples that is longer than excitation_timeout"
         )
     return sums.windows(numbers, len(silent))
 
