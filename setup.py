@@ -6,10 +6,10 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 NAME = "plow_twin"
-# colcon runs a link to this file in another folder
+# colcon runs this file through a link in another folder
 README = Path(__file__).resolve().parent / "README.md"
 
-# ROS 2 Jazzy as wheels; where a ROS 2 is sourced the extra is not needed
+# ROS 2 Jazzy as wheels; with a sourced ROS 2, this extra is not needed
 ROS_WHEELS = '; platform_system == "Linux" and platform_machine == "x86_64"'
 
 EXTRAS = {
@@ -17,7 +17,7 @@ EXTRAS = {
         f"ros-jazzy-rclpy[fastrtps]==7.1.6{ROS_WHEELS}",
         f"ros-jazzy-common-interfaces==5.3.6{ROS_WHEELS}",
     ],
-    # Writer.flush of mcap came after 1.4; 1.6 is what the tests run with
+    # mcap 1.4 has no `Writer.flush`; the tests use 1.6
     "record": ["mcap>=1.6", "rosbags>=0.11", "lz4>=4.0.2", "zstandard>=0.22", "isal>=1.6"],
     "mqtt": ["paho-mqtt>=1.6"],
     "opcua": ["asyncua>=2.1"],
@@ -82,15 +82,15 @@ setup(
         (f"share/{NAME}/config", sorted(glob("config/*.[jrxy]*"))),
         (f"share/{NAME}/config/sros2", ["config/sros2/policy.xml"]),
         (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py"))),
-        # executables under the names of ROS; in a bin folder these would be too general
+        # `lib/plow_twin` has the executables under their ROS names, which are too general for a bin folder
         (f"lib/{NAME}", sorted(glob("scripts/*"))),
     ],
     python_requires=">=3.11,<3.13",
     install_requires=[
-        # the model and its solver use these three alone
+        # the only libraries of the model and the solver
         "numpy>=1.26",
         "scipy>=1.11",
-        # bounded, for kernel/linked.py and kernel/compiler.py use parts of numba that may change in any version
+        # bounded, because kernel/linked.py and kernel/compiler.py use internals of numba
         "numba>=0.59,<0.69",
         # scene files and the command line
         "click>=8.1",

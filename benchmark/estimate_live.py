@@ -21,7 +21,7 @@ import click
 import numpy as np
 from estimate_truths import GROUPS, Truth, draw
 
-from plow_twin.estimate.answer import Asked, answer
+from plow_twin.estimate.answer import Requests, answer
 from plow_twin.estimate.estimate import Guess, warm_up
 from plow_twin.estimate.measurements import Load
 from plow_twin.estimate.window import Windows
@@ -45,7 +45,7 @@ def shares(truth: Truth, load: Load, members: int) -> list[float]:
         if window is None or window.end_ns - window.start_ns < 0.9e9 * WINDOW_S:
             continue
         begin = time.process_time()
-        told = answer(truth.nominal, window, guess, Asked(members, INTERVAL_S))
+        told = answer(truth.nominal, window, guess, Requests(members, INTERVAL_S))
         found.append((time.process_time() - begin) / INTERVAL_S)
         guess = told.following
     return found

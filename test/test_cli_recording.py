@@ -226,7 +226,7 @@ def test_view_serves_a_page_only_on_the_loopback_address(served: str) -> None:
 @pytest.mark.skipif(browser.CHROMIUM is None, reason="no Chromium is installed")
 def test_a_browser_shows_the_run_at_the_printed_address(served: str, tmp_path: Path) -> None:
     with browser.page(tmp_path, served) as page:
-        # the cross-sections have a dark background; other pages of the viewer have not
+        # the cross-sections have a dark background; other pages of the viewer do not
         until(lambda: _dark(page.picture()) >= 0.15, f"a picture: {page.errors}, {page.requests}", pause_s=0.5)
         assert not page.errors
         # the page requests the dark theme, so almost no pixel is white, whatever the theme of the browser

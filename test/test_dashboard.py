@@ -233,7 +233,7 @@ def test_requests_without_token_from_other_pages_or_under_other_names_are_refuse
                 page.recv(timeout=10)
             assert closed.value.rcvd is not None and closed.value.rcvd.code == 4401
         with ExitStack() as opened:
-            # connections without a token take no page from those who have it
+            # connections without a token do not use up the limited number of pages
             pages = [opened.enter_context(_data(url, origin=url.rstrip("/"))) for _ in range(MOST_PAGES + 1)]
             for page in reversed(pages):
                 page.send(json.dumps({"token": TOKEN}))

@@ -27,7 +27,7 @@ from plow_twin.estimate.combined import with_bounced
 from plow_twin.estimate.estimate import estimate
 from plow_twin.estimate.forces import draw_scenes
 from plow_twin.estimate.laws import Draws, log_odds
-from plow_twin.estimate.likely import Seen, likeliest
+from plow_twin.estimate.likely import PathFeatures, likeliest
 from plow_twin.estimate.measurements import Poses
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.summary import MOST_OTHER_LAW, summarise_bounced
@@ -253,16 +253,16 @@ def test_the_most_likely_clearances_are_found_from_few_drawn_motions() -> None:
     slopes, curve, common, late = (rng.standard_normal((rows, 150)) for rows in (7, 1, 3, 1))
     scale, middle = np.array([3e-4, 3e-4, 0.3, 0.3, 0.06, 0.06, 0.06]), np.array([0.02, 0.03, -7.0, 0.0, 1.0, 1.0, 1.0])
 
-    def motions(count: int) -> tuple[np.ndarray, Seen]:
+    def motions(count: int) -> tuple[np.ndarray, PathFeatures]:
         points = rng.standard_normal((count, 7))
         like = points @ slopes + (points[:, :1] * points[:, 2:3]) @ curve + rng.standard_normal((count, 3)) @ common
         like += 2e-3 * rng.standard_normal((count, 1)) @ (200.0 * late) + rng.standard_normal(like.shape)
-        return middle + scale * points, Seen(like, np.tile(200.0 * late, (count, 1)))
+        return middle + scale * points, PathFeatures(like, np.tile(200.0 * late, (count, 1)))
 
     drawn, seen = motions(120)
     fresh, others = motions(60)
     rows = zip(others.like[:, None], others.late[:, None], strict=True)
-    told = np.array([likeliest(drawn, 0.06, seen, Seen(*row))[-1] for row in rows])
+    told = np.array([likeliest(drawn, 0.06, seen, PathFeatures(*row))[-1] for row in rows])
     off = (told - fresh[:, :2]).std(axis=0)
     of_drawn = (likeliest(drawn, 0.06, seen, motions(1)[1])[:-1] - drawn[:, :2]).std(axis=0)
     assert (off < 0.15 * scale[:2]).all()

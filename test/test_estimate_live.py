@@ -25,7 +25,7 @@ from waiting import until
 
 from plow_twin import Twin, Wear
 from plow_twin.cli.app import run as run_cli
-from plow_twin.estimate.answer import Asked
+from plow_twin.estimate.answer import Requests
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.window import Window, Windows
 from plow_twin.estimate.worker import Found, Worker, serve
@@ -183,8 +183,8 @@ def test_the_live_estimate_is_published_and_repeated_by_the_journal(tmp_path: Pa
         "estimate_forces": 20,
         "forecast_limits": "[0.04, 0.05]",
         "forecast_horizon": 3.6e7,
-        "hold_limit": 3600.0,  # an estimate may take long on a busy machine, so holding must not end
-        "estimate_window": WINDOW_S,  # an estimate may take long on a busy machine, and the hold must not end before
+        "hold_limit": 3600.0,  # an estimate may take long on a busy machine, so the hold must not end first
+        "estimate_window": WINDOW_S,
         "estimate_interval": INTERVAL_S,
         "rollback_span": WAIT_S,
     }
@@ -396,7 +396,7 @@ def test_an_estimator_is_ready_after_its_compilation(monkeypatch: pytest.MonkeyP
         raise KeyboardInterrupt
 
     monkeypatch.setattr("plow_twin.estimate.worker.warm_up", compile_all)
-    near.send((preset("paper"), Windows(10.0, 4.0, 1.0), Asked()))
+    near.send((preset("paper"), Windows(10.0, 4.0, 1.0), Requests()))
     with pytest.raises(KeyboardInterrupt):
         serve(far)
     assert len(compiled) == 1 and not near.poll()

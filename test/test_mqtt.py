@@ -374,24 +374,24 @@ def _entries(run: Path) -> list[object]:
 def test_messages_for_a_broker_are_limited_counted_and_sent_in_order(tmp_path: Path) -> None:
     port = _free_port()
     there = Message("online", b"true", True)
-    way = Broker(
+    output = Broker(
         host="127.0.0.1", port=port, client_id="out", user="", password="", tls=None, will=lambda: there,
         on_connected=lambda: [there], waiting=5,
     )  # fmt: skip
-    way.open()
+    output.open()
     for number in range(8):
-        way.send(Message("n", str(number).encode(), False))
-    until(lambda: way.state.trouble.startswith("no broker at 127.0.0.1"), way.state)
-    assert (way.state.sent, way.state.lost, way.state.connected) == (0, 3, False)
+        output.send(Message("n", str(number).encode(), False))
+    until(lambda: output.state.trouble.startswith("no broker at 127.0.0.1"), output.state)
+    assert (output.state.sent, output.state.lost, output.state.connected) == (0, 3, False)
     with _open_broker(tmp_path, port):
         subscriber = Subscriber(port)
-        until(lambda: way.state.sent == 6, way.state)
+        until(lambda: output.state.sent == 6, output.state)
         subscriber.until(lambda: len(subscriber.messages) == 6)
         assert [payload for _, payload, _ in subscriber.messages] == [b"true", b"3", b"4", b"5", b"6", b"7"]
-        assert (way.state.lost, way.state.trouble) == (3, "")
+        assert (output.state.lost, output.state.trouble) == (3, "")
         subscriber.close()
-    until(lambda: not way.state.connected)
-    asyncio.run(way.close(there, 0.0))
+    until(lambda: not output.state.connected)
+    asyncio.run(output.close(there, 0.0))
 
 
 class EdgeNode:

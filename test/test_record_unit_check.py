@@ -74,7 +74,7 @@ def test_a_swing_that_the_clearance_does_not_allow_is_in_degrees() -> None:
     reach = 0.33 * np.sin(angle) + 0.27 * np.cos(angle), 0.33 * np.cos(angle) + 0.27 * np.sin(angle)
     assert min(0.30 - reach[0], 0.355 - reach[1]) == pytest.approx(0.0, abs=1e-4)
     for swing, likely in ((0.25, []), (0.6, ["deg"]), (6.0, ["deg"])):
-        for offset in (0.0, 0.1):  # the sensor's zero may be off, which must not change the verdict
+        for offset in (0.0, 0.1):
             # an offset of the sensor's zero must not change the verdict
             theta = {("head_pose", "theta"): offset + swing * np.sin(2.0 * TIMES)}
             assert [doubt.likely for doubt in unit_doubts(theta, TIMES, SCENE)] == likely

@@ -37,7 +37,7 @@ from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.ros.connections import Connections
 from plow_twin.ros.input_loop import InputLoop, Turns
-from plow_twin.ros.input_queue import InputQueue, Taken
+from plow_twin.ros.input_queue import InputQueue, Received
 from plow_twin.ros.node import TwinNode
 from plow_twin.ros.qos import OUTPUTS, sensor_input
 from plow_twin.scene_file import load_scene
@@ -51,10 +51,10 @@ class _Flood:
         self.fd = os.eventfd(1)
         self.taken = 0
 
-    def pop(self, most: int, *, all_there_are: bool = False) -> tuple[list[Taken], bool]:
-        return [Taken(b"", 0, 0, b"")] * most, True
+    def pop(self, most: int, *, all_there_are: bool = False) -> tuple[list[Received], bool]:
+        return [Received(b"", 0, 0, b"")] * most, True
 
-    def receive(self, topic: str, batch: list[Taken]) -> None:
+    def receive(self, topic: str, batch: list[Received]) -> None:
         self.taken += len(batch)
 
     def close(self) -> None:
@@ -227,7 +227,7 @@ def test_a_pose_and_its_negative_quaternion_give_the_same_residual() -> None:
             message.pose.orientation.z, message.pose.orientation.w = sign * math.sin(5e-3), sign * math.cos(5e-3)
             front = node._front
             assert front is not None
-            taken = [Taken(b"", number, 0, serialize_message(message))]
+            taken = [Received(b"", number, 0, serialize_message(message))]
             front.subscriptions._measured_poses(taken)
             residual = node.runtime.inputs.residual(np.array([0.0, 0.0, 0.002]))
             assert residual is not None
@@ -248,12 +248,12 @@ def test_the_covariance_of_each_pose_goes_into_the_journal_and_the_estimate(tmp_
             message.pose.pose.orientation.w = 1.0
             for axis, variance in zip((0, 1, 5), variances, strict=True):
                 message.pose.covariance[7 * axis] = variance
-            taken = [Taken(b"", number, 0, serialize_message(message))]
+            taken = [Received(b"", number, 0, serialize_message(message))]
             front.subscriptions._measured_poses(taken)
         assert front.runtime.inputs.head_pose.counts[Verdict.NON_FINITE] == 2
         # a quaternion of zeros must not be read as an angle of 0
         message.pose.pose.orientation.w = 0.0
-        front.subscriptions._measured_poses([Taken(b"", 6, 0, serialize_message(message))])
+        front.subscriptions._measured_poses([Received(b"", 6, 0, serialize_message(message))])
         assert front.runtime.inputs.head_pose.counts[Verdict.MALFORMED] == 1
         list(front.runtime.step([(stamp * 1_000_000_000, (0.0, 0.0, 0.0)) for stamp in (1, 2, 3)]))
         assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
@@ -349,7 +349,7 @@ def test_loss_is_counted_by_the_publishers_numbers() -> None:
         assert node._front is not None and node.runtime is not None
         subscriptions = node._front.subscriptions
         for numbers in ((7, 8), (11,), (10,), (12,)):  # sequence number 9 never arrives, and 10 is late
-            batch = [Taken(b"one", number, 0, serialize_message(TwistStamped())) for number in numbers]
+            batch = [Received(b"one", number, 0, serialize_message(TwistStamped())) for number in numbers]
             subscriptions.receive("travel", batch)
         assert node.runtime.inputs.lost == 1
 
@@ -365,7 +365,7 @@ def test_messages_before_the_subscription_are_no_loss_at_any_time_of_discovery()
         for number in numbers:
             # sender and receiver have different clocks
             received_ns, sent_ns = begun_ns + number * period_ns, number * period_ns
-            batch = [Taken(sender, number, received_ns, serialize_message(WrenchStamped()), sent_ns)]
+            batch = [Received(sender, number, received_ns, serialize_message(WrenchStamped()), sent_ns)]
             subscriptions.receive("excitation", batch)
         return node.runtime.inputs.senders.lost
 

@@ -129,8 +129,8 @@ def test_the_linearised_equations_agree_with_displaced_motions(name: str, monkey
     """
     scene, used = _law(name), list[int]()
     paths = tuple(sensitivity_parameters(scene))
-    beside = sensitivity.columns_beside
-    monkeypatch.setattr(sensitivity, "columns_beside", lambda *given: used.append(1) or beside(*given))
+    beside = sensitivity.displaced_columns
+    monkeypatch.setattr(sensitivity, "displaced_columns", lambda *given: used.append(1) or beside(*given))
     found = sensitivity.sensitivity_of(scene, 0.5, 1e-9, paths)
     assert used
     monkeypatch.setattr(sensitivity, "fits_tangents", lambda compiled: False)

@@ -21,7 +21,7 @@ from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.solve.state import ROW
 from plow_twin.stream.journal import Digest, Entry, Hold, Loss, Reset, Sample, Snapshot, Travel
-from plow_twin.stream.outputs import CLEARANCE_NAMES, SLOW_PERIOD_NS, THE_ONE, Outputs, Published, prior_points
+from plow_twin.stream.outputs import CLEARANCE_NAMES, ONLY_ROW, SLOW_PERIOD_NS, Outputs, Published, prior_points
 from plow_twin.stream.session import DIGEST_INTERVAL, Session
 
 T0 = 1_795_000_000_123_456_789
@@ -182,7 +182,7 @@ def test_clearance_is_base_plus_mean_wear_of_each_side_with_the_priors_interval(
     rows = np.zeros(1, ROW)
     twin.advance_rows(np.zeros(1), np.zeros((1, 3)), rows)
     rows["wear_depth"] = np.arange(1.0, 9.0) * 1e-3
-    published = outputs.add(rows, np.array([T0]), THE_ONE)
+    published = outputs.add(rows, np.array([T0]), ONLY_ROW)
     named = dict(zip(CLEARANCE_NAMES, published.slow["clearance"][0], strict=True))
     # pads 1 and 7 are on the left, 3 and 5 on the right, 0 and 2 at the top, and 4 and 6 at the bottom
     assert named["horizontal"] == pytest.approx(0.025 + (2e-3 + 8e-3) / 2 + (4e-3 + 6e-3) / 2)

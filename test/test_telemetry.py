@@ -230,12 +230,12 @@ def test_points_that_a_silent_or_absurd_database_has_not_confirmed_count_as_lost
     groups = {"peaks": Group(1.0, {"top_left_top": 1.0}), "wear": Group(1.0, {"top_left_top": 1.0})}
 
     async def write(port: int) -> Any:
-        way = Influx(f"http://127.0.0.1:{port}", "mine", "face", "a-token", None)
-        await way.send(groups, Newest())
-        await way.turn()  # does not wait for the answer
+        output = Influx(f"http://127.0.0.1:{port}", "mine", "face", "a-token", None)
+        await output.send(groups, Newest())
+        await output.turn()  # does not wait for the answer
         await asyncio.sleep(0.2)
-        await way.close(0.2)
-        return way.state
+        await output.close(0.2)
+        return output.state
 
     for answer, said in (
         (b"", "no connection yet"),

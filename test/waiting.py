@@ -10,7 +10,7 @@ LONGEST_S = 200.0
 
 
 def until(reached: Callable[[], object], what: object = "", pause_s: float = 0.01) -> None:
-    """Look again and again until `reached` returns a true value; it may take the next step each time."""
+    """Call `reached` until it returns a true value."""
     give_up = time.monotonic() + LONGEST_S
     while not reached():
         assert time.monotonic() < give_up, what

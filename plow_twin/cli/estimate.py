@@ -259,7 +259,7 @@ def _check_units(source: Path, measured: Measured) -> None:
 def _repeated(source: Path) -> _Task | None:
     """Return the task to repeat the last estimate of a live node, or None if there is no estimate."""
     from plow_twin.estimate.answer import answer
-    from plow_twin.live.estimation import asked_of
+    from plow_twin.live.estimation import requests_of
     from plow_twin.live.parameters import settings
     from plow_twin.record.estimated import live_estimates
     from plow_twin.record.reader import RunReader
@@ -275,7 +275,7 @@ def _repeated(source: Path) -> _Task | None:
     losses = {name: count for name, count in losses.items() if count}
 
     def run() -> tuple[Estimate, dict[str, Any]]:
-        again = answer(scene, window, entry.guess, asked_of(settings(reader.header.parameters)))
+        again = answer(scene, window, entry.guess, requests_of(settings(reader.header.parameters)))
         same = again.text == entry.result
         live = {"estimates": len(found), "repeated": same, "start_ns": entry.start_ns, "end_ns": entry.end_ns}
         return again.estimate, {**again.also, "live": live, "losses": losses}

@@ -24,7 +24,7 @@ from plow_twin.cli.console import (
 from plow_twin.cli.dashboard import access_if_shown, access_options, dashboard_option, say_where, stay
 from plow_twin.cli.live_report import Report
 from plow_twin.cli.options import FILE, FOLDER, PLACE, POSITIVE, json_option, map_option, quiet_option, unit_option
-from plow_twin.cli.telemetry import telemetry_options, ways_of
+from plow_twin.cli.telemetry import outputs_of, telemetry_options
 
 if TYPE_CHECKING:
     from plow_twin.live.bridge.access import Access
@@ -113,13 +113,13 @@ def _live(
     from plow_twin.live.solver_start import Preparation, leave
     from plow_twin.live.stop import StopRequested
     from plow_twin.live.timer import Timer
-    from plow_twin.telemetry.live import open_way
+    from plow_twin.telemetry.live import open_output
 
     report = Report(lines=lines, quiet=quiet, stamp_ns=lambda: front.runtime.stamp_ns)
     try:
         settings = _settings(options)
         access = access_if_shown(options)
-        ways = ways_of(options)
+        outputs = outputs_of(options)
         bridge = _bridge(source, options, settings.expected_rate)
         for refused in apply_realtime(settings):
             say_error(f"plow-twin: refused by the system: {refused}")
@@ -143,8 +143,8 @@ def _live(
             if access is not None:
                 screen = opened.enter_context(open_screen(front, access, source))
                 say_where(screen, access)
-            for way in ways:
-                opened.enter_context(open_way(front, way, options["out_rate"], source))
+            for output in outputs:
+                opened.enter_context(open_output(front, output, options["out_rate"], source))
             if isinstance(bridge, Files) and bridge.ends:
                 _say_pace(settings, quiet)
                 update = opened.enter_context(progress_bar("reading", quiet or lines))

@@ -10,7 +10,7 @@ from plow_twin.cli.console import DONE, DONE_WITH_LOSS, say_error
 from plow_twin.cli.options import FILE, POSITIVE, combined, find_ros_wheels, node_options, wait_option
 
 if TYPE_CHECKING:
-    from plow_twin.telemetry.access import WayOut
+    from plow_twin.telemetry.access import OutputSpec
 
 
 #: Options for the receivers of results.
@@ -42,7 +42,7 @@ telemetry_options = combined(
 )
 
 
-def ways_of(options: dict[str, Any]) -> list[WayOut]:
+def outputs_of(options: dict[str, Any]) -> list[OutputSpec]:
     """Return the receivers that the options request."""
     if options["sparkplug"] and not options["mqtt_out"]:
         raise click.UsageError("--sparkplug: expected --mqtt-out with the broker")
@@ -51,15 +51,15 @@ def ways_of(options: dict[str, Any]) -> list[WayOut]:
     from plow_twin.telemetry import access
 
     credentials, plain = access.Credentials.read(options["out_access"]), options["plain"]
-    ways = []
+    outputs = []
     if options["mqtt_out"]:
-        ways += access.mqtt_out(options["mqtt_out"], credentials, plain=plain, sparkplug=options["sparkplug"])
+        outputs += access.mqtt_out(options["mqtt_out"], credentials, plain=plain, sparkplug=options["sparkplug"])
     if options["influx"]:
-        ways.append(access.influx_out(options["influx"], credentials, plain=plain))
+        outputs.append(access.influx_out(options["influx"], credentials, plain=plain))
     if options["opcua"]:
         acknowledges = options["opcua_acknowledge"]
-        ways.append(access.opcua_out(options["opcua"], credentials, plain=plain, acknowledges=acknowledges))
-    return ways
+        outputs.append(access.opcua_out(options["opcua"], credentials, plain=plain, acknowledges=acknowledges))
+    return outputs
 
 
 @click.command(
@@ -72,8 +72,8 @@ def ways_of(options: dict[str, Any]) -> list[WayOut]:
 @telemetry_options
 def telemetry(namespace: str, name: str, scene: str | None, wait: float, **options: Any) -> int:
     """Send the results of a running node until interrupted. The results are read from the topics of the node."""
-    ways = ways_of(options)
-    if not ways:
+    outputs = outputs_of(options)
+    if not outputs:
         raise click.UsageError("expected --mqtt-out, --influx or --opcua")
     from plow_twin.live.stop import StopRequested, StopSignals
 
@@ -89,7 +89,7 @@ def telemetry(namespace: str, name: str, scene: str | None, wait: float, **optio
             return stop.stopped
 
         try:
-            lost = send_node(namespace, name, scene, ways, options["out_rate"], wait, stopped, on_error)
+            lost = send_node(namespace, name, scene, outputs, options["out_rate"], wait, stopped, on_error)
         except StopRequested:
             return DONE
     return DONE_WITH_LOSS if lost else DONE

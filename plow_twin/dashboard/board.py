@@ -43,9 +43,9 @@ class Board:
             if self._history.add(self._motion, version):
                 self._anew_version = version
         self._events.extend((version, event) for event in update.get("events", ()))
-        self.tell()
+        self.wake()
 
-    def tell(self) -> None:
+    def wake(self) -> None:
         """Wake all pages that wait for an update."""
         news, self.news = self.news, asyncio.Event()
         news.set()

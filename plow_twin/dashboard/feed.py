@@ -25,7 +25,7 @@ _MOST: Final = 256
 _EVENTS: Final = 20
 _LONGEST: Final = 1000
 #: Largest number of operator requests that are handled in one call.
-_MOST_ASKED: Final = 8
+_MOST_REQUESTS: Final = 8
 _NO_LOAD: Final = np.full(3, np.nan)
 #: States of a clearance that has a measured value, written out because the import of `estimate` takes long.
 _KNOWN_STATES: Final = ("estimated", "rough")
@@ -204,15 +204,15 @@ class Feed:
 
     def turn(self) -> None:
         """Handle operator requests and send an update. Call this method at the rate of the updates."""
-        self.hear()
+        self.receive()
         self.send()
         if self._link.broken and not self._ended:
             self._ended = True
             self._on_error(self._end)
 
-    def hear(self) -> None:
+    def receive(self) -> None:
         """Handle operator requests, and receive reports of the process."""
-        for _ in range(_MOST_ASKED):
+        for _ in range(_MOST_REQUESTS):
             asked = self._link.receive()
             if asked is None:
                 break

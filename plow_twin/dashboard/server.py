@@ -170,7 +170,7 @@ async def serve(link: Link, listening: socket.socket, access: PageAccess) -> Non
             board.add(update)
         if link.broken:
             asyncio.get_running_loop().remove_reader(link.fileno())
-            board.tell()
+            board.wake()
             server.should_exit = True
 
     asyncio.get_running_loop().add_reader(link.fileno(), take)

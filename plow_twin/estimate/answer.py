@@ -24,7 +24,7 @@ _KNOT_SHARE: Final = 1.0 / 400.0
 
 
 @dataclass(frozen=True)
-class Asked:
+class Requests:
     """Settings of the answers that a caller may request in addition to the estimate: contact forces and a forecast.
 
     members : number of twins from which the intervals of the forces are computed; 0 if no forces are requested
@@ -57,7 +57,7 @@ class Answer:
         return json.dumps({**self.estimate.as_dict(), **self.also}, allow_nan=False)
 
 
-def answer(scene: Scene, window: Window, guess: Guess, asked: Asked) -> Answer:
+def answer(scene: Scene, window: Window, guess: Guess, asked: Requests) -> Answer:
     """Return the estimate from a window, by a fit from `guess`, and the requested answers."""
     result, following = estimate_window(scene, window.load, window.pose, window.lost, guess, window.gaps)
     also: dict[str, Any] = {}
@@ -74,7 +74,7 @@ def answer(scene: Scene, window: Window, guess: Guess, asked: Asked) -> Answer:
     return Answer(result, following, also)
 
 
-def _forces(scene: Scene, result: Estimate, load: Load, asked: Asked) -> dict[str, Any]:
+def _forces(scene: Scene, result: Estimate, load: Load, asked: Requests) -> dict[str, Any]:
     if State.PRIOR in (result.horizontal_state, result.vertical_state):
         raise ForcesError("estimate: got only the prior, expected an estimated clearance")
     if load.constant:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from plow_twin.estimate import priors, tuning
 from plow_twin.estimate.forward import Forward, Start
 from plow_twin.estimate.laws import Draws, log_odds
-from plow_twin.estimate.likely import Seen, likeliest
+from plow_twin.estimate.likely import PathFeatures, likeliest
 from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER, Poses, filled
 from plow_twin.estimate.priors import UNSTATED, deviation_of, is_stated
 from plow_twin.estimate.regression import ridge
@@ -442,10 +442,10 @@ def _likeliest(features: Array, targets: Array, paths: Array, measured: Array, s
     paths, seen = (path[..., : path.shape[-1] // 2] for path in (paths, seen))
     there = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(seen).all(axis=0)
 
-    def motions(features: Array, paths: Array) -> Seen:
+    def motions(features: Array, paths: Array) -> PathFeatures:
         like = np.concatenate([features[:, :2], features[:, 5:]], axis=1)
         late = (paths[:, after] - paths[:, before]) / (_OF_DRAWN_S[after] - _OF_DRAWN_S[before])
-        return Seen(
+        return PathFeatures(
             np.concatenate([like, paths[:, _NO_LAG, there]], axis=1),
             np.concatenate([np.zeros_like(like), late[:, there]], axis=1),
         )

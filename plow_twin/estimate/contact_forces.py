@@ -74,7 +74,7 @@ class ContactForces:
 
 
 @dataclass(frozen=True, eq=False)
-class Felt:
+class FittedForces:
     """Penetration and contact force of the fitted motion at the times of the measured forces.
 
     swing : (n,) index of the swing of each row, -1 outside all swings
@@ -117,7 +117,7 @@ class Feeling:
         )  # fmt: skip
         self._depth = depth_of(turns)
 
-    def at(self, shared: Array, states: Array, delay: float) -> Felt | None:
+    def at(self, shared: Array, states: Array, delay: float) -> FittedForces | None:
         """Return penetrations and forces for given unknowns and a delay [s]; None if the motion cannot be simulated."""
         own = shared.copy()
         own[BIAS], own[DELAY] = 0.0, delay
@@ -128,7 +128,7 @@ class Feeling:
             self._problem.unknowns.scene_of(shared), -point.residual, point.rate, self._depth
         )
         force[point.swing < 0] = np.nan
-        return Felt(point.swing, penetration, force)
+        return FittedForces(point.swing, penetration, force)
 
 
 def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> tuple[Array, Array]:
@@ -154,45 +154,45 @@ def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> t
 
 def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells | None, list[str]]:
     """Return the usable cells, or None without any, and a reason for each cell that contradicts the motion."""
-    felt = feeling.at(found.shared, found.point.states, 0.0)
-    if felt is None:
+    fitted = feeling.at(found.shared, found.point.states, 0.0)
+    if fitted is None:
         return None, []
-    delay = _delay(forces, felt)
-    felt = feeling.at(found.shared, found.point.states, delay)
-    if felt is None:
+    delay = _delay(forces, fitted)
+    fitted = feeling.at(found.shared, found.point.states, delay)
+    if fitted is None:
         return None, []
     offset, noise = np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT)
     for i in range(PAIR_COUNT):
         column = forces.force[:, i]
-        flight = column[(felt.penetration[:, i] < -tuning.HEAD_ROOM) & np.isfinite(column)]
+        flight = column[(fitted.penetration[:, i] < -tuning.HEAD_ROOM) & np.isfinite(column)]
         if len(flight) >= FEWEST_POSES:
             offset[i] = np.median(flight)
             noise[i] = 1.4826 * np.median(np.abs(flight - offset[i]))
     measured = forces.force - offset
     found_out, pairs = [], []
-    largest = float(np.nanmax(felt.force))
+    largest = float(np.nanmax(fitted.force))
     # the resolution of a cell limits its noise
     noise = np.maximum(noise, 1e-4 * largest)
     for i, name in enumerate(PAIR_NAMES):
-        there = np.isfinite(measured[:, i]) & (felt.swing >= 0)
+        there = np.isfinite(measured[:, i]) & (fitted.swing >= 0)
         if not there.any():
             continue
-        why = _contradiction(measured[there], felt.force[there], i, largest, float(noise[i]))
+        why = _contradiction(measured[there], fitted.force[there], i, largest, float(noise[i]))
         if why:
             found_out.append(f"contact forces: {name}: {why}")
-        elif (felt.force[there, i] > 0.0).sum() >= FEWEST_IN_CONTACT:
+        elif (fitted.force[there, i] > 0.0).sum() >= FEWEST_IN_CONTACT:
             pairs.append(i)
     if not (found_out or pairs):
         return None, []
     return Cells(np.array(pairs, np.int64), measured, offset, noise, delay), found_out
 
 
-def _contradiction(measured: Array, felt: Array, pair: int, largest: float, noise: float) -> str:
+def _contradiction(measured: Array, fitted: Array, pair: int, largest: float, noise: float) -> str:
     """Return why a cell contradicts the motion, or an empty text.
 
-    `measured` and `felt` contain the measured forces and the forces of the fitted motion in N, shape (n, 8) each.
+    `measured` and `fitted` contain the measured forces and the forces of the fitted motion in N, shape (n, 8) each.
     """
-    own = felt[:, pair]
+    own = fitted[:, pair]
     if (own > 0.0).sum() < FEWEST_IN_CONTACT:
         most = float(np.abs(measured[:, pair]).max())
         return (
@@ -208,7 +208,7 @@ def _contradiction(measured: Array, felt: Array, pair: int, largest: float, nois
             )
     if own.max() < 6.0 * noise:
         return ""
-    like = np.array([correlation(value, felt[:, other]) for other in range(PAIR_COUNT)])
+    like = np.array([correlation(value, fitted[:, other]) for other in range(PAIR_COUNT)])
     if like[pair] < tuning.LEAST_CORRELATION:
         best = int(np.argmax(like))
         other = f", {like[best]:.2f} with {PAIR_NAMES[best]}" if like[best] > tuning.LEAST_CORRELATION else ""
@@ -222,8 +222,8 @@ def _contradiction(measured: Array, felt: Array, pair: int, largest: float, nois
     return ""
 
 
-def _delay(forces: ContactForces, felt: Felt) -> float:
-    t, measured, given = forces.t, np.nan_to_num(forces.force), np.nan_to_num(felt.force)
+def _delay(forces: ContactForces, fitted: FittedForces) -> float:
+    t, measured, given = forces.t, np.nan_to_num(forces.force), np.nan_to_num(fitted.force)
     pairs = np.flatnonzero(given.any(axis=0) & measured.any(axis=0))
     lags = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 0.5 * _DELAY_STEP, _DELAY_STEP)
     alike = [sum(correlation(measured[:, i], np.interp(t - lag, t, given[:, i])) for i in pairs) for lag in lags]

@@ -162,9 +162,9 @@ class Follower:
         #: number of times that members were drawn, and model time in s of the latest draw from an estimate
         self.drawn, self._since = 0, start
         self._draw("", start, self._unworn())
-        self._forget()
+        self._drop_measurements()
 
-    def _forget(self) -> None:
+    def _drop_measurements(self) -> None:
         #: poses and estimates in order of time: time in s, sequence number, and the pose or the estimate (JSON)
         self._due: list[tuple[float, int, list[float] | str]] = []
         #: times of recently used poses
@@ -242,7 +242,7 @@ class Follower:
         """Compile the kernels, or load them from the cache on disk; return the elapsed time in s."""
         begin, before = _time.perf_counter(), self.snapshot()
         self.advance(self.time + 1e-6)
-        self._ensemble.stand_like(self._ensemble, self._wrench)
+        self._ensemble.start_from(self._ensemble, self._wrench)
         self.restore(before)
         if may_rub(self.scene) and not kept_on_disk():  # the estimating process could not pass on its kernels later
             compile_friction(self.scene, self.tol)
@@ -371,12 +371,12 @@ class Follower:
         self.drawn += 1
         worn = self._unworn() if wear_depth is None else np.array(wear_depth, dtype=np.float64)
         self._draw("", t, worn)
-        self._forget()
+        self._drop_measurements()
         self._wrench = np.zeros(3)
         self._span_start = t
         if pose is not None:
             q, v = (np.asarray(part, dtype=np.float64) for part in pose)
-            self._ensemble.stand_about(q, v)
+            self._ensemble.move_near(q, v)
 
     def set_travel_speed(self, speed_m_s: float) -> None:
         """Set the travel speed along the face, as `Twin.set_travel_speed` does."""
@@ -518,7 +518,7 @@ class Follower:
         self.drawn += 1
         self._since = self.time
         self._draw(text, self.time, self.wear_depth)
-        self._ensemble.stand_like(before, self._wrench)
+        self._ensemble.start_from(before, self._wrench)
 
     def follow_parameters(self) -> None:
         """Continue from the state of the median twin with a single twin that poses do not move."""

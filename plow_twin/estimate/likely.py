@@ -32,7 +32,7 @@ _FREE = 100.0
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class PathFeatures:
     """Features of motions.
 
     like : (n, m) features
@@ -42,12 +42,12 @@ class Seen:
     like: Array
     late: Array
 
-    def rows(self, which: NDArray[np.bool_]) -> Seen:
+    def rows(self, which: NDArray[np.bool_]) -> PathFeatures:
         """Return the features of the selected motions."""
-        return Seen(self.like[which], self.late[which])
+        return PathFeatures(self.like[which], self.late[which])
 
 
-def likeliest(drawn: Array, gain: float, motions: Seen, measured: Seen) -> Array:
+def likeliest(drawn: Array, gain: float, motions: PathFeatures, measured: PathFeatures) -> Array:
     """Return the most likely clearances in m of n simulated motions and of the measured motion, shape (n + 1, 2).
 
     The last row belongs to the measured motion. For the simulated motions the model is cross-validated.
@@ -58,7 +58,7 @@ def likeliest(drawn: Array, gain: float, motions: Seen, measured: Seen) -> Array
         Drawn parameters: two clearances, logarithms of penetration and damping, and three load gains.
     gain : float
         Prior standard deviation of the load gains.
-    motions, measured : Seen
+    motions, measured : PathFeatures
         Features of the n simulated motions, and of the measured motion.
     """
     found = np.zeros((len(drawn) + 1, 2))
@@ -69,7 +69,7 @@ def likeliest(drawn: Array, gain: float, motions: Seen, measured: Seen) -> Array
     return found
 
 
-def _likeliest(drawn: Array, gain: float, motions: Seen, asked: Seen) -> Array:
+def _likeliest(drawn: Array, gain: float, motions: PathFeatures, asked: PathFeatures) -> Array:
     """Return the most likely clearances in m of the k motions `asked`, shape (k, 2)."""
     middle, scale = drawn.mean(axis=0), drawn.std(axis=0)
     scale[scale <= _SAME] = 1.0

@@ -185,7 +185,7 @@ class Ensemble:
                 self._add_intervals(rows[place : place + 1])
             if is_end:
                 self.begin_span()
-            self._remember(now, whole["q"][:, place].copy())
+            self._store_motion(now, whole["q"][:, place].copy())
         self._newest = whole[:, -1]
 
     def settle(self) -> None:
@@ -194,7 +194,7 @@ class Ensemble:
         if rows is not None:
             self._v, self.worn, self._depth = rows["v"].copy(), rows["wear_depth"].copy(), rows["penetration"].copy()
 
-    def _remember(self, now: float, q: Array) -> None:
+    def _store_motion(self, now: float, q: Array) -> None:
         path = self._path
         if len(path) > 1 and path[-1][0] - path[-2][0] < _PATH_S:
             path.pop()
@@ -256,7 +256,7 @@ class Ensemble:
             out[axis] = values[order[np.searchsorted(share, [0.5, 0.05, 0.95]).clip(0, len(order) - 1)]]
         return out
 
-    def stand_like(self, before: Ensemble, wrench: Array) -> None:
+    def start_from(self, before: Ensemble, wrench: Array) -> None:
         """Start from the state of the members `before`, under the load `wrench`.
 
         The poses are scaled to the clearances. Measured poses move the second member under a prior, and the first
@@ -277,7 +277,7 @@ class Ensemble:
             self.others.set_wrench(loads[1:])
         self._path = deque((t, q[from_] * share) for t, q in before._path)
         self._sums[1:], self._sums[0] = before._sums[from_[1:]], before._sums[0]
-        self._stand(self._path[-1][1], before._v[from_], before._force(before._depth)[from_])
+        self._move_toward(self._path[-1][1], before._v[from_], before._force(before._depth)[from_])
         if self._learner is not None and before._learner is not None:
             self._learner.take_over(before._learner)
             self._take_numbers(np.arange(len(self.good)))
@@ -285,11 +285,11 @@ class Ensemble:
             # a single twin continues with the parameters of the first member
             self._set_numbers(np.zeros(1, np.int64), before._numbers[:1])
 
-    def stand_about(self, q: Array, v: Array) -> None:
+    def move_near(self, q: Array, v: Array) -> None:
         """Move each member to the pose `q`, scaled to its clearances."""
         places = q * self._shares(np.broadcast_to(self._room()[0], (len(self.good), 3)))
         force = self._force(self._penetration(places))[:1]
-        self._stand(places, np.tile(v, (len(places), 1)), np.tile(force, (len(places), 1)))
+        self._move_toward(places, np.tile(v, (len(places), 1)), np.tile(force, (len(places), 1)))
 
     def _room(self) -> Array:
         """Return horizontal, vertical and smaller clearance in m, shape (m, 3), but 1 for a locked direction."""
@@ -300,7 +300,7 @@ class Ensemble:
         """Return the scales of `_room` divided by those of other members, shape (m, 3)."""
         return np.divide(self._room(), room, out=np.ones_like(room), where=room > 0.0)
 
-    def _stand(self, q: Array, v: Array, force: Array, which: NDArray[np.int64] | None = None) -> None:
+    def _move_toward(self, q: Array, v: Array, force: Array, which: NDArray[np.int64] | None = None) -> None:
         """Move members toward the poses `q` until a pair would bear much more than `force` [N], shape (m, 8)."""
         which = np.arange(len(q)) if which is None else which
         q, v, force = q[which], v[which], force[which]
@@ -433,7 +433,7 @@ class Ensemble:
         share = self._shares(room)[which]
         for _, q in self._path:
             q[which] *= share
-        self._stand(self.pose, self._v, force, which)
+        self._move_toward(self.pose, self._v, force, which)
 
     def _recover(self) -> None:
         lost, left = np.flatnonzero(~self.good), np.flatnonzero(self.good)
@@ -444,7 +444,7 @@ class Ensemble:
         from_[lost] = np.resize(left, len(lost))
         share = self._shares(self._room()[from_])
         self._path = deque((t, q[from_] * share) for t, q in self._path)
-        self._stand(self._path[-1][1], self._v[from_], self._force(self._depth)[from_], lost)
+        self._move_toward(self._path[-1][1], self._v[from_], self._force(self._depth)[from_], lost)
 
     def _force(self, depth: Array, which: NDArray[np.int64] | slice = _ALL) -> Array:
         """Return the elastic force of each pair of some members in N, shape (m, 8), from the penetrations in m."""

@@ -34,7 +34,7 @@ _STEPS: Final = np.array([one.step or 1e-3 for one in QUANTITIES])
 _SHORTER: Final = 5
 
 
-class _Whole:
+class _Simulation:
     """Simulation of the first `rows` poses from one start, and its distance from the measured components."""
 
     def __init__(self, forward: Forward, unknowns: Unknowns, poses: Poses, period: float) -> None:
@@ -152,7 +152,7 @@ def fit_some_components(
         Seed of the random numbers.
     """
     rng = np.random.default_rng(seed)
-    whole = _Whole(forward, unknowns, poses, period)
+    whole = _Simulation(forward, unknowns, poses, period)
     end = float(poses.t[0]) + tuning.FIRST_PERIODS * period
     noise = np.where(whole.measured, whole.noise, _like_measured(whole))
 
@@ -185,7 +185,7 @@ def fit_some_components(
     return None if found is None else finished(found, np.inf)
 
 
-def _starts(whole: _Whole, rows: int, rng: np.random.Generator) -> list[Array]:
+def _starts(whole: _Simulation, rows: int, rng: np.random.Generator) -> list[Array]:
     drawn, (draws, improved, kept) = [], tuning.UNMEASURED_DRAWS
     for _ in range(draws):
         vector = whole.mean + whole.deviation * rng.standard_normal(SIZE)
@@ -204,7 +204,7 @@ def _starts(whole: _Whole, rows: int, rng: np.random.Generator) -> list[Array]:
     return [vector for _, vector in sorted(better, key=lambda one: one[0])[:kept]]
 
 
-def _like_measured(whole: _Whole) -> Array:
+def _like_measured(whole: _Simulation) -> Array:
     """Return the noise of all components in m, m, rad. Missing components have the mean noise of the others."""
     arm = geometry.half_diagonal(whole.unknowns.scene)
     level = float((whole.noise * [1.0, 1.0, arm])[whole.measured].mean())

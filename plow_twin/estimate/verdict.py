@@ -265,13 +265,13 @@ def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
         verdict.model.append(f"machine changed within the window: clearances by {growth[0]:.2g} m, {growth[1]:.2g} m")
         changed = np.abs(growth)
     # unlike a wrong load or law, a real change explains a large share of the residuals
-    if changed.any() and share > tuning.CHANGE_SHARE and _felt(problem, fit):
+    if changed.any() and share > tuning.CHANGE_SHARE and _load_suffices(problem, fit):
         # a smaller change only widens the interval
         verdict.broken |= bool(changed.max() > 2.0 * tuning.OBSERVED)
         verdict.changed = changed
 
 
-def _felt(problem: Problem, fit: Fit) -> bool:
+def _load_suffices(problem: Problem, fit: Fit) -> bool:
     """Return whether the unknown part of the load has no effect on the residuals of short or linked swings."""
     drift = np.array(problem.forward.load.unknown) / np.asarray(inertias(problem.unknowns.scene)) ** 2
     span = float(np.median(np.diff(problem.window.starts)))

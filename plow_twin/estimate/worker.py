@@ -25,7 +25,7 @@ from multiprocessing.reduction import ForkingPickler
 from types import MappingProxyType
 from typing import Any, Final
 
-from plow_twin.estimate.answer import Asked, answer
+from plow_twin.estimate.answer import Requests, answer
 from plow_twin.estimate.estimate import Guess, warm_up
 from plow_twin.estimate.forces import TOLERANCE
 from plow_twin.estimate.measurements import Deviation
@@ -45,7 +45,7 @@ _NICE: Final = 10
 _SLICE_NS, _SCHED_SETATTR = 100_000, 314
 #: Upper bound on the time in s until the far side has ended.
 _STOP_S: Final = 5.0
-_ESTIMATE_ALONE: Final = Asked()
+_ESTIMATE_ALONE: Final = Requests()
 
 
 def _view(contents: dict[Any, Any]) -> MappingProxyType[Any, Any]:
@@ -95,11 +95,11 @@ class Worker:
         The nominal scene.
     windows : Windows
         The empty object that forms the windows in the process.
-    asked : Asked
+    asked : Requests
         The answers that are requested in addition to the estimate.
     """
 
-    def __init__(self, scene: Scene, windows: Windows, asked: Asked = _ESTIMATE_ALONE) -> None:
+    def __init__(self, scene: Scene, windows: Windows, asked: Requests = _ESTIMATE_ALONE) -> None:
         near, far = Pipe()
         command = [sys.executable, "-m", "plow_twin.estimate.worker", str(far.fileno()), *loaded_laws()]
         # the far side uses at most one core

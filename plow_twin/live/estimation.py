@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from plow_twin.errors import Problem
-from plow_twin.estimate.answer import Asked
+from plow_twin.estimate.answer import Requests
 from plow_twin.estimate.forces import FEWEST
 from plow_twin.estimate.forecast import HOUR_S, Plan, Scenario, check_prior
 from plow_twin.estimate.life import LifeError
@@ -36,7 +36,7 @@ class Estimation:
         self._frame_id, self._follows = settings.frame_id, settings.follows != "off"
         span = (settings.estimate_window, settings.estimate_interval, settings.rollback_span)
         windows = Windows(*span, settings.head_pose_deviation, settings.excitation_deviation, settings.gaps_deviation)
-        asked = asked_of(settings)
+        asked = requests_of(settings)
         self._start = partial(Worker, scene, windows, asked)
         self.worker = self._start()
         #: number of times that the process was started again
@@ -88,18 +88,18 @@ class Estimation:
                 self.worker.set_load_deviation(deviation)
             case journal.SetWear(stamp_ns):
                 self.worker.restart()
-                self._forget()
+                self._drop_estimate()
                 self._set_ns, self.end_ns = stamp_ns, None
                 self.trust, self.reasons = dict.fromkeys(self.trust, ""), ()
                 self.forecast, self.forecast_error = None, "nothing has been estimated since the pads were set"
             case journal.SetModel():
                 # the new clearances of the model replace the clearances of an older estimate
                 self.worker.restart()
-                self._forget()
+                self._drop_estimate()
             case journal.Reset():
                 self.worker.restart()
                 if self._follows:
-                    self._forget()
+                    self._drop_estimate()
 
     def add_series(self, series: Series) -> None:
         """Pass a series of samples to the estimating process."""
@@ -158,7 +158,7 @@ class Estimation:
             messages[FORECAST] = forecast_message(found, self._frame_id)
         return messages
 
-    def _forget(self) -> None:
+    def _drop_estimate(self) -> None:
         self.entry = None
         self.states = dict.fromkeys(self.states, State.PRIOR)
 
@@ -237,14 +237,14 @@ def forecast_message(found: Found, frame_id: str) -> plain.JointState:
     return plain.JointState(found.end_ns, frame_id, tuple(names), position=np.array(numbers))
 
 
-def asked_of(settings: Settings) -> Asked:
+def requests_of(settings: Settings) -> Requests:
     """Return the results that the parameters request in addition to the estimate."""
     horizontal, vertical = settings.forecast_limits
     plan = None
     if horizontal or vertical:
         stop_h = settings.forecast_stop / HOUR_S or None
         plan = Plan(horizontal, vertical, settings.forecast_horizon / HOUR_S, stop_h, scenarios=scenarios_of(settings))
-    return Asked(settings.estimate_forces, settings.estimate_interval, plan, settings.follows != "off")
+    return Requests(settings.estimate_forces, settings.estimate_interval, plan, settings.follows != "off")
 
 
 def scenarios_of(settings: Settings) -> tuple[Scenario, ...]:

@@ -120,9 +120,9 @@ class BridgeFront:
     def send(self, topic: str, message: memoryview | Message) -> None:
         """Report the message if it contains alarms or an estimate. Messages of the motion are only recorded."""
         if isinstance(message, DiagnosticStatus | JointState):
-            self._tell(topic, part_of(message))
+            self._send_report(topic, part_of(message))
 
-    def _tell(self, name: str, part: Part) -> None:
+    def _send_report(self, name: str, part: Part) -> None:
         self._say(name, part)
         for watcher in self._watchers:
             watcher.part(name, part)
@@ -147,7 +147,7 @@ class BridgeFront:
         if (level, message, values) == self._said:
             return
         self._said = level, message, values
-        self._tell("status", self._said)
+        self._send_report("status", self._said)
         head = self._settings.hardware_id
         self.runtime.record_status(DiagnosticStatus(level, self.name, message, head, tuple(values.items())))
 
@@ -266,7 +266,7 @@ class BridgeFront:
         # the alarms are sent here because the twin sends them only when a level changes
         self.send(ALARMS, alarms_message(self.runtime.alarms, self.name, self._settings.hardware_id))
         for name, part in self.parts().items():
-            self._tell(name, part)
+            self._send_report(name, part)
 
 
 def _first_messages(bridge: Bridge) -> Iterator[Messages]:

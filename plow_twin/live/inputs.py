@@ -104,7 +104,7 @@ class Inputs:
         `number` counts the messages of each sender from 1. `fits` states whether the message can be read as a sample.
         """
         lost = self.senders.lost
-        followed = self.senders.hear(sender, number)
+        followed = self.senders.count_arrival(sender, number)
         if self.senders.lost != lost:
             self.unused.note_lost(self._source, sender, self.senders.lost - lost)
         if followed and self.active and fits:
@@ -137,7 +137,7 @@ class Inputs:
     def _follows(self, topic: str, stamp_ns: int, values: Sequence[float]) -> bool:
         """Return whether the current message on an optional input comes from the followed sender; if not, count it."""
         sender = self.arriving[1]
-        followed = self.optional[topic].hear(sender, time.monotonic_ns())
+        followed = self.optional[topic].count_arrival(sender, time.monotonic_ns())
         if not followed:
             self._other_heard(topic, sender, stamp_ns, values)
         return followed

@@ -26,7 +26,7 @@ LOOK_S: Final = 0.2
 #: Name of a node whose topics have been announced before its name, because rmw_dds_common announces them separately.
 _UNNAMED: Final = "_NODE_NAME_UNKNOWN_"
 #: Shortest interval between two error messages about `/clock` [s].
-_SAY_AGAIN_S: Final = 5.0
+_ERRORS_APART_S: Final = 5.0
 _TYPES: Final = frozenset(kind.value for kind in Parameter.Type)
 
 
@@ -61,7 +61,7 @@ class WithoutEvents(Node):
     def _take_clock(self, take: Callable[[Clock], None], message: Clock) -> None:
         if message.clock.sec < 0:
             text = f"/clock: got {message.clock.sec} s, expected a time >= 0: the message is ignored"
-            self.get_logger().error(text, throttle_duration_sec=_SAY_AGAIN_S)
+            self.get_logger().error(text, throttle_duration_sec=_ERRORS_APART_S)
         else:
             take(message)
 

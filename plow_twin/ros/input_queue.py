@@ -21,7 +21,7 @@ from plow_twin.ros.rcl import SerializedMessage, libraries
 _FIRST_CAPACITY: Final = 1024
 
 
-class Taken(NamedTuple):
+class Received(NamedTuple):
     """A received message.
 
     `sender` is the identifier of the publisher. `number` is the sequence number of the message, counted from 1 for each
@@ -53,7 +53,7 @@ class _Info(ctypes.Structure):
 #: and length of the bytes).
 _INFO, _PLACE = struct.Struct("=qqQ16x16s"), struct.Struct("=QQ")
 #: Return code of rcl for an empty queue.
-_NOTHING_TAKEN: Final = 401
+_EMPTY_QUEUE: Final = 401
 
 
 @cache
@@ -89,7 +89,7 @@ class InputQueue:
         with subscription.handle:
             self._listen(subscription.handle.pointer, _count_up(), self.fd)
 
-    def pop(self, most: int, *, all_there_are: bool = False) -> tuple[list[Taken], bool]:
+    def pop(self, most: int, *, all_there_are: bool = False) -> tuple[list[Received], bool]:
         """Return at most `most` messages in the order of arrival, and whether the queue contains more messages.
 
         By default, as many messages are read as were signalled, which saves a read of the empty queue. With
@@ -101,10 +101,10 @@ class InputQueue:
             signs = 0
         self._signs += signs
         wanted = most if all_there_are else min(most, self._signs)
-        taken = self._taken(wanted)
+        received = self._read(wanted)
         # if the queue has overflowed, it contains fewer messages than were signalled
-        self._signs = max(0, self._signs - len(taken)) if len(taken) == wanted else 0
-        return taken, self._signs > 0 or (all_there_are and len(taken) == most)
+        self._signs = max(0, self._signs - len(received)) if len(received) == wanted else 0
+        return received, self._signs > 0 or (all_there_are and len(received) == most)
 
     def close(self) -> None:
         """Destroy the subscription."""
@@ -115,20 +115,20 @@ class InputQueue:
         self._node.destroy_subscription(self._subscription)
         libraries()[1].rcutils_uint8_array_fini(ctypes.byref(self._buffer))
 
-    def _taken(self, most: int) -> list[Taken]:
-        taken: list[Taken] = []
+    def _read(self, most: int) -> list[Received]:
+        received: list[Received] = []
         handle, take = self._subscription.handle, self._take
         with handle:
             pointer = handle.pointer
-            while len(taken) < most:
+            while len(received) < most:
                 answer = take(pointer, *self._places, None)
                 if answer:
                     break
                 sent_ns, received_ns, number, sender = _INFO.unpack_from(self._info)
                 data = ctypes.string_at(*_PLACE.unpack_from(self._buffer))
-                taken.append(Taken(sender, number, received_ns, data, sent_ns))
+                received.append(Received(sender, number, received_ns, data, sent_ns))
             else:
                 answer = 0
-        if answer not in (0, _NOTHING_TAKEN):
+        if answer not in (0, _EMPTY_QUEUE):
             raise RuntimeError(f"{self._subscription.topic_name}: rcl_take_serialized_message returned {answer}")
-        return taken
+        return received

@@ -34,7 +34,7 @@ from plow_twin.ros.parameter_server import ParameterServer
 from plow_twin.ros.qos import DIAGNOSTICS, OUTPUTS
 
 #: Number of reports between two log messages about the same problem.
-_SAY_AGAIN: Final = 5
+_REPORTS_APART: Final = 5
 
 
 class TwinNode(WithoutEvents, LifecycleNode):
@@ -246,7 +246,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
             # the solver is compiled before configure, so that a lifecycle manager does not have to wait for it
             self.prepare()
         runtime = self.runtime
-        if runtime is not None and runtime.without_clock and self._reports % _SAY_AGAIN == 0:
+        if runtime is not None and runtime.without_clock and self._reports % _REPORTS_APART == 0:
             self.get_logger().warning(
                 "use_sim_time is set and no message has arrived on /clock: the twin waits and records nothing"
             )

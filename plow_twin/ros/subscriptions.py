@@ -19,7 +19,7 @@ from plow_twin.live.tool_forces import ToolForces
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.ros.connections import Connections
 from plow_twin.ros.input_loop import InputLoop, Turns
-from plow_twin.ros.input_queue import InputQueue, Taken
+from plow_twin.ros.input_queue import InputQueue, Received
 from plow_twin.ros.messages import UNREADABLE, Read, deviations, read_wrench, stamp_ns
 from plow_twin.ros.qos import OVERRIDABLE, sensor_input
 from plow_twin.stream.driver import Arrival
@@ -60,7 +60,7 @@ class Subscriptions:
         self._following: dict[tuple[str, bytes], int] = {}
         self._since_ns = time.time_ns()  # time of the subscription to the load
         #: first message of each publisher that appeared after the subscription, and number of messages lost before it
-        self._appeared: dict[bytes, tuple[Taken, int]] = {}
+        self._appeared: dict[bytes, tuple[Received, int]] = {}
         self._before: frozenset[bytes] = frozenset()
         with_covariance = runtime.settings.head_pose_type == "pose_with_covariance"
         self._pose = PoseWithCovarianceStamped if with_covariance else PoseStamped
@@ -132,7 +132,7 @@ class Subscriptions:
         self._taken_from[topic] = subscription
         self._loop.add(InputQueue(self._node, subscription), self, topic)
 
-    def receive(self, topic: str, batch: list[Taken]) -> None:
+    def receive(self, topic: str, batch: list[Received]) -> None:
         """Count the gaps in the sequence numbers of a batch, and process its messages."""
         inputs, following = self._inputs, self._following
         for message in batch:
@@ -167,7 +167,7 @@ class Subscriptions:
         else:
             self._not_selected(topic, batch)
 
-    def _count_before_first(self, batch: list[Taken]) -> None:
+    def _count_before_first(self, batch: list[Received]) -> None:
         """Count the lost messages of a publisher before its first received message.
 
         A publisher that is new to the node may have started before the subscription. Its start is estimated from its
@@ -186,7 +186,7 @@ class Subscriptions:
             if heard >= _RATE_KNOWN:
                 del self._appeared[sender]
 
-    def _samples(self, topic: str, batch: list[Taken]) -> None:
+    def _samples(self, topic: str, batch: list[Received]) -> None:
         inputs = self._inputs
         inputs.waited(len(batch), (time.time_ns() - batch[0].received_ns) * 1e-9)
         arrived: list[Arrival] = []
@@ -209,7 +209,7 @@ class Subscriptions:
             for topic, message in self._runtime.step(arrived):
                 self._front.send(topic, message)
 
-    def _not_selected(self, topic: str, batch: list[Taken]) -> None:
+    def _not_selected(self, topic: str, batch: list[Received]) -> None:
         for message in batch:
             stamp, values, _, _ = self._read(topic, message.data)
             self._inputs.arriving = (topic, message.sender)
@@ -226,11 +226,11 @@ class Subscriptions:
         values = tuple(message.effort) if wrench is None else wrench
         return stamp_ns(message.header), values, wrench is not None, False
 
-    def _travel_speeds(self, batch: list[Taken]) -> None:
+    def _travel_speeds(self, batch: list[Received]) -> None:
         for message in self._messages("travel", TwistStamped, self._inputs.travel, batch):
             self._runtime.add_travel(stamp_ns(message.header), message.twist.linear.z)
 
-    def _measured_gaps(self, batch: list[Taken]) -> None:
+    def _measured_gaps(self, batch: list[Received]) -> None:
         for message in self._messages("gaps", JointState, self._inputs.gaps, batch):
             named, stamp = set(message.name), stamp_ns(message.header)
             if len(message.position) == len(message.name) == len(named) and named <= _PAIR_NUMBERS.keys():
@@ -239,7 +239,7 @@ class Subscriptions:
             else:
                 self._inputs.gaps.refuse(Verdict.MALFORMED, stamp, tuple(message.position))
 
-    def _measured_poses(self, batch: list[Taken]) -> None:
+    def _measured_poses(self, batch: list[Received]) -> None:
         for message in self._messages("head_pose", self._pose, self._inputs.head_pose, batch):
             with_covariance = self._pose is PoseWithCovarianceStamped
             pose = message.pose.pose if with_covariance else message.pose
@@ -252,7 +252,7 @@ class Subscriptions:
             deviation = deviations(message.pose.covariance) if with_covariance else ()
             self._runtime.add_pose(stamp, (pose.position.x, pose.position.y, theta), deviation)
 
-    def _messages(self, topic: str, kind: type, intake: Intake, batch: list[Taken]) -> Iterator[Any]:
+    def _messages(self, topic: str, kind: type, intake: Intake, batch: list[Received]) -> Iterator[Any]:
         for taken in batch:
             self._inputs.arriving = (topic, taken.sender)
             message = _message(taken.data, kind)

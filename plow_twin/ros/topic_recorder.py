@@ -22,7 +22,7 @@ from plow_twin.record.metadata_yaml import offered
 from plow_twin.record.writer import in_free_folder
 from plow_twin.ros.connections import WithoutEvents
 from plow_twin.ros.input_loop import InputLoop, Turns
-from plow_twin.ros.input_queue import InputQueue, Taken
+from plow_twin.ros.input_queue import InputQueue, Received
 from plow_twin.ros.main import make_executor
 from plow_twin.ros.start import ros
 from plow_twin.scene_file.yaml_text import dump_yaml
@@ -132,7 +132,7 @@ class TopicRecorder:
         )
         self._loop.add(InputQueue(self._node, subscription), _Subscription(self, quality, number), name)
 
-    def add(self, name: str, quality: _Quality, number: int, taken: list[Taken]) -> None:
+    def add(self, name: str, quality: _Quality, number: int, taken: list[Received]) -> None:
         """Write the messages that a subscription received, without duplicates."""
         for message in taken:
             key = (name, message.sender)
@@ -156,7 +156,7 @@ class _Subscription(NamedTuple):
     quality: _Quality
     number: int
 
-    def receive(self, topic: str, batch: list[Taken]) -> None:
+    def receive(self, topic: str, batch: list[Received]) -> None:
         self.recorder.add(topic, self.quality, self.number, batch)
 
 

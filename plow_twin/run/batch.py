@@ -229,7 +229,7 @@ class TwinBatch:
         self._reload()
         self._wrench = np.zeros((1, 3))
 
-    def begin_beside(self, snapshot: bytes, moved: ArrayLike, *, again: bool = False) -> None:
+    def begin_displaced(self, snapshot: bytes, moved: ArrayLike, *, again: bool = False) -> None:
         """Set all twins to displaced states of a sampled twin, and copy its contacts, last sample and travel speed.
 
         Parameters

@@ -21,7 +21,7 @@ from plow_twin.errors import ArgumentError, SceneError, SolverError
 from plow_twin.model import geometry
 from plow_twin.model.scene import Load, Scene, Table
 from plow_twin.run.motion import BUDGET, Motion, next_slice, run_events
-from plow_twin.run.tangent_columns import columns_beside, fits_tangents, is_curved
+from plow_twin.run.tangent_columns import displaced_columns, fits_tangents, is_curved
 from plow_twin.solve.compiled_scene import TOLERANCE_RANGE, CompiledScene, compile_scene
 from plow_twin.solve.growth import MOST_KEPT, follow_growth
 from plow_twin.solve.state import State, Status, Work, first_of, new_record, new_records, new_work
@@ -304,7 +304,7 @@ def _by_equations(scene: Scene, t_end: float, tol: float, parameters: Sequence[s
         return None
     scale, parts = scale_of(compiled), compiled.parts
     ends, count = _ends(t_end), STATE_COLUMNS + len(changed)
-    columns, omegas, amplitudes = columns_beside(compiled, [(one.compiled, one.change) for one in changed])
+    columns, omegas, amplitudes = displaced_columns(compiled, [(one.compiled, one.change) for one in changed])
     out, whole, reached = np.zeros((len(ends), STATE_COLUMNS, count)), np.zeros(len(ends), np.int64), np.zeros(1, int)
     state, work, along = compiled.initial_state(), new_work(), new_record(ALONG)
     room, size = _CLEAR_OF_WALLS * DISPLACEMENT * scale[0], _FIRST_SLICE
@@ -336,7 +336,7 @@ def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str
     moved, implicit = DISPLACEMENT, 0
     scenes = [compiled] * (1 + size) + [one.compiled for one in changed]
     first_states = [one.compiled.initial_state() for one in changed]
-    states = _beside(compiled, compiled.initial_state(), moved * scale, free, first_states, work)
+    states = _displaced(compiled, compiled.initial_state(), moved * scale, free, first_states, work)
     matrices, changes, ended = [], [], []
     for end in _ends(t_end).tolist():
         followed = [_follow(one, state, end, work) for one, state in zip(scenes, states, strict=True)]
@@ -348,13 +348,13 @@ def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str
         assert followed[0].penetration is not None
         held = int(states[0].implicit_steps) > implicit
         depths = followed[0].penetration[0, compiled.params.enabled == 1]
-        possible = displacement_beside(
+        possible = possible_displacement(
             depths, scale[0], held=held, reads_speed=bool(compiled.params.damping_number >= 0.0)
         )
         ends = possible is not None or merged >= most_merged
         if ends:
             merged, moved, implicit = 0, possible or DISPLACEMENT, int(states[0].implicit_steps)
-            states = _beside(compiled, states[0], moved * scale, free, states[1 + size :], work)
+            states = _displaced(compiled, states[0], moved * scale, free, states[1 + size :], work)
         else:
             merged += 1
         ended.append(ends)
@@ -382,7 +382,7 @@ def scale_of(compiled: CompiledScene) -> Array:
     return scale
 
 
-def displacement_beside(
+def possible_displacement(
     penetration: Array, length: float, *, held: bool = False, reads_speed: bool = False
 ) -> float | None:
     """Return the largest displacement of shadows, relative to the clearance, for the start of a stretch.
@@ -417,7 +417,7 @@ def free_places(scene: Scene) -> NDArray[np.int64]:
     return np.flatnonzero(scene.free * 2)
 
 
-def _beside(
+def _displaced(
     compiled: CompiledScene,
     state: State,
     moved: Array,

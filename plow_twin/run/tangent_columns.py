@@ -36,7 +36,7 @@ def is_curved(terms: Terms) -> int | None:
     return 1 if terms.hysteretic or terms.integer or terms.fraction else None
 
 
-def columns_beside(
+def displaced_columns(
     compiled: CompiledScene, changed: Sequence[tuple[CompiledScene, float]]
 ) -> tuple[NDArray[np.void], _Array, _Array]:
     """Compute the columns for displacements of the state, and for changes of one parameter each.

@@ -48,7 +48,7 @@ DEFAULT_BUDGET = 50_000_000
 #: Compiled kernels by signature and kind, which determine the argument types. Numba's own look-up takes milliseconds.
 _entries: dict[tuple[Any, ...], Callable[..., bool]] = {}
 _NO_DIGESTS = np.zeros(0, np.int64)
-_THE_ONE = np.zeros(1, np.int64)
+_ONLY_TWIN = np.zeros(1, np.int64)
 #: Smallest admissible number of evaluations of an advance, enough for four Runge-Kutta steps.
 LEAST_EVALUATIONS = 16
 
@@ -336,7 +336,7 @@ class Twin:
             Rates of the pose in m/s, m/s and rad/s; rates of locked degrees of freedom are set to 0, as by `reset`.
         """
         place = geometry.states_of(self.scene, np.concatenate([q, np.where(self.scene.free, v, 0.0)])[None])
-        settle_moved(self._params, self._states, _THE_ONE, place, self.time, self._parts.terms.stick)
+        settle_moved(self._params, self._states, _ONLY_TWIN, place, self.time, self._parts.terms.stick)
 
     def set_travel_speed(self, speed_m_s: float) -> None:
         """Set the speed along the face from the current time on. Only wear depends on this speed.

@@ -20,8 +20,8 @@ from plow_twin.run.sensitivity import (
     SHADOW_TOLERANCE,
     ChangedScene,
     StretchProduct,
-    displacement_beside,
     free_places,
+    possible_displacement,
     refuse_support,
     scale_of,
     sensitivity_parameters,
@@ -141,7 +141,7 @@ class TwinSensitivity:
         size = len(self._free)
         if t - self.t >= _STRETCH_S or np.abs(away[:size]).max() > _FAR * DISPLACEMENT:
             depths = rows.penetration[0, 0, self._enabled]
-            clear = displacement_beside(depths, float(self._scale[0]), reads_speed=self._reads_speed) is not None
+            clear = possible_displacement(depths, float(self._scale[0]), reads_speed=self._reads_speed) is not None
             if clear or t - self.t >= LONGEST_S:
                 self._end(t, away[:size].T / DISPLACEMENT, away[size:])
         return advanced
@@ -158,4 +158,4 @@ class TwinSensitivity:
         size = len(self._free)
         moved = np.zeros((len(self._shadows), 6))
         moved[np.arange(1, 1 + size), self._free] = DISPLACEMENT * self._scale[self._free]
-        self._shadows.begin_beside(self._twin.snapshot(), moved, again=again)
+        self._shadows.begin_displaced(self._twin.snapshot(), moved, again=again)

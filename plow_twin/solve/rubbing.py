@@ -21,7 +21,7 @@ SLOWEST_TRAVEL: Final = 0.01
 
 
 @kernel(inline="code")
-def time_per_way(p, pair) -> float:
+def time_per_length(p, pair) -> float:
     """Return 1 / v of a pad in s/m, with v at least `SLOWEST_TRAVEL`, or 0 if in-plane sliding causes no wear."""
     if p.speed_per_wear == 0.0:
         return 0.0
@@ -34,7 +34,7 @@ def rubbing(p, pair, y, depth, sliding, running_in) -> float:
     factor = 1.0
     if sliding is not None:
         rate = slip_rate(p, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
-        factor = math.sqrt(1.0 + (rate * time_per_way(p, pair)) ** 2)
+        factor = math.sqrt(1.0 + (rate * time_per_length(p, pair)) ** 2)
     if running_in is not None:
         factor *= 1.0 + p.running_in * math.exp(-depth * p.running_in_rate)
     return factor

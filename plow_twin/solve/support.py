@@ -21,7 +21,7 @@ from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
 #: Columns of the frame's series `w.frame`: displacement and velocity in world axes, angular velocity, cosine and sine
 #: of the head's angle relative to the frame, and the frame's angle.
-FRAME_X, FRAME_Y, FRAME_VX, FRAME_VY, SPIN, SEEN_COS, SEEN_SIN, FRAME_THETA = range(8)
+FRAME_X, FRAME_Y, FRAME_VX, FRAME_VY, SPIN, RELATIVE_COS, RELATIVE_SIN, FRAME_THETA = range(8)
 
 
 @kernel()
@@ -83,7 +83,7 @@ def start_frame(state, w) -> None:
     for j in range(2):
         here[FRAME_X + j], here[FRAME_VX + j] = frame[j], frame[3 + j]
     here[SPIN], here[FRAME_THETA] = frame[5], frame[2]
-    here[SEEN_COS], here[SEEN_SIN] = math.cos(state.y[THETA]), math.sin(state.y[THETA])
+    here[RELATIVE_COS], here[RELATIVE_SIN] = math.cos(state.y[THETA]), math.sin(state.y[THETA])
 
 
 @kernel(fast=True)

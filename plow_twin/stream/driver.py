@@ -295,7 +295,7 @@ class Driver:
         """Return to the motion of a snapshot. The next sample is at the model time of the snapshot."""
         self.failed.end()
         self.session.apply(journal.Restore(stamp_ns, snapshot.data))
-        self._begin_again()
+        self._restart_stream()
         self.intake.restart()
         self.clock.restart()
 
@@ -321,7 +321,7 @@ class Driver:
             raise ValueError(f"wear depth: got {list(depth_m)!r}, expected {PAIR_COUNT} finite depths >= 0 in m")
         self.failed.end()
         self.session.apply(journal.SetWear(stamp_ns, depth, reason))
-        self._begin_again()
+        self._restart_stream()
         self.intake.restart()
         self.clock.restart()
 
@@ -377,9 +377,9 @@ class Driver:
         self.failed.end()
         self.session.apply(journal.Reset(stamp_ns, reason))
         self.resets += 1
-        self._begin_again()
+        self._restart_stream()
 
-    def _begin_again(self) -> None:
+    def _restart_stream(self) -> None:
         self.newest_ns = self._counted_ns = None
         self.silences.restart()
         self.state = StreamState.WAITING

@@ -110,9 +110,9 @@ class History:
             self._kept_ns = stamps_ns[old - 1 :].tolist()
         else:
             self._kept_ns = self._kept_ns[max(0, bisect_right(self._kept_ns, first_ns) - 1) :] + stamps_ns.tolist()
-        self._forget_old()
+        self._drop_old()
 
-    def _forget_old(self) -> None:
+    def _drop_old(self) -> None:
         oldest_ns, old = self._kept_ns[0], 0
         while old + 1 < len(self._snapshots) and self._snapshots[old + 1][0] <= oldest_ns:
             old += 1

@@ -50,7 +50,7 @@ SLOW: Final = np.dtype(
     ]
 )
 #: Indices of the published rows if a single row is added and published.
-THE_ONE: Final = np.zeros(1, np.int64)
+ONLY_ROW: Final = np.zeros(1, np.int64)
 #: Indices of the published rows if no row is published.
 NONE: Final = np.zeros(0, np.int64)
 _NO_ROWS: Final = np.zeros(0, ROW)
@@ -359,4 +359,4 @@ def warm_up() -> None:
 def _publish() -> Callable[..., int]:
     """Return `publish` compiled for its argument types, because the check of the types takes longer than the call."""
     rows = np.zeros(1, ROW)
-    return for_arguments(publish, (rows, THE_ONE, 0, THE_ONE, rows, 0))
+    return for_arguments(publish, (rows, ONLY_ROW, 0, ONLY_ROW, rows, 0))

@@ -37,7 +37,7 @@ class Senders:
         """Register a sender. Its messages before the first received sample do not count as lost."""
         self._before |= {sender}
 
-    def hear(self, sender: bytes, number: int, count: int = 1) -> bool:
+    def count_arrival(self, sender: bytes, number: int, count: int = 1) -> bool:
         """Count the arrival of `count` samples of a sender, and return whether the sender is followed.
 
         `number` is the message number of the first of these samples, counted from 1.
@@ -88,7 +88,7 @@ class OneSender:
         self._heard_ns = 0
         self._listed: set[bytes] = set()
 
-    def hear(self, sender: bytes, now_ns: int) -> bool:
+    def count_arrival(self, sender: bytes, now_ns: int) -> bool:
         """Register a message that arrived at `now_ns` of the steady clock; return whether its sender is followed."""
         if self.followed is None or now_ns - self._heard_ns > _SILENT_NS:
             self.followed = sender

@@ -26,7 +26,7 @@ from plow_twin.stream import journal
 from plow_twin.stream.driven import MOST_MEASURED, Driven, Following
 from plow_twin.stream.history import History
 from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
-from plow_twin.stream.outputs import NONE, NOTHING, THE_ONE, Outputs, Published, Rows, Stock
+from plow_twin.stream.outputs import NONE, NOTHING, ONLY_ROW, Outputs, Published, Rows, Stock
 from plow_twin.stream.snapshot import SessionState, split_changes, with_changes
 
 #: Number of advances from one digest to the next.
@@ -171,7 +171,7 @@ class Session:
         if self.following is not None:
             self.following.catch_up()
             if self.history.is_due and self.stamp_ns is not None and not self.held:
-                self._remember(kept=False)
+                self._store_snapshot(kept=False)
 
     def start(self) -> None:
         """Emit the snapshot that opens a journal."""
@@ -226,10 +226,10 @@ class Session:
                     self._follow(stamp_ns, entry)
             case journal.Parameter("follow", "parameters") if self.following is not None:
                 self.following.follow_parameters()
-                self._forget()
+                self._renew_history()
             case journal.Snapshot(_, data):
                 self._restore(data)
-                self._forget()
+                self._renew_history()
         return None  # entries of other types do not change the motion
 
     def parts(self, samples: Sequence[journal.Sample], *, each: bool = False) -> Iterator[Sequence[journal.Sample]]:
@@ -268,10 +268,10 @@ class Session:
         for sample in samples:
             self.emit(sample)
         if late:
-            applied = self._work_in(first_ns, samples)
+            applied = self._recompute(first_ns, samples)
             applied = applied._replace(published=self.outputs.pop() if each else NOTHING, late=late)
         else:
-            applied = self._run(samples, THE_ONE if each else NONE)
+            applied = self._run(samples, ONLY_ROW if each else NONE)
             if each and applied.failed and not applied.published.rows["stamp_ns"][0]:
                 applied = applied._replace(published=NOTHING)
         self._count(len(samples))
@@ -351,7 +351,7 @@ class Session:
         while begin < count:
             travel, end = self._travels[0] if self._travels else None, count
             if travel is not None and travel.stamp_ns < stamps[begin]:
-                self._travel_on_the_way(travel, int(stamps[begin]), wrench[begin])
+                self._apply_waiting_travel(travel, int(stamps[begin]), wrench[begin])
                 continue
             if travel is not None:
                 end = int(np.searchsorted(stamps, travel.stamp_ns, side="right"))
@@ -365,7 +365,7 @@ class Session:
             out = None if rows is None else rows[here]
             parts.append(self._advance(stamps[here], wrench[here], out, chosen, here_after, resumed=resumed))
             if resumed:
-                self._remember(resumed=True)
+                self._store_snapshot(resumed=True)
             begin, resumed = end, False
         published = Published.joined([part.published for part in parts])
         digests = [digest for part in parts for digest in part.digests]
@@ -383,7 +383,7 @@ class Session:
     def renew(self) -> journal.Snapshot:
         """Return a snapshot from which a journal can continue, and drop all stored earlier states."""
         snapshot = self.snapshot()
-        self._forget()
+        self._renew_history()
         return snapshot
 
     def snapshot(self) -> journal.Snapshot:
@@ -460,7 +460,7 @@ class Session:
             ]
             self.poses_dropped += 1
 
-    def _travel_on_the_way(self, travel: journal.Travel, stamp_ns: int, wrench: NDArray[np.float64]) -> None:
+    def _apply_waiting_travel(self, travel: journal.Travel, stamp_ns: int, wrench: NDArray[np.float64]) -> None:
         self._travels.pop(0)
         if self.stamp_ns is not None and travel.stamp_ns > self.stamp_ns:
             share = (travel.stamp_ns - self.stamp_ns) / (stamp_ns - self.stamp_ns)
@@ -485,7 +485,7 @@ class Session:
             expected = f"at least {reached}" if oldest_ns is None else f"a stamp after {stored}"
             raise ValueError(f"stamp: got {stamp_ns} ns, expected {expected}")
 
-    def _work_in(self, stamp_ns: int, late: Sequence[journal.Sample], *travels: journal.Travel) -> Applied:
+    def _recompute(self, stamp_ns: int, late: Sequence[journal.Sample], *travels: journal.Travel) -> Applied:
         """Go back to a state before a late stamp, and compute the motion again with late samples and travel speeds.
 
         The next publication covers the motion from the earliest late stamp that was inserted since the previous
@@ -496,7 +496,7 @@ class Session:
         known = [sample for sample in again if sample.stamp_ns < corrected_ns]
         if known:
             self._run(known)
-            self._remember(kept=False)
+            self._store_snapshot(kept=False)
         self.outputs.begin_correction()
         return self._run(sorted([*again[len(known) :], *late], key=lambda sample: sample.stamp_ns))
 
@@ -556,7 +556,7 @@ class Session:
 
     def _suspend_wear(self) -> None:
         if not self.held:
-            self._remember()
+            self._store_snapshot()
             self.held = True
             if self._wears:
                 self.twin.set_travel_speed(0.0)
@@ -584,7 +584,7 @@ class Session:
         elif newest_ns is None or oldest_ns is None or travel.stamp_ns >= newest_ns:
             self._set_speed(travel)
         else:
-            self._work_in(travel.stamp_ns, [], travel)
+            self._recompute(travel.stamp_ns, [], travel)
 
     def _set_speed(self, travel: journal.Travel) -> None:
         self.history.add_travel(travel)
@@ -600,16 +600,16 @@ class Session:
         if before // DIGEST_INTERVAL != self._advances // DIGEST_INTERVAL and self.stamp_ns is not None:
             self.emit(journal.Digest(self.stamp_ns, self.twin.digest()))
 
-    def _remember(self, *, kept: bool = True, resumed: bool = False) -> None:
+    def _store_snapshot(self, *, kept: bool = True, resumed: bool = False) -> None:
         if self.stamp_ns is not None:
             self.history.add_snapshot(self.stamp_ns, self.snapshot().data, kept=kept, resumed=resumed)
 
-    def _forget(self) -> None:
-        self._forget_past()
+    def _renew_history(self) -> None:
+        self._clear_history()
         if not self.held:
-            self._remember()
+            self._store_snapshot()
 
-    def _forget_past(self) -> None:
+    def _clear_history(self) -> None:
         self.history.clear()
         self._measured.clear()
 
@@ -624,7 +624,7 @@ class Session:
         for travel in self._travels:
             self._set_speed(travel)
         self.outputs.restart()
-        self._forget_past()
+        self._clear_history()
         self._travels = []
         self.origin_ns = self.stamp_ns = None
 
@@ -643,7 +643,7 @@ class Session:
             self.twin.set_travel_speed(speed)
         self.outputs.scene = self.twin.scene
         self.outputs.set_shift(_NO_SHIFT)
-        self._forget()
+        self._renew_history()
 
     def _changed_twin(self, changes: Mapping[str, float]) -> Driven:
         """Return a twin of the scene with changed numbers.

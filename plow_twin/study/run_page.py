@@ -171,7 +171,7 @@ def _by_pad(recording: Recording) -> list[dict[str, str]]:
 def _plots(reader: RunReader, curves: RunCurves) -> list[dict[str, Any]]:
     alarms = alarms_of(reader.header.parameters).alarms
     force, clearance = alarms["force"].thresholds, alarms["clearance"].thresholds
-    ways = ("horizontal", "vertical")
+    directions = ("horizontal", "vertical")
     found: list[dict[str, Any]] = [
         {
             "title": "Largest force of each pad [kN]",
@@ -189,7 +189,7 @@ def _plots(reader: RunReader, curves: RunCurves) -> list[dict[str, Any]]:
         },
         {
             "title": "Clearance with its 90 % interval [mm]",
-            "names": [f"{way}{point}" for way in ways for point in ("", " 5 %", " 95 %")],
+            "names": [f"{direction}{point}" for direction in directions for point in ("", " 5 %", " 95 %")],
             "bands": [[3, 2], [6, 5]],
             "limits": [value * 1e3 for value in (clearance.warn, clearance.error)],
             "data": _columns(curves.clearance, [(column, int(column % 3 != 1)) for column in range(6)]),

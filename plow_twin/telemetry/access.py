@@ -37,7 +37,7 @@ _NO_TOPIC: Final = re.compile(r"[+#\x00-\x1f]|^\$")
 
 
 @dataclass(frozen=True)
-class WayOut:
+class OutputSpec:
     """Description of an output.
 
     `name` is its part of the diagnostics, and `address` contains no credentials. The process of the output imports
@@ -95,7 +95,7 @@ class Credentials:
         return os.environ.get(f"PLOW_TWIN_{variable}", "") if path is None else read_secret(Path(path))
 
 
-def mqtt_out(url: str, credentials: Credentials, *, plain: bool, sparkplug: str = "") -> list[WayOut]:
+def mqtt_out(url: str, credentials: Credentials, *, plain: bool, sparkplug: str = "") -> list[OutputSpec]:
     """Return the outputs to an MQTT broker at `mqtt[s]://HOST[:PORT]/PREFIX`.
 
     `sparkplug` is GROUP/NODE of an edge node of Sparkplug. With `sparkplug`, JSON messages are sent only if `url` has a
@@ -107,19 +107,21 @@ def mqtt_out(url: str, credentials: Credentials, *, plain: bool, sparkplug: str 
         raise AccessError("--mqtt-out", url, f"{expected}, the prefix without + and #")
     address = f"{'mqtts' if tls else 'mqtt'}://{_in_url(host)}:{port}"
     options = _broker_options(host, port, credentials, tls=tls)
-    client_id, ways = options["client_id"], []
+    client_id, outputs = options["client_id"], []
     if prefix:
-        ways.append(WayOut("mqtt_out", f"{address}/{prefix}", ("paho",), {"way": "mqtt", "prefix": prefix, **options}))
+        outputs.append(
+            OutputSpec("mqtt_out", f"{address}/{prefix}", ("paho",), {"output": "mqtt", "prefix": prefix, **options})
+        )
     if sparkplug:
         group, _, node = sparkplug.partition("/")
         if not (group and node) or "/" in node or re.search(_NO_TOPIC, sparkplug):
             raise AccessError("--sparkplug", sparkplug, "GROUP/NODE, without + and #")
-        first = {"way": "sparkplug", "group": group, "node": node, **options, "client_id": f"{client_id}_b"}
-        ways.append(WayOut("sparkplug", f"{address}/{sparkplug}", ("paho", "google.protobuf"), first))
-    return ways
+        first = {"output": "sparkplug", "group": group, "node": node, **options, "client_id": f"{client_id}_b"}
+        outputs.append(OutputSpec("sparkplug", f"{address}/{sparkplug}", ("paho", "google.protobuf"), first))
+    return outputs
 
 
-def influx_out(url: str, credentials: Credentials, *, plain: bool) -> WayOut:
+def influx_out(url: str, credentials: Credentials, *, plain: bool) -> OutputSpec:
     """Return the output to InfluxDB at `http[s]://HOST[:PORT]/ORG/BUCKET`. The errors are those of `mqtt_out`."""
     expected = "http[s]://HOST:PORT/ORG/BUCKET"
     host, port, path, encrypted = _address("--influx", url, ("http", "https"), expected, plain=plain)
@@ -131,17 +133,17 @@ def influx_out(url: str, credentials: Credentials, *, plain: bool) -> WayOut:
     if not (token.isascii() and token.isprintable()):  # the message must not contain the token
         raise AccessError("the token of influx", f"{len(token)} characters", "ASCII, without line breaks")
     first = {
-        "way": "influx",
+        "output": "influx",
         "url": server,
         "org": org,
         "bucket": bucket,
         "token": token,
         "ca": credentials.file("influx", "ca"),
     }
-    return WayOut("influx", f"{server}/{org}/{bucket}", ("influxdb_client",), first)
+    return OutputSpec("influx", f"{server}/{org}/{bucket}", ("influxdb_client",), first)
 
 
-def opcua_out(url: str, credentials: Credentials, *, plain: bool, acknowledges: bool) -> WayOut:
+def opcua_out(url: str, credentials: Credentials, *, plain: bool, acknowledges: bool) -> OutputSpec:
     """Return the OPC UA server that listens on `opc.tcp://HOST:PORT`. The errors are those of `mqtt_out`."""
     expected = "opc.tcp://HOST:PORT"
     files = {key: credentials.file("opcua", key) for key in ("certificate", "key", "trusted")}
@@ -155,14 +157,14 @@ def opcua_out(url: str, credentials: Credentials, *, plain: bool, acknowledges: 
         raise AccessError("--opcua", url, "certificate and key in --out-access for other machines, or --plain")
     address = f"opc.tcp://{_in_url(host)}:{port}"
     first = {
-        "way": "opcua",
+        "output": "opcua",
         "endpoint": address,
         "user": credentials.text("opcua", "user"),
         "password": credentials.secret("opcua", "password_file", "OPCUA_OUT_PASSWORD"),
         "acknowledges": acknowledges,
         **files,
     }
-    return WayOut("opcua_out", address, ("asyncua",), first, may_acknowledge=acknowledges)
+    return OutputSpec("opcua_out", address, ("asyncua",), first, may_acknowledge=acknowledges)
 
 
 def _in_url(host: str) -> str:

@@ -11,8 +11,8 @@ from influxdb_client import InfluxDBClient, Point, WritePrecision
 from influxdb_client.client.write_api import SYNCHRONOUS
 
 from plow_twin.dashboard.link import Link
+from plow_twin.telemetry.output import State
 from plow_twin.telemetry.values import Group, Newest
-from plow_twin.telemetry.way import State
 
 #: Largest number of points in the queue: ten minutes of all numeric groups at 1 Hz. The oldest points are dropped.
 _WAITING: Final = 2000

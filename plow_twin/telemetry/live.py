@@ -9,11 +9,11 @@ from plow_twin.dashboard.facts import facts_of
 from plow_twin.live.front import BridgeFront
 from plow_twin.live.services import Services
 from plow_twin.live.timer import Timer
-from plow_twin.telemetry.access import WayOut
+from plow_twin.telemetry.access import OutputSpec
 from plow_twin.telemetry.outlet import Outlet
 
 
-def open_way(front: BridgeFront, way: WayOut, rate_hz: float, source: str) -> Outlet:
+def open_output(front: BridgeFront, output: OutputSpec, rate_hz: float, source: str) -> Outlet:
     """Open an output of a twin that has not been started yet. The errors are those of `Outlet`."""
     runtime = front.runtime
     services = Services(runtime, front.changed)
@@ -21,9 +21,9 @@ def open_way(front: BridgeFront, way: WayOut, rate_hz: float, source: str) -> Ou
     def answer(action: str, text: str) -> tuple[bool, str]:
         return services.call("acknowledge_alarms") if action == "acknowledge" else (False, "not possible here")
 
-    asked: Callable[[str, str], tuple[bool, str]] | None = answer if way.may_acknowledge else None
-    outlet = Outlet(way, facts_of(runtime.scene, asdict(runtime.settings), source), asked, front.say_error)
+    asked: Callable[[str, str], tuple[bool, str]] | None = answer if output.may_acknowledge else None
+    outlet = Outlet(output, facts_of(runtime.scene, asdict(runtime.settings), source), asked, front.say_error)
     front.attach(outlet.feed)
-    front.more_parts[way.name] = outlet.part
+    front.more_parts[output.name] = outlet.part
     front.timers.append(Timer(1.0 / rate_hz, outlet.turn))
     return outlet

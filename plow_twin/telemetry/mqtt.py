@@ -13,8 +13,8 @@ from typing import Any, Final, NamedTuple
 
 from plow_twin.dashboard.link import Link
 from plow_twin.live.bridge.paho_client import end_of, make_client, refusal, use_tls
+from plow_twin.telemetry.output import State, TelemetryError
 from plow_twin.telemetry.values import UNITS, Group, Newest
-from plow_twin.telemetry.way import State, TelemetryError
 
 #: Largest number of messages in the queue: ten minutes of all numeric groups at 1 Hz. The oldest messages are dropped.
 _WAITING: Final = 2000

@@ -8,7 +8,7 @@ from contextlib import ExitStack, closing
 from plow_twin.dashboard.node import NodeWatch
 from plow_twin.live.timer import Timer
 from plow_twin.ros.start import ros
-from plow_twin.telemetry.access import WayOut
+from plow_twin.telemetry.access import OutputSpec
 from plow_twin.telemetry.outlet import Outlet
 
 
@@ -16,7 +16,7 @@ def send_node(
     namespace: str,
     name: str,
     scene: str | None,
-    ways: Sequence[WayOut],
+    outputs: Sequence[OutputSpec],
     rate_hz: float,
     wait_s: float,
     stopped: Callable[[], bool],
@@ -40,10 +40,10 @@ def send_node(
         opened.enter_context(ros())
         listeners: list[tuple[NodeWatch, Outlet]] = []
         timers = []
-        for way in ways:
+        for output in outputs:
             watch = opened.enter_context(closing(NodeWatch(namespace, name, wait_s, stopped)))
-            answer = watch.answer if way.may_acknowledge else None
-            outlet = opened.enter_context(Outlet(way, watch.facts(scene), answer, on_error))
+            answer = watch.answer if output.may_acknowledge else None
+            outlet = opened.enter_context(Outlet(output, watch.facts(scene), answer, on_error))
             watch.listen(outlet.feed)
             listeners.append((watch, outlet))
             timers.append(Timer(1.0 / rate_hz, outlet.turn))

@@ -11,8 +11,8 @@ from typing import Any, Final
 from plow_twin.dashboard.beside import END_S, Beside
 from plow_twin.dashboard.feed import Feed
 from plow_twin.live.part import Part
-from plow_twin.telemetry.access import WayOut
-from plow_twin.telemetry.way import TelemetryError
+from plow_twin.telemetry.access import OutputSpec
+from plow_twin.telemetry.output import TelemetryError
 
 #: Longest time in which an output must open [s]. Most of the time is needed to import the library of the output.
 _START_S: Final = 60.0
@@ -28,23 +28,23 @@ class Outlet(Beside):
 
     def __init__(
         self,
-        way: WayOut,
+        output: OutputSpec,
         facts: dict[str, Any],
         answer: Callable[[str, str], tuple[bool, str]] | None,
         on_error: Callable[[str], object],
     ) -> None:
-        for name in way.modules:
+        for name in output.modules:
             if not _is_there(name):
                 raise ModuleNotFoundError(name, name=name)
-        super().__init__("plow_twin.telemetry.process", {**way.first, "facts": facts})
-        self.name, self.address, self._on_error = way.name, way.address, on_error
-        ended = f"the process of {way.address}", "nothing is sent there any more"
+        super().__init__("plow_twin.telemetry.process", {**output.first, "facts": facts})
+        self.name, self.address, self._on_error = output.name, output.address, on_error
+        ended = f"the process of {output.address}", "nothing is sent there any more"
         self.feed = Feed(self.link, facts, answer, None, on_error, *ended)
         self._trouble = ""
         give_up = time.monotonic() + _START_S
         while not (self.feed.report or self.link.broken) and time.monotonic() < give_up:
             select.select([self.link], [], [], 0.1)
-            self.feed.hear()
+            self.feed.receive()
         if not self.feed.report or "failed" in self.feed.report:
             failed = self.feed.report.get("failed", f"{self.address}: its process has ended")
             super().close()
@@ -76,7 +76,7 @@ class Outlet(Beside):
         while not self.link.broken and time.monotonic() < give_up:
             asked = asked or self.link.send({"end": True})
             select.select([self.link], [], [], 0.1)
-            self.feed.hear()
+            self.feed.receive()
         super().close()
 
 

@@ -19,10 +19,10 @@ from typing import Any, Final
 
 from plow_twin.dashboard.link import LONGEST, Link
 from plow_twin.errors import PlowTwinError
+from plow_twin.telemetry.output import Output
 from plow_twin.telemetry.values import Newest
-from plow_twin.telemetry.way import Way
 
-WAYS: Final = {
+OUTPUTS: Final = {
     "mqtt": ("plow_twin.telemetry.mqtt", "MqttOut"),
     "sparkplug": ("plow_twin.telemetry.sparkplug", "Sparkplug"),
     "influx": ("plow_twin.telemetry.influx", "Influx"),
@@ -36,26 +36,26 @@ _REPORT_S: Final = 0.5
 _END_S: Final = 2.0
 
 
-def _report(way: Way) -> dict[str, Any]:
-    return {"do": "report", **asdict(way.state)}
+def _report(output: Output) -> dict[str, Any]:
+    return {"do": "report", **asdict(output.state)}
 
 
-async def serve(link: Link, way: Way, newest: Newest) -> None:
+async def serve(link: Link, output: Output, newest: Newest) -> None:
     """Pass updates to the output until the twin requests the end, or has ended."""
-    sent, ends = _report(way), False
+    sent, ends = _report(output), False
     link.send(sent)
     while not (ends or link.broken):
         await _readable(link)
         while not ends and (update := link.receive()) is not None:
             ends = "end" in update
             if not ends:
-                await way.send(newest.update(update), newest)
-        await way.turn()
-        report = _report(way)
+                await output.send(newest.update(update), newest)
+        await output.turn()
+        report = _report(output)
         if report != sent and link.send(report):
             sent = report
-    await way.close(0.0 if link.broken else _END_S)
-    link.send(_report(way))
+    await output.close(0.0 if link.broken else _END_S)
+    link.send(_report(output))
 
 
 async def _readable(link: Link) -> None:
@@ -67,16 +67,16 @@ async def _readable(link: Link) -> None:
 
 
 async def _run(link: Link, first: dict[str, Any]) -> None:
-    module, name = WAYS[first.pop("way")]
+    module, name = OUTPUTS[first.pop("output")]
     newest = Newest()
     newest.update({"facts": first.pop("facts")})
     try:
-        way: Way = getattr(import_module(module), name)(**first)
-        await way.open(link, newest)
+        output: Output = getattr(import_module(module), name)(**first)
+        await output.open(link, newest)
     except PlowTwinError as error:
         link.send({"do": "report", "failed": str(error)})
         return
-    await serve(link, way, newest)
+    await serve(link, output, newest)
 
 
 def main() -> None:

@@ -134,7 +134,7 @@ class Feeder:
                 if name in self._optional and not other.empty(arrived):
                     self._measured(name, other, arrived)
         stamps, values = found
-        inputs.senders.hear(self._name, self._number + 1, len(stamps))
+        inputs.senders.count_arrival(self._name, self._number + 1, len(stamps))
         self._number += len(stamps)
         self._follow_times(stamps)
         order = [list(role.fields).index(name) for name in ROLES["excitation"]]
@@ -231,7 +231,7 @@ class Feeder:
         if odd is not None and abs(number - odd) < abs(number - before):
             if not before < odd <= before + _MOST_LOST:
                 self._begin_anew()
-                self._runtime.inputs.senders.hear(self._name, odd)
+                self._runtime.inputs.senders.count_arrival(self._name, odd)
                 if odd <= _RESTART:
                     self._runtime.inputs.lost_at_first(self._name, max(odd - 1, 0))
             return True

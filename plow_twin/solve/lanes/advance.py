@@ -284,8 +284,8 @@ def _fail(s, lanes, lane, code) -> None:
 
 
 @kernel()
-def _tell(lanes, reached, viscous, hysteretic, power, fraction) -> None:
-    """Write poses and rates of all lanes to `lanes.out`, and penetrations, their rates and forces to `lanes.told`.
+def _write_outputs(lanes, reached, viscous, hysteretic, power, fraction) -> None:
+    """Write poses and rates of all lanes to `lanes.out`, and values of the pairs to `lanes.pair_values`.
 
     `reached` is a bit mask of the lanes that have reached a sample. Their peaks include the force at the sample.
     """
@@ -309,9 +309,9 @@ def _tell(lanes, reached, viscous, hysteretic, power, fraction) -> None:
                 push = fused(exact_row(lanes.factor, pair) * closing, push, push)
         acts = lanes.on[pair] & below(zero, depth) & below(zero, push)
         force, peak = choose(acts, exact_row(lanes.stiffness, 0) * push, zero), exact_row(lanes.peak, pair)
-        set_row(lanes.told[0], pair, depth)
-        set_row(lanes.told[1], pair, closing)
-        set_row(lanes.told[2], pair, force)
+        set_row(lanes.pair_values[0], pair, depth)
+        set_row(lanes.pair_values[1], pair, closing)
+        set_row(lanes.pair_values[2], pair, force)
         set_row(lanes.peak, pair, choose(below(peak, force) & reached, force, peak))
     turn(lanes.out, X, Y)
     turn(lanes.out, VX, VY)
@@ -322,7 +322,7 @@ def _write_rows(s, lanes, reached) -> None:
     turned = lanes.turned
     transpose(turned[0], lanes.out)
     for i in range(3):
-        transpose(turned[1 + i], lanes.told[i])
+        transpose(turned[1 + i], lanes.pair_values[i])
     transpose(turned[4], lanes.peak)
     transpose(turned[5], lanes.impulse)
     transpose(turned[6], lanes.time_in_contact)
@@ -427,7 +427,7 @@ def _get_ready(s, viscous, hysteretic, power, fraction, slip, rest, lanes, budge
                 failed |= 1 << lane
         lanes.failed[0] = 0
         if reached != 0:
-            _tell(lanes, reached, viscous, hysteretic, power, fraction)
+            _write_outputs(lanes, reached, viscous, hysteretic, power, fraction)
             _write_rows(s, lanes, reached)
             _clear_sums(s, lanes, reached)
         if left | failed != 0:

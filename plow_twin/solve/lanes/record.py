@@ -144,7 +144,7 @@ LANES: Final = np.dtype(
         ("impulse", "f8", _PAIRS),
         ("time_in_contact", "f8", _PAIRS),
         ("out", "f8", (COMPONENTS, WIDTH)),  # values of one scene at eight times, or of eight scenes at one time
-        ("told", "f8", (3, PAIR_COUNT, WIDTH)),  # penetration, rate, force
+        ("pair_values", "f8", (3, PAIR_COUNT, WIDTH)),  # penetration, rate, force
         # blocks whose rows are lanes and whose columns are pairs or components, and the transposes of these blocks
         ("staged", "f8", (_BLOCKS, WIDTH, PAIR_COUNT)),
         ("turned", "f8", (_BLOCKS, PAIR_COUNT, WIDTH)),

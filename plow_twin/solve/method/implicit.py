@@ -40,8 +40,8 @@ from plow_twin.solve.support import (
     FRAME_VY,
     FRAME_X,
     FRAME_Y,
-    SEEN_COS,
-    SEEN_SIN,
+    RELATIVE_COS,
+    RELATIVE_SIN,
     SPIN,
     to_body_both,
     to_ground,
@@ -287,13 +287,13 @@ def _bodies(p, support, state, implicit, i) -> None:
         to_ground(seen, implicit.rate[0, :6], y)
         frame[FRAME_X], frame[FRAME_Y], frame[FRAME_THETA] = z[3], z[4], z[5]
         frame[FRAME_VX], frame[FRAME_VY], frame[SPIN] = z[9], z[10], z[11]
-        frame[SEEN_COS], frame[SEEN_SIN] = seen[COS], seen[SIN]
+        frame[RELATIVE_COS], frame[RELATIVE_SIN] = seen[COS], seen[SIN]
     else:
         to_body(p, state.y, z, y)
 
 
 @kernel()
-def _seen(support, implicit):
+def _relative_nodes(support, implicit):
     """Return the body coordinates relative to the frame at the start and at the nodes, for penetrations."""
     if support is not None:
         return implicit.seen
@@ -303,7 +303,7 @@ def _seen(support, implicit):
 @kernel()
 def _measure(p, support, state, implicit) -> None:
     """Write the acting force, the force by the law, and the penetration rate of each pair at the nodes."""
-    pairs, seen = implicit.pairs, _seen(support, implicit)
+    pairs, seen = implicit.pairs, _relative_nodes(support, implicit)
     for i in range(implicit.nodes.size):
         _bodies(p, support, state, implicit, i + 1)
         y = seen[i + 1]
@@ -321,7 +321,7 @@ def _measure(p, support, state, implicit) -> None:
 def _wear_at_nodes(p, support, state, h, implicit, sliding, running_in) -> float:
     """Compute the wear rate and wear depth of each pad at the nodes. Return the largest change of a depth in m."""
     worn, rates, a, s, change = implicit.wear_depth, implicit.wearing, implicit.weights, implicit.nodes.size, 0.0
-    seen = _seen(support, implicit)
+    seen = _relative_nodes(support, implicit)
     _measure(p, support, state, implicit)
     for i in range(s):
         for pair in range(PAIR_COUNT):
@@ -410,7 +410,7 @@ def _interpolate(values, coefficients, h, out) -> None:
 
 
 @kernel()
-def _series_seen(support, h, w, implicit):
+def _relative_series(support, h, w, implicit):
     """Return the series of the body coordinates relative to the frame, and write the series of a frame on springs."""
     if support is not None:
         frame, s, seen = implicit.frame, implicit.nodes.size, w.seen
@@ -455,7 +455,7 @@ def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float
         for k in range(s):
             w.series[k, i] = scratch[k, i]
         w.series[s, i] = 0.0
-    seen = _series_seen(support, h, w, implicit)
+    seen = _relative_series(support, h, w, implicit)
     _interpolate(pairs[0], implicit.from_stages, h, w.force)
     if wear is not None:
         _interpolate(implicit.wearing, implicit.from_stages, h, scratch)
@@ -472,7 +472,7 @@ def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float
         set_row(w.penetration, k, penetration)
     size = grip = 0.0
     if stick is not None:
-        _write_grip(p, state, h, w, implicit, _seen(support, implicit), seen)
+        _write_grip(p, state, h, w, implicit, _relative_nodes(support, implicit), seen)
         grip = _last_of_guards(p, state, w, h)
     if ramp is not None:
         size = _write_ramp(p, h, w, implicit)

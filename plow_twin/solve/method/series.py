@@ -25,7 +25,7 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_terms
 from plow_twin.solve.grip import grip_terms
 from plow_twin.solve.kinematics import fixed_axes, rolled, row_values, slip_arms
-from plow_twin.solve.rubbing import time_per_way
+from plow_twin.solve.rubbing import time_per_length
 from plow_twin.solve.state import ACTS, BASE, COS, DAMPS, OMEGA, RAMPS, SIN, THETA, VX, VY, X, Y
 from plow_twin.solve.support import (
     FRAME_THETA,
@@ -33,8 +33,8 @@ from plow_twin.solve.support import (
     FRAME_VY,
     FRAME_X,
     FRAME_Y,
-    SEEN_COS,
-    SEEN_SIN,
+    RELATIVE_COS,
+    RELATIVE_SIN,
     SPIN,
     start_frame,
 )
@@ -318,7 +318,7 @@ def _slide(p, w, k, om, dc, ds, dx, dy) -> None:
     sliding, way = w.rub[0], w.rub[1]
     rate = rolled(p, row_values(p.slip_rows, dc, ds, dx, dy), om)
     for pair in range(PAIR_COUNT):
-        sliding[k, pair] = lane(rate, pair) * time_per_way(p, pair)
+        sliding[k, pair] = lane(rate, pair) * time_per_length(p, pair)
     square = _multiply(sliding, sliding, k)
     if k == 0:
         for pair in range(PAIR_COUNT):
@@ -382,7 +382,7 @@ def _slide_size(p, w, k, sliding, running_in):
     if sliding is not None:
         for pair in range(PAIR_COUNT):
             if w.per_pair[ACTS, pair] != 0.0 and p.speed_per_wear != 0.0:
-                size += abs(w.rub[1, k - 1, pair]) / time_per_way(p, pair)
+                size += abs(w.rub[1, k - 1, pair]) / time_per_length(p, pair)
     return size
 
 
@@ -407,7 +407,7 @@ def _turn_frame(w, k, there, c, s):
 
 
 @kernel(fast=True)
-def _seen_rates(w, k, there, turned, om, turning):
+def _relative_rates(w, k, there, turned, om, turning):
     """Return coefficient k of the rates of the head's cosine, sine and position relative to the frame.
 
     `turned` is the result of `_turn_frame`: R^T u and R^T w with the frame's displacement u and velocity w, where R
@@ -415,7 +415,9 @@ def _seen_rates(w, k, there, turned, om, turning):
     """
     relative = om - lane(there, SPIN)
     left = pack(om, om, relative, relative, 0.0, 0.0, 0.0, 0.0)
-    right = pack(lane(turned, 1), -lane(turned, 0), -lane(there, SEEN_SIN), lane(there, SEEN_COS), 0.0, 0.0, 0.0, 0.0)
+    right = pack(
+        lane(turned, 1), -lane(turned, 0), -lane(there, RELATIVE_SIN), lane(there, RELATIVE_COS), 0.0, 0.0, 0.0, 0.0
+    )
     set_row(w.frame_left[1], k, left)
     set_row(w.frame_right[1], k, right)
     rates = _join(w.frame_left[1], w.frame_right[1], k, left, right)
@@ -468,7 +470,7 @@ def _size(p, w, k, penetrating, sigma_limit, wear, support, sliding, running_in)
     if support is not None:
         there = w.frame[k]
         size += abs(there[FRAME_VX]) + abs(there[FRAME_VY]) + p.radius * abs(there[SPIN])
-        size += p.weight * (abs(there[SEEN_COS]) + abs(there[SEEN_SIN]))
+        size += p.weight * (abs(there[RELATIVE_COS]) + abs(there[RELATIVE_SIN]))
     if wear is not None and penetrating:
         size += p.weight / p.radius * total(magnitude(row(w.wear, k)))
         size += _slide_size(p, w, k, sliding, running_in) / sigma_limit
@@ -515,7 +517,7 @@ def expand(
         if support is not None:
             set_row(w.frame, k, there)
             frame_turned = _turn_frame(w, k, there, c, s)
-            seen_c, seen_s = lane(there, SEEN_COS), lane(there, SEEN_SIN)
+            seen_c, seen_s = lane(there, RELATIVE_COS), lane(there, RELATIVE_SIN)
             seen_x, seen_y = x - lane(frame_turned, 0), yy - lane(frame_turned, 1)
         if k == 0:
             penetration = (
@@ -555,7 +557,7 @@ def expand(
         steady, bent = alpha * inverse[k + 1], beta * inverse[k + 1]
         dx, dy, dc, ds = lane(turning, X), lane(turning, Y), lane(turning, COS), lane(turning, SIN)
         if support is not None:
-            dx, dy, dc, ds = _seen_rates(w, k, there, frame_turned, om, turning)
+            dx, dy, dc, ds = _relative_rates(w, k, there, frame_turned, om, turning)
             pushed = splat(0.0)
         if penetrating:
             rate = row_values(p.penetration_rows, dc, ds, dx, dy)

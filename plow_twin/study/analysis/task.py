@@ -23,8 +23,8 @@ from plow_twin.study.analysis.analyse import MAPPED_LOAD, Analysis, OnProgress, 
 from plow_twin.study.analysis.report import write_report
 
 #: File with the inputs of an analysis. It is written last, so it shows that the analysis is complete.
-_ASKED: Final = "asked.json"
-_FILES: Final = (_ASKED, "analysis.json", "report.html", "measured.parquet")
+_INPUTS: Final = "asked.json"
+_FILES: Final = (_INPUTS, "analysis.json", "report.html", "measured.parquet")
 #: Names of the tables. A number marks a table of a further scene (`--with`).
 _TABLE: Final = re.compile(r"(predicted|clearance|face|slide_wear)(_\d+)?\.parquet")
 
@@ -77,7 +77,7 @@ class Task:
         if self.out is None:
             return None
         try:
-            asked = json.loads((self.out / _ASKED).read_text(encoding="utf-8"))
+            asked = json.loads((self.out / _INPUTS).read_text(encoding="utf-8"))
             facts: dict[str, Any] = json.loads((self.out / "analysis.json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return None
@@ -104,14 +104,14 @@ class Task:
         self._keep(self._old(), inputs)
 
     def _old(self) -> list[Path]:
-        """Return the files of an earlier analysis, beginning with `_ASKED`."""
+        """Return the files of an earlier analysis, beginning with `_INPUTS`."""
         if self.out is None or not self.out.is_dir():
             return []
         found = sorted(path for path in self.out.iterdir() if path.name in _FILES or _TABLE.fullmatch(path.name))
         run = self.out / "run"
         if run.is_dir() and all(map(_is_ours, run.iterdir())):
             found.append(run)
-        return sorted(found, key=lambda path: path.name != _ASKED)
+        return sorted(found, key=lambda path: path.name != _INPUTS)
 
     def _keep(self, old: Sequence[Path], inputs: Sequence[Path]) -> None:
         for path in inputs:
@@ -138,7 +138,7 @@ class Task:
         found.left_out = self.left_out
         if self.out is not None:
             write_report(found, self.out)
-            write_whole(self.out / _ASKED, json.dumps(asked, indent=1).encode(), sync=True)
+            write_whole(self.out / _INPUTS, json.dumps(asked, indent=1).encode(), sync=True)
         return {**found.facts(), "lossy": found.lossy}
 
     def _asked(self) -> dict[str, Any]:

@@ -22,8 +22,8 @@ from plow_twin.access import key_format
 from plow_twin.dashboard.link import Link
 from plow_twin.telemetry.opcua.conditions import Conditions
 from plow_twin.telemetry.opcua.model import Model
+from plow_twin.telemetry.output import State, TelemetryError
 from plow_twin.telemetry.values import Group, Newest, Value
-from plow_twin.telemetry.way import State, TelemetryError
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _POLICIES: Final = [

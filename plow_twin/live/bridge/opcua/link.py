@@ -28,7 +28,7 @@ _QUEUE: Final = 10_000
 _KEEPALIVE_S: Final = 2.0
 #: Time after which the server deletes the subscription of a client that has disappeared [s].
 _LIFETIME_S: Final = 60.0
-_MOST_AGAIN: Final = 100
+_MOST_REPEATED: Final = 100
 _ANSWER_S: Final = 10.0
 _CLOSE_S: Final = 2.0
 _LARGEST_MESSAGE: Final = 64 << 20
@@ -238,12 +238,12 @@ class Link:
             return
         missing = self._missing(message.SequenceNumber)
         lost = 0
-        for number in missing[:_MOST_AGAIN]:
+        for number in missing[:_MOST_REPEATED]:
             again = await self._again(number)
             lost += again is None
             if again is not None:
                 await self._take_message(again, lost=False)
-        lost += len(missing[_MOST_AGAIN:])
+        lost += len(missing[_MOST_REPEATED:])
         self._counts.notifications_lost += lost
         await self._take_message(message, lost=lost > 0)
 

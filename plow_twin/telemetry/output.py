@@ -28,7 +28,7 @@ class State:
     trouble: str = ""
 
 
-class Way(Protocol):
+class Output(Protocol):
     """Interface of an output."""
 
     state: State
