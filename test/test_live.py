@@ -793,7 +793,7 @@ print(os.sched_getaffinity(0) == {one})
         (["mqtt://localhost:1"], 1, "expected a mapping that assigns the topics"),
     ],
 )
-def test_a_wrong_call_is_refused_with_the_expected_call(
+def test_a_message_about_a_wrong_call_states_the_expected_call(
     arguments: list[str],
     code: int,
     said: str,

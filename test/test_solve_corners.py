@@ -205,7 +205,7 @@ def test_corners_move_the_same_by_a_live_twin(falls) -> None:
     np.testing.assert_allclose(now.q, falls.q[100], atol=1e-9)
 
 
-def test_senses_of_corners_are_those_of_the_block() -> None:
+def test_pairs_of_a_block_stop_the_rotations_of_the_block() -> None:
     # a moment turns the block counter-clockwise against its guide; a larger moment would need implicit steps, which
     # must be compiled
     scene = block(

@@ -131,9 +131,7 @@ def same(one: Ensemble, i: int, other: Ensemble, k: int) -> bool:
         pytest.param(True, False, 2, False, marks=[pytest.mark.stress, pytest.mark.timeout(1200)]),
     ],
 )
-def test_a_scene_has_the_same_bits_alone_and_with_others(
-    powers: bool, friction: bool, seed: int, some: bool
-) -> None:
+def test_a_scene_has_the_same_bits_alone_and_with_others(powers: bool, friction: bool, seed: int, some: bool) -> None:
     scenes = drawn(seed, 19, some, powers, friction)
     together = simulate_many(scenes, 1.0, 0.05, 1e-7, workers=1)
     # the lanes end at very different times and are filled again

@@ -24,7 +24,7 @@ def dry_run(target: str, *variables: str) -> str:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
 
 
-def test_stress_draws_new_examples_prints_its_seed_and_shrinks() -> None:
+def test_a_stress_run_draws_new_examples_and_prints_its_seed() -> None:
     stress = settings.get_profile("stress")
     assert not stress.derandomize and stress.database is None and Phase.shrink in stress.phases
     line = dry_run("stress")

@@ -30,7 +30,7 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     return kept_figures(monkeypatch)
 
 
-def test_an_hour_of_load_fills_the_same_band_everywhere() -> None:
+def test_the_band_of_an_hour_of_load_is_constant() -> None:
     envelope = Envelope(1)
     times = np.arange(72_000) / 20.0
     for part in np.array_split(times, 300):  # rows arrive in parts, as in the batches of a recording

@@ -112,7 +112,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "poses_used": "measured poses that corrected the motion of the twins",
         "poses_outlying": "poses that were ignored, because they are too far from their predictions",
         "poses_dropped": "poses dropped because they were an hour ahead of the load or too many poses waited",
-        "taken_over": "times that the twins were drawn again, because an estimate or the machine changed",
+        "taken_over": "number of times that the twins were drawn again, because an estimate or the machine had changed",
         "reduced": "1 if poses no longer correct the motion, because the twins were too slow",
     },
     "recorder": {

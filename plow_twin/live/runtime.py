@@ -231,7 +231,7 @@ class Runtime:
         if folder is None:
             return True, "written to the recording"
         self._renew_recording()
-        return True, f"the ring in memory will be written to {folder}"
+        return True, f"the last seconds of the run will be written to {folder}"
 
     def record_status(self, status: DiagnosticStatus) -> None:
         """Record a published status."""

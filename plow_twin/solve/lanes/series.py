@@ -256,7 +256,7 @@ def tested(power) -> int:
 
 @kernel(inline="code")
 def _long_quiet(history) -> int:
-    """Return a bit mask of the lanes whose terms were negligible in all last orders before the newest."""
+    """Return a bit mask of the lanes whose terms are negligible in the last orders, without the newest order."""
     bits = history
     for i in range(1, MOST_LACUNA - 1):
         bits &= history >> WIDTH * i
@@ -295,7 +295,7 @@ def _set_state(series, k, x, y, vx, vy, om, c, s, angle) -> None:
 
 @kernel(inline="code")
 def _add_ends(load, k, c0, s0, c, s, share, wc, ws):
-    """Return coefficient k of a load times cosine and sine: `wc` and `ws` plus the first and the last product."""
+    """Add the first and the last product to `wc` and `ws`, coefficient k of a load times cosine and sine."""
     first, newest = exact_row(load, 0) * share, exact_row(load, k)
     return fused(newest, c0, fused(first, c, wc)), fused(newest, s0, fused(first, s, ws))
 
