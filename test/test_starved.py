@@ -19,8 +19,12 @@ from plow_twin.record.replay import replay
 LIVE = ("live", "load.csv", "--scene", "paper", "--record", "run", "-q")
 
 
-def _limit(kind: int, most: int) -> Callable[[], None]:
-    return lambda: resource.setrlimit(kind, (most, most))
+def _limit(**most: int) -> Callable[[], None]:
+    def limit() -> None:
+        for kind, number in most.items():
+            resource.setrlimit(getattr(resource, f"RLIMIT_{kind}"), (number, number))
+
+    return limit
 
 
 def _run(
@@ -62,14 +66,14 @@ def folder(compiled: None, tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     "lacking",
     [
-        {"before": _limit(resource.RLIMIT_AS, 3_000_000_000)},
-        {"before": _limit(resource.RLIMIT_NOFILE, 64)},
-        {"HOME": None, "XDG_CACHE_HOME": None},
+        {"before": _limit(AS=3_000_000_000, NOFILE=64)},
+        {
+            **{"HOME": None, "XDG_CACHE_HOME": None, "TERM": None, "COLUMNS": "20"},
+            **{"LC_ALL": "C", "LANG": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+        },
         {"HOME": "/proc/nothing", "XDG_CACHE_HOME": "/proc/nothing"},
-        {"LC_ALL": "C", "LANG": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
-        {"TERM": None, "COLUMNS": "20"},
     ],
-    ids=["3 GB of addresses", "64 files", "no home", "a home that is not there", "the locale C", "no terminal"],
+    ids=["3 GB of addresses, 64 files", "no home, no terminal, the locale C", "a home that is not there"],
 )
 def test_a_run_and_its_replay_work_with_few_resources(lacking: dict[str, object], folder: Path) -> None:
     assert _run(folder, *LIVE, **lacking) == (0, [])  # type: ignore[arg-type]
@@ -117,9 +121,9 @@ def test_a_recording_in_progress_is_replayed_up_to_its_end(folder: Path) -> None
 @pytest.mark.parametrize(
     ("lacking", "code", "said"),
     [
-        ({"before": _limit(resource.RLIMIT_AS, 150_000_000)}, 1, "a library cannot be loaded"),
-        ({"before": _limit(resource.RLIMIT_FSIZE, 0)}, 1, "File too large"),
-        ({"before": _limit(resource.RLIMIT_FSIZE, 100_000)}, 3, "File too large"),
+        ({"before": _limit(AS=150_000_000)}, 1, "a library cannot be loaded"),
+        ({"before": _limit(FSIZE=0)}, 1, "File too large"),
+        ({"before": _limit(FSIZE=100_000)}, 3, "File too large"),
         ({"NUMBA_DISABLE_JIT": "1"}, 1, "NUMBA_DISABLE_JIT is set, expected it unset"),
     ],
     ids=["150 MB of addresses", "no room for a file", "100 kB for a file", "no compiled code"],
