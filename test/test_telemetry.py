@@ -21,10 +21,12 @@ from commands import plow_twin_here
 from test_live import Live, _csv, _free_port, _live
 from test_mqtt import STALE, _entries
 
+from plow_twin.live.bridge.source import BridgeError
 from plow_twin.stream.journal import Parameter
 from plow_twin.telemetry.access import AccessError, Credentials, influx_out, opcua_out
 from plow_twin.telemetry.influx import Influx
 from plow_twin.telemetry.opcua.model import NAMESPACE
+from plow_twin.telemetry.opcua.server import Trusted
 from plow_twin.telemetry.values import Group, Newest
 
 
@@ -137,7 +139,8 @@ def test_an_opcua_server_for_other_machines_encrypts_and_admits_trusted_clients(
     for name in ("server", "client", "other"):
         _certificate(tmp_path, name)
     (tmp_path / "trusted").mkdir()
-    (tmp_path / "client.pem").rename(tmp_path / "trusted" / "client.pem")
+    (tmp_path / "client.pem").rename(tmp_path / "trusted" / "client.crt")
+    (tmp_path / "trusted" / "note.txt").write_text("for the operator")
     (tmp_path / "secret").write_text("s3cret\n")
     (tmp_path / "out.yaml").write_text(
         "opcua: {certificate: server.pem, key: server.key.pem, trusted: trusted, user: plant, password_file: secret}\n"
@@ -154,7 +157,7 @@ def test_an_opcua_server_for_other_machines_encrypts_and_admits_trusted_clients(
             if certificate is not None:
                 key = CertProperties(tmp_path / f"{certificate.stem}.key.pem")
                 await client.set_security(
-                    SecurityPolicyAes256Sha256RsaPss, CertProperties(certificate), key,
+                    SecurityPolicyAes256Sha256RsaPss, CertProperties(certificate, "pem"), key,
                     server_certificate=CertProperties(tmp_path / "server.pem"),
                 )  # fmt: skip
             async with client:
@@ -167,11 +170,16 @@ def test_an_opcua_server_for_other_machines_encrypts_and_admits_trusted_clients(
     assert done.returncode == 2 and "certificate and key in --out-access for other machines" in done.stderr
     with _live(*arguments, "--out-access", str(tmp_path / "out.yaml"), *STALE) as live:
         live.until_count("samples_used", 100)
-        trusted, other = tmp_path / "trusted" / "client.pem", tmp_path / "other.pem"
+        trusted, other = tmp_path / "trusted" / "client.crt", tmp_path / "other.pem"
         cases = ((trusted, "s3cret"), (trusted, "guess"), (other, "s3cret"), (None, "s3cret"))
         found = [_meanwhile(live, connects(*given)) for given in cases]
         assert found == [True, False, False, False]
-        assert live.stop() == 0
+        live.process.terminate()
+        said = live.process.communicate(timeout=60.0)[1]
+        assert live.process.returncode == 0 and b"Traceback" not in said
+    (tmp_path / "trusted" / "bad.pem").write_text("none")
+    with pytest.raises(BridgeError, match=r"bad\.pem: got no certificate"):
+        asyncio.run(Trusted([tmp_path / "trusted"], []).load())
 
 
 def _certificate(folder: Path, name: str) -> None:

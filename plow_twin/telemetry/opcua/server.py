@@ -20,6 +20,7 @@ from cryptography import x509
 
 from plow_twin.access import key_format
 from plow_twin.dashboard.link import Link
+from plow_twin.live.bridge.opcua.security import read_certificate
 from plow_twin.telemetry.opcua.conditions import Conditions
 from plow_twin.telemetry.opcua.model import Model
 from plow_twin.telemetry.output import State, TelemetryError
@@ -35,6 +36,7 @@ _UNKNOWN: Final = ua.StatusCode(StatusCodes.BadWaitingForInitialData)
 #: Status of a number that was computed without new samples of the load.
 _HELD: Final = ua.StatusCode(StatusCodes.UncertainLastUsableValue)
 _GOOD: Final = ua.StatusCode()
+_SUFFIXES: Final = (".pem", ".der", ".crt", ".cer")
 
 
 class OneUser(UserManager):
@@ -50,6 +52,13 @@ class OneUser(UserManager):
         given = zip((self._user, self._password), (username or "", password or ""), strict=True)
         right = all([hmac.compare_digest(own.encode(), found.encode("utf-8", "replace")) for own, found in given])
         return User(UserRole.User, username) if right or not self._user else None
+
+
+class Trusted(TrustStore):
+    """Certificates in a folder, whose format is found in their content. asyncua reads only names with der or pem."""
+
+    async def _load_trust_location(self, location: Path) -> list[x509.Certificate]:
+        return [read_certificate(path) for path in sorted(location.iterdir()) if path.suffix.lower() in _SUFFIXES]
 
 
 class OpcUaServer:
@@ -73,9 +82,10 @@ class OpcUaServer:
         self.state = State()
         self._endpoint, self._certificate, self._key, self._trusted = endpoint, certificate, key, trusted
         self._acknowledges = acknowledges
-        logger = logging.getLogger("asyncua")
-        logger.addHandler(logging.NullHandler())
-        logger.propagate = False
+        for name in ("asyncua", "asyncuagds"):  # asyncuagds logs the certificates that it refuses
+            logger = logging.getLogger(name)
+            logger.addHandler(logging.NullHandler())
+            logger.propagate = False
         self._server = Server(user_manager=OneUser(user, password))
         self._tokens: list[type] = [ua.UserNameIdentityToken] if user else [ua.AnonymousIdentityToken]
         self._model = Model(self._server)
@@ -133,7 +143,7 @@ class OpcUaServer:
             if uri:
                 await self._server.set_application_uri(uri)
             if self._trusted:
-                store = TrustStore([Path(self._trusted)], [])
+                store = Trusted([Path(self._trusted)], [])
                 await store.load()
                 checks = CertificateValidatorOptions.BASIC_VALIDATION | CertificateValidatorOptions.TRUSTED
                 validator = CertificateValidator(checks | CertificateValidatorOptions.PEER_CLIENT, store)

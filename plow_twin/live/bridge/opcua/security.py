@@ -42,8 +42,8 @@ async def secure(client: Client, access: Access, host: str) -> None:
         expected = ", ".join(policy.URI.rpartition("#")[2] for policy in _POLICIES)
         raise BridgeError(f"{access.url}: got a server that offers no encryption, expected one of {expected}")
     server = _first(offered[policy.URI].ServerCertificate)
-    _check_trust(x509.load_der_x509_certificate(server), _read(access.ca), host, access)
-    own = _read(access.certificate)
+    _check_trust(x509.load_der_x509_certificate(server), read_certificate(access.ca), host, access)
+    own = read_certificate(access.certificate)
     client.application_uri = _application_uri(own, client.application_uri)
     try:
         key = await load_private_key(access.key, extension=_format(access.key))
@@ -80,7 +80,8 @@ def _format(path: Path) -> str:
     return key_format(path.read_bytes())
 
 
-def _read(path: Path) -> x509.Certificate:
+def read_certificate(path: Path) -> x509.Certificate:
+    """Return the certificate in a file. Raise `BridgeError` if the file contains none."""
     try:
         data = path.read_bytes()
         return (
