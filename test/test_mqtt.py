@@ -211,7 +211,11 @@ def test_a_wrong_password_a_strange_certificate_and_a_broker_without_tls_are_ref
         with pytest.raises(BridgeError, match=said):
             bridge.start(["plough/load"])
         assert not bridge.connected
-    for topic, said in (("prohibited", "refused: prohibited"), ("plough/+/load", r"topic: got 'plough/\+/load'")):
+    for topic, said in (
+        ("prohibited", "refused: prohibited"),
+        ("plough/+/load", r"topic: got 'plough/\+/load'"),
+        ("p" * 70_000, r"70000 characters\)', expected one topic of up to 65,535"),
+    ):
         with pytest.raises(BridgeError, match=said):
             Mqtt(replace(broker, client_id="other"), connect_s=60.0).start(["plough/load", topic])
 

@@ -23,7 +23,7 @@ from test_mqtt import STALE, _entries
 
 from plow_twin.live.bridge.source import BridgeError
 from plow_twin.stream.journal import Parameter
-from plow_twin.telemetry.access import AccessError, Credentials, influx_out, opcua_out
+from plow_twin.telemetry.access import AccessError, Credentials, influx_out, mqtt_out, opcua_out
 from plow_twin.telemetry.influx import Influx
 from plow_twin.telemetry.opcua.model import NAMESPACE
 from plow_twin.telemetry.opcua.server import Trusted
@@ -270,6 +270,8 @@ def test_an_ipv6_address_keeps_its_brackets_and_a_bad_token_is_refused_without_p
     assert influx_out("http://[::1]:8086/mine/face", Credentials(), plain=False).first["url"] == "http://[::1]:8086"
     served = opcua_out("opc.tcp://[::1]:4841", Credentials(), plain=False, acknowledges=False)
     assert served.address == served.first["endpoint"] == "opc.tcp://[::1]:4841"
+    with pytest.raises(AccessError, match="the prefix without"):
+        mqtt_out(f"mqtt://localhost/{'p' * 70_000}", Credentials(), plain=False)
     for token in ("t\N{EURO SIGN}ken", "a-token\n"):
         monkeypatch.setenv("PLOW_TWIN_INFLUX_TOKEN", token)
         with pytest.raises(AccessError) as caught:

@@ -32,8 +32,9 @@ class AccessError(InputError):
         super().__init__([Problem(key, got, expected)], "telemetry")
 
 
-#: Characters that are not allowed in the name of a topic: wildcards, control characters and a `$` at the beginning.
-_NO_TOPIC: Final = re.compile(r"[+#\x00-\x1f]|^\$")
+#: Not allowed in the name of a topic: wildcards, control characters, a `$` at the beginning, and a length at which the
+#: name may exceed the 65,535 bytes of MQTT.
+_NO_TOPIC: Final = re.compile(r"[+#\x00-\x1f]|^\$|.{16000}")
 
 
 @dataclass(frozen=True)

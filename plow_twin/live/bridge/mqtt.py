@@ -25,6 +25,8 @@ from plow_twin.record.sources import Arrived
 _QUEUE: Final = 100_000
 #: Largest total size of the messages in the queue [B]. If the size is reached, new messages are counted as lost.
 _QUEUED_BYTES: Final = 2**26
+#: Largest length of the name of a topic in MQTT [B].
+_LONGEST_TOPIC: Final = 65_535
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
 
 
@@ -59,8 +61,9 @@ class Mqtt(Bridge):
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
         """Connect to the broker and subscribe to the topics."""
         for topic in topics:
-            if any(sign in topic for sign in "+#") or not topic:
-                raise BridgeError(f"topic: got {topic!r}, expected one topic, without + and #")
+            if any(sign in topic for sign in "+#\0") or not 0 < len(topic.encode()) <= _LONGEST_TOPIC:
+                got = topic if len(topic) < 200 else f"{topic[:20]}... ({len(topic)} characters)"
+                raise BridgeError(f"topic: got {got!r}, expected one topic of up to 65,535 bytes, without + and #")
         self._topics = topics
         try:
             self._client.connect(self.host, self.port)
