@@ -293,6 +293,16 @@ def test_the_travel_determines_the_passes_of_the_face(tmp_path: Path) -> None:
     assert only.slide_wear and not only.pad_wear[1].any()
 
 
+def test_a_late_speed_acts_from_its_stamp_on_as_in_the_twin(tmp_path: Path) -> None:
+    entries: list[Entry] = [paper_sample(index) for index in range(301)]
+    for place, late in ((290, -3), (250, 5), (150, 40)):
+        entries.insert(place, Travel(BASE_NS + (place - late) * STEP_NS + 300_000, 1e-2 * place))
+    run = record_run(tmp_path / "run", entries, wear=Wear(1e-9, 0.015, 2.0), rollback_span_s=0.1)
+    depth = [message.position[2:10] for topic, message in run.outputs if topic.endswith("clearance")][-1]
+    worn = analyse(run.folder).predictions[0].loads.pad_wear.sum(axis=0)
+    assert worn.max() > 0.0 and worn == pytest.approx(np.array(depth), rel=1e-9)
+
+
 @pytest.mark.parametrize("lag_s", [0.0, 0.0203, -0.4])
 @pytest.mark.parametrize(("rate_hz", "times_each"), [(1000, 1), (1000, 2), (200, 1), (37, 1)])
 def test_the_lag_is_found_at_any_rate_of_the_sensor(rate_hz: int, times_each: int, lag_s: float) -> None:

@@ -6,6 +6,7 @@ A *walker* advances one session. The load is interpolated linearly between all s
 from __future__ import annotations
 
 from bisect import insort
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -27,9 +28,9 @@ if TYPE_CHECKING:
 
 #: Largest number of samples by which a session advances in one call.
 BATCH: Final = 4096
-#: Types of entries that change the session. Samples between two entries of these types are sorted by their stamps.
+#: Types of entries that change the session. Samples and speeds between two entries of these types are sorted by their
+#: stamps.
 _ACTING: Final = (
-    journal.Travel,
     journal.Reset,
     journal.Loss,
     journal.Restore,
@@ -113,7 +114,7 @@ class Walker:
         count = len(stamp_ns)
         numbers = self._advances + 1 + np.arange(count)
         marks = 1 + np.flatnonzero(numbers % DIGEST_INTERVAL == 0)
-        before, speed = self.session.outputs.makes, self.session.travel_speed_m_s
+        before = self.session.outputs.makes
         done = self.session.advance(stamp_ns, wrench, np.zeros(count, ROW), np.arange(count), marks)
         self._advances += count
         self.failures += done.failed
@@ -121,7 +122,7 @@ class Walker:
             self._write(stamp_ns, wrench, log_ns, marks, done)
         rows = AdvanceSeries(done.rows)
         makes = np.diff(rows.makes, axis=0, prepend=before[None])
-        scene = self.session.twin.scene
+        scene, speed = self.session.twin.scene, self.session.travel_speed_m_s
         self._on_walked(Walked(stamp_ns, wrench, rows, done.published, makes, speed, scene))
         if count >= _FAILURE_LIMIT and rows.status[-_FAILURE_LIMIT:].all():
             self.apply(journal.Reset(int(stamp_ns[-1]), f"{_FAILURE_LIMIT} failed advances"), int(log_ns[-1]))
@@ -190,8 +191,12 @@ class JournalWalk:
     def _whole(self, entries: Entries) -> None:
         stamps, wrench, begin = entries.stamp_ns, entries.wrench, 0
         acting = sorted(place for place, entry in entries.rest.items() if isinstance(entry, self._acting))
+        found = ((place, entry) for place, entry in entries.rest.items() if isinstance(entry, journal.Travel))
+        travels = deque(sorted(found, key=lambda item: item[0]))
         for place in (*acting, len(entries)):
             samples = begin + np.flatnonzero(entries.sample[begin:place])
+            while travels and travels[0][0] < place:
+                insort(self._travels, travels.popleft()[1], key=lambda travel: travel.stamp_ns)
             if samples.size:
                 self._samples(stamps[samples], wrench[samples])
             if place < len(entries):
@@ -213,24 +218,20 @@ class JournalWalk:
                     walker.samples(stamps[:count], wrench[:count], stamps[:count])
                 stamps, wrench = stamps[count:], wrench[count:]
             if len(stamps):
-                self._speed(self._travels.pop(0).speed_m_s)
+                travel = self._travels.pop(0)
+                self._speed(max(travel.stamp_ns, self._reached_ns), travel.speed_m_s)
 
-    def _speed(self, speed_m_s: float) -> None:
+    def _speed(self, stamp_ns: int, speed_m_s: float) -> None:
         for walker in self._all:
-            # if the stamp of the speed has already been reached, the speed takes effect immediately
-            walker.apply(journal.Travel(max(0, self._reached_ns), speed_m_s))
+            walker.apply(journal.Travel(stamp_ns, speed_m_s))
 
     def _begin_anew(self) -> None:
         for travel in self._travels:
-            self._speed(travel.speed_m_s)
+            self._speed(max(0, self._reached_ns), travel.speed_m_s)
         self._travels, self._reached_ns = [], -1
 
     def _entry(self, entry: journal.Entry | Dropped) -> None:
         match entry:
-            case journal.Travel(stamp_ns, speed) if 0 <= self._reached_ns < stamp_ns:
-                insort(self._travels, entry, key=lambda travel: travel.stamp_ns)
-            case journal.Travel(_, speed):
-                self._speed(speed)
             case journal.Reset() | journal.Loss():
                 self._begin_anew()
                 for walker in self._all:
