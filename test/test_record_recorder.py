@@ -456,16 +456,16 @@ def test_closing_waits_while_items_are_written_and_then_reports_missing_items(
     monkeypatch.setattr("plow_twin.record.recorder._BURST", 10)
     monkeypatch.setattr(RunWriter, "write_samples", slowly)
     for count in (50, 51):
-        recorder = Recorder(tmp_path / f"run{count}", HEADER)
+        recorder = Recorder(tmp_path / f"run {count}", HEADER)
         for index in range(count):
             assert recorder.journal(paper_sample(index))
         # writing one burst takes 0.3 s, which is fast enough; five bursts take 1.5 s, which is too long
         report = recorder.close(timeout_s=0.6)
         assert report.complete == (count == 50)
-    sentence = report.sentence(tmp_path / "run51")
+    sentence = report.sentence(tmp_path / "run 51")
     stuck.set()
     assert "is incomplete: no data were written for 0.6 s, " in sentence and "are unwritten; its last file" in sentence
-    assert sentence.endswith(f"plow-twin doctor --repair {tmp_path / 'run51'} completes its files")
+    assert sentence.endswith(f"plow-twin doctor --repair '{tmp_path / 'run 51'}' completes its files")
 
 
 def test_an_earlier_recording_is_never_written_over(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -184,8 +185,8 @@ def say_end(recording: object, status: str) -> None:
     from plow_twin.record.reader import FileStatus
 
     if status not in (FileStatus.COMPLETE.value, FileStatus.UNREAD.value):
-        cut = status == FileStatus.TRUNCATED.value
-        remedy = f"; plow-twin doctor --repair {recording} completes it after the end of the run" if cut else ""
+        remedy = f"; plow-twin doctor --repair {shlex.quote(str(recording))} completes it after the end of the run"
+        remedy = remedy if status == FileStatus.TRUNCATED.value else ""
         say_error(f"plow-twin: {recording}: {status}{remedy}")
 
 

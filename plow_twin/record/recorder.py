@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import atexit
 import errno
+import shlex
 import threading
 import time
 from collections import Counter, deque
@@ -82,10 +83,11 @@ class LossReport:
         lacks = [f"{count} lost of {topic}" for topic, count in self.lost.items()]
         if self.error is not None:
             lacks.append(self.error)
-        remedy = f"plow-twin info {folder} shows its content"
+        quoted = shlex.quote(str(folder))
+        remedy = f"plow-twin info {quoted} shows its content"
         if not self.closed:
             lacks.append("its last file has no end")
-            remedy += f", plow-twin doctor --repair {folder} completes its files"
+            remedy += f", plow-twin doctor --repair {quoted} completes its files"
         return f"the recording {folder} is incomplete: {'; '.join(lacks)}. {remedy}"
 
 
