@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -78,14 +79,16 @@ class Forward:
         self._implicit = nominal.parts.implicit
         if self._implicit is None and scene.contact.restitution is not None:
             self._implicit = new_implicit(False)
-        pieces = Pieces.through(load.t, load.wrench)
-        self._start, self._slope = pieces.start, pieces.slope
-        self._knots = pieces.knots
-        self._scene, self.load = scene, load
+        self._scene = scene
+        self._set_load(load)
         self._work, self._log = new_work(), np.zeros(_LOG_SIZE, EVENT)
         self._params: tuple[Scene, tuple[bytes | None, ...], Any] | None = None
         #: work of all simulations so far, in steps of the series
         self.work = 0
+
+    def _set_load(self, load: Load) -> None:
+        pieces = Pieces.through(load.t, load.wrench)
+        self._start, self._slope, self._knots, self.load = pieces.start, pieces.slope, pieces.knots, load
 
     def renewed(self) -> Forward:
         """Return a copy with the work counter at zero."""
@@ -97,7 +100,10 @@ class Forward:
 
     def under(self, load: Load) -> Forward:
         """Return a model of this nominal scene under the load `load`, with the work counter at zero."""
-        return Forward(self._scene, load)
+        other = copy(self)
+        other._set_load(load)
+        other.work = 0
+        return other
 
     def run(
         self, scene: Scene, gain: Array, starts: Array, states: Array, edges: NDArray[np.int64], times: Array,
