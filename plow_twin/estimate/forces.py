@@ -7,7 +7,7 @@ influence, so the members differ only by the uncertainty of the estimate.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -18,9 +18,9 @@ from plow_twin.estimate import tuning
 from plow_twin.estimate.harmonics import Harmonics
 from plow_twin.estimate.measurements import Load
 from plow_twin.estimate.result import NORMAL_P95, Estimate, Interval, State
-from plow_twin.estimate.unknowns import CORRELATED, DAMPING, GAIN, SOFTNESS, contact_with
+from plow_twin.estimate.unknowns import CORRELATED, DAMPING, GAIN, SOFTNESS, contact_numbers
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
-from plow_twin.model.scene import Clearance, Scene
+from plow_twin.model.scene import Scene, variants
 from plow_twin.run.batch import TwinBatch
 
 Array = NDArray[np.float64]
@@ -193,7 +193,7 @@ def draw_scenes(scene: Scene, found: Estimate, members: int, rng: np.random.Gene
     )
     stiffness = np.exp(_normal(_logarithm(found.stiffness), -white[:, SOFTNESS]))
     restitution = scene.contact.restitution is not None
-    damping = np.zeros(members)
+    damping: Array | None = None
     if found.damping is not None:
         value = found.damping if restitution else _logarithm(found.damping)
         damping = _normal(value, white[:, DAMPING])
@@ -202,13 +202,11 @@ def draw_scenes(scene: Scene, found: Estimate, members: int, rng: np.random.Gene
         np.ones(members) if value is None else _normal(value, white[:, GAIN.start + index])
         for index, value in enumerate((found.gain_fx, found.gain_fy, found.gain_m))
     ]
-    scenes = []
-    for index in range(members):
-        number = None if found.damping is None else float(damping[index])
-        contact = contact_with(scene.contact, float(stiffness[index]), number)
-        clearance = Clearance(float(horizontal[index]), float(vertical[index]))
-        scenes.append(replace(scene, clearance=clearance, contact=contact, loads=(), wear=None))
-    return scenes, np.stack(gains, axis=1)
+    numbers = {
+        "clearance": {"horizontal_m": horizontal, "vertical_m": vertical},
+        "contact": contact_numbers(scene.contact, stiffness, damping),
+    }
+    return variants([scene] * members, numbers, loads=(), wear=None), np.stack(gains, axis=1)
 
 
 def draw_biases(found: Estimate, members: int, rng: np.random.Generator) -> Array:

@@ -13,15 +13,14 @@ parameters.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
-from plow_twin.estimate.unknowns import contact_with
-from plow_twin.model.scene import Clearance, Scene
+from plow_twin.estimate.unknowns import contact_numbers
+from plow_twin.model.scene import Scene, variants
 
 Array = NDArray[np.float64]
 
@@ -56,16 +55,20 @@ def biases_of(numbers: Array) -> Array:
     return found
 
 
-def with_numbers(scene: Scene, numbers: Array) -> tuple[Scene, Array]:
-    """Return the scene and the load gains, shape (3,), of a member with the parameters `numbers`, shape (10,)."""
-    softness, damping, horizontal, vertical, *gain = (numbers * np.array(tuning.LEARNED_TO)).tolist()[:-3]
-    number = None
-    if scene.contact.restitution is not None:
-        number = min(float(np.exp(damping)), _MOST_RESTITUTION)
-    elif scene.contact.damping:
-        number = float(np.exp(damping))
-    contact = contact_with(scene.contact, float(np.exp(-2.0 * softness)), number)
-    return replace(scene, contact=contact, clearance=Clearance(horizontal, vertical)), np.array(gain)
+def with_numbers(scenes: Sequence[Scene], numbers: Array) -> tuple[list[Scene], Array]:
+    """Return the scenes and the load gains, shape (m, 3), of members with the parameters `numbers`, shape (m, 10)."""
+    columns = np.ascontiguousarray((numbers * np.array(tuning.LEARNED_TO)).T)[:-3]
+    softness, damping, horizontal, vertical, *gain = columns
+    contact, number = scenes[0].contact, None
+    if contact.restitution is not None:
+        number = np.minimum(np.exp(damping), _MOST_RESTITUTION)
+    elif contact.damping:
+        number = np.exp(damping)
+    changed = {
+        "contact": contact_numbers(contact, np.exp(-2.0 * softness), number),
+        "clearance": {"horizontal_m": horizontal, "vertical_m": vertical},
+    }
+    return variants(scenes, changed), np.stack(gain, axis=1)
 
 
 class Learner:

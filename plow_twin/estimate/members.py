@@ -15,6 +15,7 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import compress
 from typing import Any, Final
 
 import numpy as np
@@ -26,9 +27,9 @@ from plow_twin.estimate.forces import FEWEST, amplitudes_of, draw_biases, draw_s
 from plow_twin.estimate.learned import Learner, biases_of, numbers_of, with_numbers
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.unknowns import QUANTITIES
-from plow_twin.model.geometry import penetration_rows, states_of
+from plow_twin.model.geometry import penetration_rows, penetrations_at_centre, states_of
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.model.scene import DOF_NAMES, Clearance, Friction, Gravity, Scene, fastest_travel
+from plow_twin.model.scene import DOF_NAMES, Friction, Gravity, Scene, Wear, fastest_travel, variants
 from plow_twin.run.batch import TwinBatch
 from plow_twin.run.twin import Twin
 from plow_twin.solve.state import ADVANCE, FOLLOWED, WITH_INTERVALS
@@ -83,10 +84,13 @@ class Ensemble:
         self, scene: Scene, known: Estimate, members: int, rng: np.random.Generator, start: float, tol: float,
         worn: Array, learns: bool = True,
     ) -> None:  # fmt: skip
+        differ = rubs(scene, known)
+        if differ:
+            scene = replace(scene, friction=scene.friction or Friction(0.0))
         scenes, gain = draw_scenes(scene, known, members, rng) if members > 1 else ([scene], np.ones((1, 3)))
         scenes[0], gain[0] = middle_of(scene, known)
-        if rubs(scene, known):
-            scenes = _with_friction(scenes, scene, known, rng)
+        if differ:
+            scenes = _with_friction(scenes, known, rng)
         #: whether poses move the first member; under the prior, they move the second member, a copy of the first member
         self._steers_first = known.horizontal_state is not State.PRIOR
         if not self._steers_first and members > 1:
@@ -96,7 +100,7 @@ class Ensemble:
         if scene.wear is not None:
             states = (known.horizontal_state, known.vertical_state)
             self.moved_before = np.where([[state.known] for state in states], widening(scene, worn)[:, None], 0.0)
-            scenes = [_worn(one, scene, worn, self.moved_before[:, 0]) for one in scenes]
+            scenes = _worn(scenes, replace(scene.wear, initial_depth_m=tuple(worn.tolist())), self.moved_before)
         #: the first member, which is advanced alone so that its forces are available first
         self.first = Twin(scenes[0], tol=tol, excitation="sampled", start=start, max_steps=MOST_STEPS)
         self.others = TwinBatch(scenes[1:], tol=tol, start=start, max_steps=MOST_STEPS) if members > 1 else None
@@ -111,8 +115,9 @@ class Ensemble:
         self._amplitude = amplitudes_of(known, members, rng)
         # load error of each member in N, N, N m, and its time in s
         self._load_off, self._drifted = np.zeros((members, 3)), start
-        self._walls = np.stack([penetration_rows(one) for one in scenes])
-        self._clearance = np.array([[one.clearance.horizontal_m, one.clearance.vertical_m] for one in scenes])
+        self._walls = np.repeat(penetration_rows(scene)[None], members, axis=0)
+        self._walls[:, 4] = penetrations_at_centre(scenes)
+        self._clearance = _clearance_of(scenes)
         self._fastest = np.array([fastest_travel(one.wear, one.contact) for one in scenes])
         self._stiffness, self._exponent = np.array([one.contact.stiffness for one in scenes]), scene.contact.exponent
         self._pressed = tuning.PRESSED * scene.head.mass_kg * Gravity().acceleration_m_s2
@@ -411,21 +416,24 @@ class Ensemble:
         A member keeps its parameters if the new values need a different kernel, as an overdamped contact does.
         """
         now = [self.first.scene, *(() if self.others is None else self.others.scenes)]
-        changed = [with_numbers(now[place], own) for place, own in zip(which.tolist(), numbers, strict=True)]
+        if not len(which):
+            return
+        changed, gain = with_numbers([now[place] for place in which.tolist()], numbers)
         taken, rest = np.ones(len(which), dtype=bool), which > 0
         if self.others is not None:
-            taken[rest] = self.others.change(which[rest] - 1, [changed[place][0] for place in np.flatnonzero(rest)])
+            taken[rest] = self.others.change(which[rest] - 1, changed[-int(rest.sum()) :] if rest.any() else [])
         which, room, force, before = which[taken], self._room(), self._force(self._depth), self._gain[0].copy()
-        self._numbers[which] = numbers[taken]
-        for place, index in zip(which.tolist(), np.flatnonzero(taken).tolist(), strict=True):
-            one, self._gain[place] = changed[index]
-            self._walls[place] = penetration_rows(one)
-            self._clearance[place] = one.clearance.horizontal_m, one.clearance.vertical_m
-            self._fastest[place], self._stiffness[place] = fastest_travel(one.wear, one.contact), one.contact.stiffness
-        if len(which) and which[0] == 0:
+        if not taken.any():
+            return
+        changed = list(compress(changed, taken))
+        self._numbers[which], self._gain[which] = numbers[taken], gain[taken]
+        self._clearance[which], self._walls[which, 4] = _clearance_of(changed), penetrations_at_centre(changed)
+        self._fastest[which] = [fastest_travel(one.wear, one.contact) for one in changed]
+        self._stiffness[which] = [one.contact.stiffness for one in changed]
+        if which[0] == 0:
             load = (self.first.wrench - self._load_off[0]) / before * self._gain[0] + self._load_off[0]
             time = self.first.time
-            self.first = self.first.like(changed[0][0])
+            self.first = self.first.like(changed[0])
             self.first.reset(time, wear_depth=self.worn[0], pose=(self.pose[0], self._v[0]))
             self.first.advance(time, load)
         if self._scene.wear is not None:
@@ -531,12 +539,14 @@ def _off(q: Array, then: Array, there: NDArray[np.int64]) -> Array:
     return off
 
 
-def _worn(one: Scene, scene: Scene, worn: Array, moved: Array) -> Scene:
-    assert scene.wear is not None
-    depths = tuple(worn.tolist())
-    horizontal, vertical = one.clearance.horizontal_m - moved[0], one.clearance.vertical_m - moved[1]
-    clearance = Clearance(max(float(horizontal), 0.0), max(float(vertical), 0.0))
-    return replace(one, clearance=clearance, wear=replace(scene.wear, initial_depth_m=depths))
+def _clearance_of(scenes: Sequence[Scene]) -> Array:
+    return np.array([[one.clearance.horizontal_m, one.clearance.vertical_m] for one in scenes]).reshape(-1, 2)
+
+
+def _worn(scenes: Sequence[Scene], wear: Wear, moved: Array) -> list[Scene]:
+    """Return scenes with the worn pads `wear` and with clearances reduced by `moved` in m, shape (2, 1)."""
+    horizontal, vertical = np.maximum(_clearance_of(scenes).T - moved, 0.0)
+    return variants(scenes, {"clearance": {"horizontal_m": horizontal, "vertical_m": vertical}}, wear=wear)
 
 
 def widening(scene: Scene, worn: Array) -> Array:
@@ -567,14 +577,12 @@ def compile_friction(scene: Scene, tol: float) -> None:
     Twin(scenes[0], tol=tol, excitation="sampled").warm_up()
 
 
-def _with_friction(scenes: list[Scene], scene: Scene, known: Estimate, rng: np.random.Generator) -> list[Scene]:
+def _with_friction(scenes: Sequence[Scene], known: Estimate, rng: np.random.Generator) -> list[Scene]:
+    """Return scenes with friction coefficients drawn about those of the scenes."""
     _, by, deviation = known.differs[FRICTION]
-    nominal = scene.friction or Friction(0.0)
-    drawn = nominal.coefficient + by + deviation * np.append(0.0, rng.standard_normal(len(scenes) - 1))
-    return [
-        replace(one, friction=replace(nominal, coefficient=max(coefficient, _LEAST_FRICTION)))
-        for one, coefficient in zip(scenes, drawn.tolist(), strict=True)
-    ]
+    assert scenes[0].friction is not None
+    drawn = scenes[0].friction.coefficient + by + deviation * np.append(0.0, rng.standard_normal(len(scenes) - 1))
+    return variants(scenes, {"friction": {"coefficient": np.maximum(drawn, _LEAST_FRICTION)}})
 
 
 def middle_of(scene: Scene, known: Estimate) -> tuple[Scene, Array]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -239,17 +239,23 @@ class Unknowns:
 
 
 def contact_with(contact: Contact, stiffness: float, damping: float | None) -> Contact:
-    """Return a contact with the given stiffness and, unless it is None, damping or restitution.
+    """Return a contact with other numbers (`contact_numbers`)."""
+    numbers = contact_numbers(contact, np.array(stiffness), None if damping is None else np.array(damping))
+    values: dict[str, Any] = {name: float(value) for name, value in numbers.items()}
+    return replace(contact, **values)
+
+
+def contact_numbers(contact: Contact, stiffness: Array, damping: Array | None) -> dict[str, Array]:
+    """Return the fields of contacts with the given stiffness and, unless it is None, damping or restitution.
 
     A damping above the largest admissible damping factor becomes this factor.
     """
-    contact = replace(contact, stiffness=stiffness)
     if damping is None:
-        return contact
+        return {"stiffness": stiffness}
     if contact.restitution is not None:
-        return replace(contact, restitution=damping)
+        return {"stiffness": stiffness, "restitution": damping}
     most = math.inf if LAWS[contact.law].additive else MOST_DAMPING_FACTOR
-    return replace(contact, damping=min(damping, most))
+    return {"stiffness": stiffness, "damping": np.minimum(damping, most)}
 
 
 def with_other_law(unknowns: Unknowns) -> Unknowns | None:

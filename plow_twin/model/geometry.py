@@ -27,6 +27,7 @@ acts at the touching point, one radius away from C (`roll`).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -78,11 +79,12 @@ def roll(scene: Scene) -> float:
     return corner_radius(scene) * (1.0 if scene.head.carries == "corners" else -1.0)
 
 
-def wall_distances(scene: Scene) -> NDArray[np.float64]:
-    """Return the distance of each pair's unworn wall from the centre of the cavity in m, shape (8,)."""
-    half_width = 0.5 * (scene.frame.width_m + scene.clearance.horizontal_m)
-    half_height = 0.5 * (scene.frame.height_m + scene.clearance.vertical_m)
-    return _ALONG_X * half_width + _ALONG_Y * half_height
+def wall_distances(scenes: Sequence[Scene]) -> NDArray[np.float64]:
+    """Return the distance of each pair's unworn wall from the centre of the cavity in m, shape (m, 8)."""
+    cavities = ((one.frame, one.clearance) for one in scenes)
+    sides = [(frame.width_m + gap.horizontal_m, frame.height_m + gap.vertical_m) for frame, gap in cavities]
+    half = 0.5 * np.array(sides)
+    return _ALONG_X * half[:, :1] + _ALONG_Y * half[:, 1:]
 
 
 def _along_normal(scene: Scene) -> NDArray[np.float64]:
@@ -103,13 +105,16 @@ def _along_tangent(scene: Scene) -> NDArray[np.float64]:
 
 def penetration_rows(scene: Scene) -> NDArray[np.float64]:
     """Return the coefficients of each penetration n . p - H before wear, shape (5, 8): rows for c, s, X, Y and 1."""
-    return _of_places(scene, np.vstack([_along_normal(scene), penetrations_at_centre(scene)]))
+    return _of_places(scene, np.vstack([_along_normal(scene), penetrations_at_centre([scene])]))
 
 
-def penetrations_at_centre(scene: Scene) -> NDArray[np.float64]:
-    """Return the last row of `penetration_rows`, shape (8,), the only row that depends on the clearance."""
-    offset_x, offset_y = scene.head.com_offset_m
-    return NORMAL_X * offset_x + NORMAL_Y * offset_y - (wall_distances(scene) - corner_radius(scene))
+def penetrations_at_centre(scenes: Sequence[Scene]) -> NDArray[np.float64]:
+    """Return the last row of `penetration_rows`, shape (m, 8), the only row that depends on the clearance.
+
+    The scenes must have the same head and frame.
+    """
+    offset_x, offset_y = scenes[0].head.com_offset_m
+    return NORMAL_X * offset_x + NORMAL_Y * offset_y - (wall_distances(scenes) - corner_radius(scenes[0]))
 
 
 def _of_places(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,11 +7,11 @@ the checks, the schema of the scene file and its documentation are derived.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
-from dataclasses import MISSING, Field, dataclass, field, fields
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from enum import Enum
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,8 @@ SCENE_VERSION: Final = 1
 DOF_NAMES: Final = ("x", "y", "theta")
 
 _LARGEST_EXPONENT: Final = 4.0
+
+_Part = TypeVar("_Part")
 
 
 class Mark(Enum):
@@ -409,6 +411,43 @@ class Scene:
     def free(self) -> tuple[bool, ...]:
         """Whether x, y and theta are free, shape (3,)."""
         return tuple(name not in self.locked for name in DOF_NAMES)
+
+
+def variants(scenes: Sequence[Scene], numbers: Mapping[str, Mapping[str, Any]], **parts: Any) -> list[Scene]:
+    """Return copies of scenes with other numbers in clearance, contact or friction.
+
+    Parameters
+    ----------
+    scenes : sequence of Scene
+        Scenes that differ from each other only in these parts.
+    numbers : mapping
+        For each part, the new numbers by the names of the fields, shape (m,) each.
+    **parts
+        Further parts, which become those of all scenes.
+
+    Raises
+    ------
+    SceneError
+        A copy is not valid. Only the copies with all smallest and all largest numbers are checked, because a scene
+        bounds each of these numbers.
+    """
+    for bound in (np.min, np.max):
+        end = {part: {name: float(bound(values)) for name, values in own.items()} for part, own in numbers.items()}
+        replace(scenes[0], **parts, **{part: replace(getattr(scenes[0], part), **own) for part, own in end.items()})
+    lists = {part: {name: values.tolist() for name, values in own.items()} for part, own in numbers.items()}
+    found = []
+    for index, scene in enumerate(scenes):
+        for part, own in lists.items():
+            parts[part] = _copied(getattr(scene, part), {name: values[index] for name, values in own.items()})
+        found.append(_copied(scene, parts))
+    return found
+
+
+def _copied(part: _Part, values: Mapping[str, Any]) -> _Part:
+    """Return a copy of a frozen dataclass without a check of its new values."""
+    found = object.__new__(type(part))
+    found.__dict__.update(part.__dict__, **values)
+    return found
 
 
 #: Parts that every scene has.

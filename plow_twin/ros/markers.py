@@ -43,7 +43,7 @@ class Markers:
         self._transforms = _Transforms(node) if settings.tf else None
         corners_x, corners_y = corner_positions(scene)
         self._corners = np.stack([corners_x, corners_y], axis=1)
-        self._walls, self._radius = wall_distances(scene), corner_radius(scene)
+        self._walls, self._radius = wall_distances([scene])[0], corner_radius(scene)
         self._scale = scene.frame.height_m
         self._weight = scene.head.mass_kg * max(scene.gravity.acceleration_m_s2, 1.0)
 

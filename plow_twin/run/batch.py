@@ -21,7 +21,7 @@ from plow_twin.run.lane_twins import LaneTwins
 from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, Pace, check_limits
 from plow_twin.run.twin import DEFAULT_BUDGET, read_snapshot
 from plow_twin.solve import loop
-from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, options, wear_rate
+from plow_twin.solve.compiled_scene import CompiledScene, compile_scenes, inertias, options, start_many, wear_rate
 from plow_twin.solve.lanes.advance import Load
 from plow_twin.solve.lanes.record import fits_lanes
 from plow_twin.solve.method.implicit import new_implicit
@@ -107,11 +107,8 @@ class TwinBatch:
             raise ArgumentError("scenes: got none, expected at least one")
         self.scenes = tuple(scenes)
         self.tol = tol
-        self._compiled = [compile_scene(scene, tol, sampled=True) for scene in scenes]
-        self._params = new_records(self._compiled[0].params.dtype, len(scenes))
+        self._params, self._compiled = compile_scenes(scenes, tol, sampled=True, kind=options(scenes[0]))
         terms = _merge(self._compiled)
-        for index, compiled in enumerate(self._compiled):
-            self._params[index] = compiled.params
         self._stick = terms.stick
         self._states = new_records(state_type(self._compiled[0].parts.terms), len(scenes))
         #: states before the last call, and memory for the states of the next call
@@ -123,7 +120,7 @@ class TwinBatch:
         count = max(1, min(workers, os.cpu_count() or 1, len(scenes)))
         self._workers = [_Worker.of(terms, self._compiled, max_wall_s) for _ in range(count)]
         self._edges = [len(scenes) * index // len(self._workers) for index in range(len(self._workers) + 1)]
-        if all(fits_lanes(one, sampled=True) for one in self._compiled):
+        if all(fits_lanes(one, sampled=True) for _, one in _kinds(self._compiled)):
             spans = [range(*span) for span in pairwise(self._edges)]
             self._workers = [one.with_lanes(self, terms, span) for one, span in zip(self._workers, spans, strict=True)]
         self._pool = ThreadPoolExecutor(len(self._workers)) if len(self._workers) > 1 else None
@@ -224,8 +221,10 @@ class TwinBatch:
         """
         if not np.isfinite(t):
             raise ArgumentError(f"t: got {t!r}, expected a finite time in s")
-        for index, compiled in enumerate(self._compiled):
-            self._states[index] = compiled.initial_state(t)
+        members = np.arange(len(self))
+        self._states[:] = 0
+        start_many(self._compiled, self._states, members.tolist())
+        settle_moved(self._params, self._states, members, self._states["y"].copy(), t, self._stick)
         self._reload()
         self._wrench = np.zeros((1, 3))
 
@@ -300,17 +299,20 @@ class TwinBatch:
             False for a twin if its scene was not replaced, because the new scene has different terms.
         """
         changed = np.zeros(len(scenes), dtype=bool)
-        own = list(self.scenes)
-        for index, (place, scene) in enumerate(zip(np.asarray(which).tolist(), scenes, strict=True)):
-            one, before = compile_scene(scene, self.tol, sampled=True), self._compiled[place]
+        if not scenes:
+            return changed
+        places, own = np.asarray(which), list(self.scenes)
+        params, compiled = compile_scenes(scenes, self.tol, sampled=True, kind=options(own[0]))
+        for index, (place, scene, one) in enumerate(zip(places.tolist(), scenes, compiled, strict=True)):
+            before = self._compiled[place]
             changed[index] = _signature(one.parts, scene) == _signature(before.parts, before.scene)
             if not changed[index]:
                 continue
-            wear = self._params["wear_per_impulse"][place].copy()
-            self._params[place], self._compiled[place], own[place] = one.params, one, scene
-            self._params["wear_per_impulse"][place] = wear
+            self._compiled[place], own[place] = one, scene
             if scene.contact.damping is not None and one.parts.terms.hysteretic is not None:
                 self._states["damping_factor"][place] = scene.contact.damping
+        params["wear_per_impulse"] = self._params["wear_per_impulse"][places]
+        self._params[places[changed]] = params[changed]
         self.scenes = tuple(own)
         self._reload()
         return changed
@@ -484,6 +486,15 @@ class _Worker(NamedTuple):
         ))  # fmt: skip
 
 
+def _kinds(compiled: Sequence[CompiledScene]) -> list[tuple[int, CompiledScene]]:
+    """Return the index and the first scene of each combination of terms, implicit steps, kind of head and options."""
+    found: dict[object, tuple[int, CompiledScene]] = {}
+    for index, one in enumerate(compiled):
+        key = one.parts.terms, one.parts.implicit is None, one.scene.head.carries, options(one.scene)
+        found.setdefault(key, (index, one))
+    return list(found.values())
+
+
 def _merge(compiled: Sequence[CompiledScene]) -> Terms:
     """Return the terms that compiled code for all members needs.
 
@@ -494,7 +505,7 @@ def _merge(compiled: Sequence[CompiledScene]) -> Terms:
     """
     first = compiled[0].parts.terms
     merged = first
-    for index, one in enumerate(compiled):
+    for index, one in _kinds(compiled):
         terms = one.parts.terms
         for name in ("viscous", "integer", "fraction", "ramp"):
             if getattr(terms, name) != getattr(first, name):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.run.motion import Motion, next_slice, run_events
-from plow_twin.solve.compiled_scene import CompiledScene
+from plow_twin.solve.compiled_scene import CompiledScene, start_many
 from plow_twin.solve.lanes.loop import OTHER_METHOD, Members, run_lanes
 from plow_twin.solve.lanes.record import forces
 from plow_twin.solve.modes import settle_many
@@ -58,8 +58,7 @@ class LaneRun:
         self._size = _FIRST_SLICE
         self.states, self.totals = new_records(STATE, count), np.zeros(count, TOTALS)
         self.status = np.full(count, int(Status.PAUSED))
-        for index in members:
-            compiled[index].start(self.states[index])
+        start_many(compiled, self.states, members)
         settle_many(params, self.states, np.array(members))
         self._members = Members(
             params, self.states, self.totals, *_joined(compiled, members), self.status, np.zeros(count, np.int64),

@@ -18,20 +18,19 @@ from plow_twin.model import geometry
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.loads import LoadSet, Pieces, compile_loads
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
-from plow_twin.model.scene import Contact, Head, Scene, Table, Wear
+from plow_twin.model.scene import Contact, Friction, Head, Scene, Table, Wear
 from plow_twin.solve.method.implicit import OVERDAMPED_RATIO, new_implicit
 from plow_twin.solve.modes import settle_modes
 from plow_twin.solve.state import (
     COS,
     HARMONIC,
     MAX_ORDER,
-    PARAMS,
+    NO_OPTIONS,
     RESTITUTIONS,
     SEGMENT,
     SIN,
     Array,
     Harmonics,
-    Implicit,
     Options,
     Params,
     Parts,
@@ -40,10 +39,11 @@ from plow_twin.solve.state import (
     Terms,
     X,
     Y,
-    new_record,
+    first_of,
     new_records,
     params_type,
     state_type,
+    with_attributes,
 )
 
 #: Tightest and loosest admissible tolerance.
@@ -79,21 +79,34 @@ class CompiledScene:
 
     def initial_state(self, time: float = 0.0, wear_depth: Array | None = None) -> State:
         """Return the scene's initial state at `time`, with its own wear depth or `wear_depth` [m]."""
-        state = new_record(state_type(self.parts.terms))
-        self.start(state)
+        states = new_records(state_type(self.parts.terms), 1)
+        start_many([self], states, [0])
+        state = first_of(states)
         if wear_depth is not None:
             state.wear_depth[:] = wear_depth
         state.step_start = state.time = time
         settle_modes(self.params, state, self.parts.terms.stick)
         return state
 
-    def start(self, state: State | np.void) -> None:
-        """Write coordinates, rates, damping and wear, but not modes, of the initial state to a zero record."""
-        state["y"][:] = geometry.state_of(self.scene, self.scene.initial.q, self.scene.initial.v)
-        if self.parts.terms.hysteretic is not None:
-            state["damping_factor"][:] = self.scene.contact.damping or 0.0
-        if self.scene.wear is not None:
-            state["wear_depth"][:] = self.scene.wear.initial_depth_m
+
+def start_many(compiled: Sequence[CompiledScene], states: NDArray[np.void], members: Sequence[int]) -> None:
+    """Write coordinates, rates, damping and wear, but not modes, of the initial states of `members` to zero records."""
+    chosen, shared = [compiled[index] for index in members], _Shared()
+    scenes = [one.scene for one in chosen]
+    # the frame and the wear determine whether a block tumbles
+    states["y"][members] = [
+        shared.of(_initial_place, one.initial, one.head, one.frame, one.wear, given=(one,)) for one in scenes
+    ]
+    states["damping_factor"][members] = [
+        [0.0 if one.parts.terms.hysteretic is None else one.scene.contact.damping or 0.0] for one in chosen
+    ]
+    for index, scene in zip(members, scenes, strict=True):
+        if scene.wear is not None:
+            states["wear_depth"][index] = scene.wear.initial_depth_m
+
+
+def _initial_place(scene: Scene) -> Array:
+    return geometry.state_of(scene, scene.initial.q, scene.initial.v)
 
 
 def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> CompiledScene:
@@ -115,18 +128,32 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
     _check_tolerance(tol)
     # `_LATELY` would keep a table in memory after the end of its scene
     tables = any(isinstance(load, Table) for load in scene.loads)
-    return _describe(scene, tol, sampled, _Shared() if tables else _LATELY).compiled()
+    return _compile_alike([scene], tol, sampled, _Shared() if tables else _LATELY)[0]
 
 
-def compile_scenes(scenes: Sequence[Scene], tol: float) -> tuple[NDArray[np.void], list[CompiledScene]]:
-    """Return the records of many scenes at one tolerance. A part that scenes share is converted only once.
+def compile_scenes(
+    scenes: Sequence[Scene], tol: float, *, sampled: bool = False, kind: Options = NO_OPTIONS
+) -> tuple[NDArray[np.void], list[CompiledScene]]:
+    """Return the records of many scenes at one tolerance, as `compile_scene` does.
+
+    Scenes that differ only in the numbers of clearance, contact and friction are converted together.
+
+    Parameters
+    ----------
+    scenes : sequence of Scene
+    tol : float
+        Tolerance of the pose relative to `geometry.length_scale`, 1e-13 .. 1e-1.
+    sampled : bool
+        Whether the load is given as samples. If True, the loads of the scenes are omitted.
+    kind : Options
+        Options of the scenes whose constants are rows of one array.
 
     Returns
     -------
-    params : ndarray of `PARAMS`, shape (m,)
-        Constants of all scenes in one array. The rows of scenes with `Options` are zero.
+    params : ndarray of records, shape (m,)
+        Constants of all scenes in one array. The rows of scenes with other options are zero.
     compiled : list of CompiledScene
-        The compiled scenes. Their constants are rows of `params`, or separate records for scenes with `Options`.
+        The compiled scenes. Their constants are rows of `params`, or separate records for scenes with other options.
 
     Raises
     ------
@@ -134,16 +161,16 @@ def compile_scenes(scenes: Sequence[Scene], tol: float) -> tuple[NDArray[np.void
         The tolerance is out of range.
     """
     _check_tolerance(tol)
-    shared, params = _Shared(), new_records(PARAMS, len(scenes))
-    descriptions = [_describe(scene, tol, False, shared) for scene in scenes]
-    shares = [not any(options(scene)) for scene in scenes]
-    for name in PARAMS.names or ():
-        there = [index for index, one in enumerate(descriptions) if shares[index] and name in one.values]
-        values = [descriptions[index].values[name] for index in there]
-        if values:
-            params[name][there] = values[0] if all(value is values[0] for value in values) else values
-    rows = params.view(np.recarray)
-    return params, [one.compiled(rows[i] if shares[i] else None) for i, one in enumerate(descriptions)]
+    shared, params = _LATELY if sampled else _Shared(), new_records(params_type(kind), len(scenes))
+    alike: dict[tuple[object, ...], list[int]] = {}
+    for index, scene in enumerate(scenes):
+        alike.setdefault(_kind(scene, sampled), []).append(index)
+    found: dict[int, CompiledScene] = {}
+    for which in alike.values():
+        own = [scenes[index] for index in which]
+        rows = (params, which) if options(own[0]) == kind else None
+        found.update(zip(which, _compile_alike(own, tol, sampled, shared, rows), strict=True))
+    return params, [found[index] for index in range(len(scenes))]
 
 
 def _is_number(value: object) -> bool:
@@ -180,26 +207,8 @@ class _Shared:
 _LATELY: Final = _Shared(64)
 
 
-@dataclass(frozen=True)
-class _Description:
-    """Content of a `CompiledScene`, with the fields `values` of its `PARAMS` record."""
-
-    scene: Scene
-    values: dict[str, Any]
-    parts: Parts
-    loads: LoadSet
-
-    def compiled(self, params: Params | None = None) -> CompiledScene:
-        """Return the compiled scene with its constants in `params` or in a new record."""
-        if params is None:
-            params = new_record(params_type(options(self.scene)))
-            for name, value in self.values.items():
-                params[name] = value
-        return CompiledScene(self.scene, params, self.parts, self.loads)
-
-
 class _Unchanged(NamedTuple):
-    """Results that do not depend on the clearance. `values` are fields of `PARAMS`."""
+    """Results that scenes of the same `_kind` share. `values` are fields of `PARAMS`."""
 
     loads: LoadSet
     acceleration: float  #: largest acceleration in m/s^2
@@ -217,7 +226,7 @@ def _unchanged(scene: Scene, sampled: bool, shared: _Shared) -> _Unchanged:
     constant[1] -= gravity
     constant[2] -= mass * gravity * scene.gravity.arm_m / inertia
     direction, harmonics = shared.of(_harmonics, scene.head, loads)
-    terms, number = shared.of(law_terms, scene.contact)
+    terms, _ = law_terms(scene.contact)
     rows = geometry.penetration_rows(scene)
     values: dict[str, Any] = dict(
         penetration_rows=rows,
@@ -225,16 +234,9 @@ def _unchanged(scene: Scene, sampled: bool, shared: _Shared) -> _Unchanged:
         enabled=[name in scene.pairs for name in PAIR_NAMES],
         inverse_mass=1.0 / mass,
         inverse_inertia=1.0 / inertia,
-        stiffness=float(scene.contact.stiffness),
-        exponent=float(scene.contact.exponent),
-        viscous=float(scene.contact.damping or 0.0) if terms.viscous else 0.0,
-        damping_number=number,
-        speed_floor=float(scene.contact.impact_speed_floor_m_s),
-        ramp=float(scene.contact.ramp_m or 0.0) if terms.ramp else 0.0,
         gravity=float(gravity),
         constant=constant,
         direction=direction,
-        lacuna=_lacuna(scene.contact.exponent),
         radius=geometry.half_diagonal(scene),
         wear_per_impulse=_wear_rates(scene.wear),
         offset=scene.head.com_offset_m,
@@ -248,37 +250,86 @@ def _unchanged(scene: Scene, sampled: bool, shared: _Shared) -> _Unchanged:
     return _Unchanged(loads, acceleration, _start_speed(scene), harmonics, terms, values)
 
 
-def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Description:
-    loads, acceleration, start_speed, harmonics, terms, unchanged = shared.of(
-        _unchanged, scene.head, scene.frame, scene.contact, scene.gravity, scene.loads, scene.initial, scene.locked,
-        scene.pairs, scene.wear, scene.friction, scene.support, sampled,
-        # only a head that starts off centre may touch a wall at the start
-        scene.clearance if any(scene.initial.q) else None,
-        given=(scene, sampled, shared),
+def _sources(scene: Scene, sampled: bool) -> tuple[object, ...]:
+    """Return the objects that determine `_unchanged`."""
+    law, _ = law_terms(scene.contact)
+    # only under harmonic loads, a head that starts off centre may rest at a wall that it touches at the start
+    wall = (scene.contact, scene.clearance) if not sampled and any(scene.initial.q) else ()
+    return (
+        scene.head, scene.frame, scene.gravity, () if sampled else scene.loads, scene.initial, scene.locked,
+        scene.pairs, scene.wear, scene.support, law, _friction_kind(scene.friction), sampled, *wall,
     )  # fmt: skip
-    length, radius = geometry.length_scale(scene), unchanged["radius"]
+
+
+def _kind(scene: Scene, sampled: bool) -> tuple[object, ...]:
+    """Return a key of the scenes that differ at most in the numbers of `_varied`."""
+    contact = scene.contact
+    return contact.law, contact.exponent, options(scene).falling, *map(id, _sources(scene, sampled))
+
+
+def _compile_alike(
+    scenes: Sequence[Scene],
+    tol: float,
+    sampled: bool,
+    shared: _Shared,
+    rows: tuple[NDArray[np.void], list[int]] | None = None,
+) -> list[CompiledScene]:
+    """Return the records of scenes of the same `_kind`.
+
+    `rows` are an array of records and the indices of the scenes in it. Without `rows`, the array is new.
+    """
+    first = scenes[0]
+    params, which = rows or (new_records(params_type(options(first)), len(scenes)), list(range(len(scenes))))
+    common = shared.of(_unchanged, *_sources(first, sampled), given=(first, sampled, shared))
+    values, overdamped = _varied(scenes, tol, common)
+    # numpy writes to a slice faster than to a list of indices
+    there = slice(which[0], which[-1] + 1) if which[-1] - which[0] < len(which) else which
+    for name, value in values.items():
+        params[name][there] = value
+    segments = None
+    if sampled:
+        segments = np.zeros(1, SEGMENT)
+    elif common.loads.pieces is not None:
+        segments = _segments(first, common.loads.pieces)
+    parts = Parts(common.terms, common.harmonics, segments, None)
+    record, support = with_attributes(params), first.support is not None
+    return [
+        CompiledScene(scene, record[row], parts._replace(implicit=new_implicit(support)) if damped else parts,
+                      common.loads)
+        for scene, row, damped in zip(scenes, which, overdamped, strict=True)
+    ]  # fmt: skip
+
+
+def _varied(scenes: Sequence[Scene], tol: float, common: _Unchanged) -> tuple[dict[str, Any], list[bool]]:
+    """Return the fields of `PARAMS`, shape (m, ...) or that of one record, and whether each scene is overdamped."""
+    first, terms, contacts = scenes[0], common.terms, [scene.contact for scene in scenes]
+    length, radius = np.array([geometry.length_scale(scene) for scene in scenes]), common.values["radius"]
     # speed after half the length scale under the largest load
-    speed = max(math.sqrt(length * acceleration), start_speed, 1e-3 * length)
+    speed = np.maximum(np.maximum(np.sqrt(length * common.acceleration), common.start_speed), 1e-3 * length)
     admissible = min(tol * (STEP_SHARE if terms.fraction is None else STEP_SHARE_FRACTION), LARGEST_STEP_ERROR)
     order = order_for(admissible)
-    rows = unchanged["penetration_rows"].copy()
-    rows[4] = geometry.penetrations_at_centre(scene)
-    values: dict[str, Any] = unchanged | dict(
+    rows = np.repeat(common.values["penetration_rows"][None], len(scenes), axis=0)
+    rows[:, 4] = geometry.penetrations_at_centre(scenes)
+    release = 0.0 if terms.fraction is None else list(map(_release, scenes, [tol] * len(scenes), length, speed))
+    values: dict[str, Any] = common.values | dict(
         penetration_rows=rows,
+        stiffness=np.array([float(contact.stiffness) for contact in contacts]),
+        exponent=float(first.contact.exponent),
+        viscous=np.array([float(contact.damping or 0.0) if terms.viscous else 0.0 for contact in contacts]),
+        damping_number=np.array([law_terms(contact)[1] for contact in contacts]),
+        speed_floor=np.array([float(contact.impact_speed_floor_m_s) for contact in contacts]),
+        ramp=[float(contact.ramp_m or 0.0) if terms.ramp else 0.0 for contact in contacts],
+        lacuna=_lacuna(first.contact.exponent),
         order=order,
-        threshold=speed * _thresholds(admissible, order),
+        threshold=speed[:, None] * _thresholds(admissible, order),
         velocity_tolerance=tol * speed,
         position_tolerance=tol * length,
         weight=radius * speed / length,
-        release=0.0 if terms.fraction is None else _release(scene, tol, length, speed),
-        half_cavity=0.5 * float(geometry.wall_distances(scene).min()),
+        release=release,
+        half_cavity=0.5 * geometry.wall_distances(scenes).min(axis=1),
     )
-    values |= _of_options(scene)
-    values |= _rubbing(scene) | _slip(scene) | _frame(scene)
-    segments = _segments(scene, loads.pieces) if loads.pieces is not None else None
-    if sampled:
-        segments = np.zeros(1, SEGMENT)
-    return _Description(scene, values, Parts(terms, harmonics, segments, _implicit(scene, terms, values)), loads)
+    values |= _of_options(scenes) | _rubbing(first) | _slip(scenes) | _frame(first)
+    return values, _overdamped(scenes, terms, values, length).tolist()
 
 
 def options(scene: Scene) -> Options:
@@ -287,20 +338,21 @@ def options(scene: Scene) -> Options:
     return Options(scene.head.carries == "corners", scene.frame.corner_radius_m is not None, falls)
 
 
-def _of_options(scene: Scene) -> dict[str, Any]:
-    there, contact, found = options(scene), scene.contact, dict[str, Any]()
+def _of_options(scenes: Sequence[Scene]) -> dict[str, Any]:
+    first, found = scenes[0], dict[str, Any]()
+    there, contacts = options(first), [scene.contact for scene in scenes]
     if there.corners:
-        found["tumbles"] = float(geometry.tumbles(scene))
+        found["tumbles"] = float(geometry.tumbles(first))
     if there.rounded:
-        found["roll"] = geometry.roll(scene)
+        found["roll"] = geometry.roll(first)
     if there.falling:
         found |= dict(
-            damping_numbers=damping_numbers(contact.law),
-            restitution=contact.restitution,
-            fall=contact.restitution_fall or 0.0,
-            fall_speed=contact.restitution_speed_m_s or 1.0,
-            fall_mass=contact.restitution_mass_power or 0.0,
-            fall_along=contact.restitution_fall_along_s_m or 0.0,
+            damping_numbers=damping_numbers(first.contact.law),
+            restitution=[contact.restitution for contact in contacts],
+            fall=[contact.restitution_fall or 0.0 for contact in contacts],
+            fall_speed=[contact.restitution_speed_m_s or 1.0 for contact in contacts],
+            fall_mass=[contact.restitution_mass_power or 0.0 for contact in contacts],
+            fall_along=[contact.restitution_fall_along_s_m or 0.0 for contact in contacts],
         )
     return found
 
@@ -323,8 +375,9 @@ def _scene_terms(
         offset=any(scene.head.com_offset_m),
         free=bool(scene.locked),
     )
-    if scene.friction is not None and scene.friction.coefficient != 0.0:
-        present["slip" if scene.friction.stick_stiffness_n_m is None else "stick"] = True
+    friction = _friction_kind(scene.friction)
+    if friction in ("slip", "stick"):
+        present[friction] = True
     present["support"] = scene.support is not None
     # with an offset centre of mass, the moment of the loads depends on the angle
     present["flight"] = present["harmonics"] and not present["offset"] and not present["support"]
@@ -337,6 +390,14 @@ def _scene_terms(
         damped = law.viscous is not None or law.hysteretic is not None
         present["rest"] &= damped and present["flight"] and _harmonics_are_small(scene, loads, shared.of(_swing, loads))
     return law._replace(**_flags(present))
+
+
+def _friction_kind(friction: Friction | None) -> str:
+    if friction is None:
+        return ""
+    if friction.coefficient == 0.0:
+        return "zero"
+    return "slip" if friction.stick_stiffness_n_m is None else "stick"
 
 
 def _wear_rates(wear: Wear | None) -> list[float]:
@@ -356,17 +417,22 @@ def _harmonics_are_small(scene: Scene, loads: LoadSet, swing: Array) -> bool:
     pressing = np.abs(loads.constant) @ arms + mass * abs(scene.gravity.acceleration_m_s2)
     if loads.pieces is not None:
         pressing += float(np.abs(loads.pieces.start).max(axis=0) @ arms)
-    pressing += contact.stiffness * _initial_depth(scene) ** contact.exponent
+    if any(scene.initial.q):
+        depth = float(_initial_depth(scene, geometry.penetration_rows(scene)))
+        pressing += contact.stiffness * depth**contact.exponent
     return bool(swing @ arms <= _SMALL_HARMONICS * pressing)
 
 
-def _initial_depth(scene: Scene) -> float:
-    """Return the largest penetration of a pair in the initial state in m, or 0 without contact."""
+def _initial_depth(scene: Scene, rows: Array) -> Array | float:
+    """Return the largest penetration of any pair in the initial state in m, shape (...), or 0 without contact.
+
+    `rows` are the coefficients of the penetrations, shape (..., 5, 8).
+    """
     if not any(scene.initial.q):
         return 0.0  # a centred head does not touch a wall
     y = geometry.state_of(scene, scene.initial.q, scene.initial.v)
-    rows = geometry.penetration_rows(scene)
-    return max(float((np.array([y[COS], y[SIN], y[X], y[Y], 1.0]) @ rows).max()), 0.0)
+    depth: Array = np.maximum((np.array([y[COS], y[SIN], y[X], y[Y], 1.0]) @ rows).max(axis=-1), 0.0)
+    return depth
 
 
 @lru_cache(64)
@@ -408,18 +474,24 @@ def _segments(scene: Scene, pieces: Pieces) -> Segments:
 
 def law_terms(contact: Contact) -> tuple[Terms, float]:
     """Return the terms of the contact law, and D for a damping factor D / v0 or -1 for a constant factor."""
-    law, exponent = LAWS[contact.law], float(contact.exponent)
+    law = LAWS[contact.law]
     viscous = law.additive and bool(contact.damping)
     number = -1.0 if contact.restitution is None else law.damping_number(contact.restitution)
     damped = not law.additive and (number > 0.0 or bool(contact.damping))
+    terms = _law_terms(viscous, damped, float(contact.exponent), viscous and contact.ramp_m is not None)
+    return terms, number if damped else -1.0
+
+
+@lru_cache(64)
+def _law_terms(viscous: bool, damped: bool, exponent: float, ramp: bool) -> Terms:
     present = dict(
         viscous=viscous,
         hysteretic=damped,
         integer=exponent != 1.0 and exponent.is_integer(),
         fraction=not exponent.is_integer(),
-        ramp=viscous and contact.ramp_m is not None,
+        ramp=ramp,
     )
-    return _NO_TERMS._replace(**_flags(present)), number if damped else -1.0
+    return _NO_TERMS._replace(**_flags(present))
 
 
 def _flags(present: dict[str, bool]) -> dict[str, int]:
@@ -507,28 +579,32 @@ def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
     return release
 
 
-def _implicit(scene: Scene, terms: Terms, values: dict[str, Any]) -> Implicit | None:
-    """Return nodes and scratch space of implicit steps, or None without overdamped motion."""
-    contact = scene.contact
-    mobility = 1.0 / scene.head.mass_kg + values["radius"] ** 2 / scene.head.inertia_kg_m2
-    if scene.support is not None:
+def _overdamped(scenes: Sequence[Scene], terms: Terms, values: dict[str, Any], length: Array) -> NDArray[np.bool_]:
+    """Return whether the motion of each scene is overdamped, so that it needs implicit steps."""
+    first, exponent, stiffness = scenes[0], values["exponent"], values["stiffness"]
+    mobility = 1.0 / first.head.mass_kg + values["radius"] ** 2 / first.head.inertia_kg_m2
+    if first.support is not None:
         mobility += float(values["frame_mobility"][0] + values["radius"] ** 2 * values["frame_mobility"][2])
-    largest_force = scene.head.mass_kg * values["threshold"][0] ** 2 / geometry.length_scale(scene)
-    depth = max((largest_force / contact.stiffness) ** (1.0 / contact.exponent), _initial_depth(scene))
-    largest_force = contact.stiffness * depth**contact.exponent
-    spring = contact.exponent * largest_force / depth
-    damping = values.get("stick_damping", 0.0)
+    largest_force = first.head.mass_kg * values["threshold"][:, 0] ** 2 / length
+    depth = np.maximum(
+        (largest_force / stiffness) ** (1.0 / exponent), _initial_depth(first, values["penetration_rows"])
+    )
+    largest_force = stiffness * depth**exponent
+    spring = exponent * largest_force / depth
+    damping: Any = np.array(values.get("stick_damping", 0.0))
     if terms.viscous is not None:
-        damping += values["viscous"]
+        damping = damping + values["viscous"]
     elif terms.hysteretic is not None:
-        damping += largest_force * (contact.damping or values["damping_number"] / values["speed_floor"])
+        factor = np.array([scene.contact.damping or 0.0 for scene in scenes])
+        slow = values["damping_number"] / values["speed_floor"]
+        damping = damping + largest_force * np.where(factor > 0.0, factor, slow)
     if terms.slip is not None:
-        damping += values["friction"] * largest_force / values["slip_speed"]
-    overdamped = damping * mobility > OVERDAMPED_RATIO * math.sqrt(spring * mobility)
+        damping = damping + np.array(values["friction"]) * largest_force / np.array(values["slip_speed"])
+    overdamped: NDArray[np.bool_] = damping * mobility > OVERDAMPED_RATIO * np.sqrt(spring * mobility)
     # the dampers of a support can make the motion overdamped
-    if scene.support is not None:
+    if first.support is not None:
         overdamped |= bool((values["frame_damping"] > OVERDAMPED_RATIO * np.sqrt(values["frame_stiffness"])).any())
-    return new_implicit(scene.support is not None) if overdamped else None
+    return overdamped
 
 
 def _rubbing(scene: Scene) -> dict[str, Any]:
@@ -541,19 +617,20 @@ def _rubbing(scene: Scene) -> dict[str, Any]:
     return found
 
 
-def _slip(scene: Scene) -> dict[str, Any]:
+def _slip(scenes: Sequence[Scene]) -> dict[str, Any]:
     """Return the constants of friction; without friction, only a slip speed as a divisor."""
-    friction = scene.friction
-    if friction is None:
+    there = [scene.friction for scene in scenes if scene.friction is not None]
+    if not there:
         return {"slip_speed": 1.0}
+    static = [one.coefficient if one.static_coefficient is None else one.static_coefficient for one in there]
     return dict(
-        slip_rows=geometry.slip_rows(scene),
-        slip_arm_rows=geometry.slip_arm_rows(scene),
-        friction=friction.coefficient,
-        slip_speed=friction.regularisation_speed_m_s,
-        static_friction=friction.coefficient if friction.static_coefficient is None else friction.static_coefficient,
-        stick_stiffness=friction.stick_stiffness_n_m or 0.0,
-        stick_damping=friction.stick_damping_n_s_m or 0.0,
+        slip_rows=geometry.slip_rows(scenes[0]),
+        slip_arm_rows=geometry.slip_arm_rows(scenes[0]),
+        friction=[one.coefficient for one in there],
+        slip_speed=[one.regularisation_speed_m_s for one in there],
+        static_friction=static,
+        stick_stiffness=[one.stick_stiffness_n_m or 0.0 for one in there],
+        stick_damping=[one.stick_damping_n_s_m or 0.0 for one in there],
     )
 
 

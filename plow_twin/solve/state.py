@@ -185,6 +185,10 @@ class Options(NamedTuple):
     falling: bool  #: the restitution decreases with the impact speed
 
 
+#: A scene without options.
+NO_OPTIONS: Final = Options(False, False, False)
+
+
 @cache
 def params_type(options: Options) -> np.dtype[np.void]:
     """Return the record type of a scene's constants."""
@@ -461,8 +465,13 @@ def new_record(dtype: np.dtype[np.void]) -> np.record:
 
 def first_of(records: NDArray[np.void]) -> np.record:
     """Return a view of the first record."""
-    record: np.record = records.view(_with_attributes(records.dtype))[0]
+    record: np.record = with_attributes(records)[0]
     return record
+
+
+def with_attributes(records: NDArray[np.void]) -> NDArray[np.void]:
+    """Return a view of records with access to their fields as attributes."""
+    return records.view(_with_attributes(records.dtype))
 
 
 @cache
