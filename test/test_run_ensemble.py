@@ -22,8 +22,10 @@ from plow_twin import (
     simulate,
     simulate_many,
 )
+from plow_twin.errors import SceneError
 from plow_twin.model import geometry
 from plow_twin.model.loads import compile_loads
+from plow_twin.model.scene import variants
 from plow_twin.solve import compiled_scene
 
 
@@ -97,7 +99,7 @@ def test_equal_parts_of_successive_scenes_are_converted_once(monkeypatch: pytest
     assert len(summed) == 3
 
 
-def test_parts_independent_of_the_clearance_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parts_independent_of_clearance_and_contact_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     rows, computed = geometry.arm_rows, list[Scene]()
 
     def counted(scene: Scene) -> object:
@@ -110,10 +112,15 @@ def test_parts_independent_of_the_clearance_are_computed_once(monkeypatch: pytes
     beside = dataclasses.replace(centred, initial=Initial(q=(1e-3, 2e-3, 0.01)))
     gaps = [Clearance(gap, 0.03) for gap in (0.015, 0.020, 0.025)]
     scenes = [dataclasses.replace(scene, clearance=gap) for scene in (centred, beside) for gap in gaps]
+    # the second contact is overdamped
+    scenes += variants([centred] * 2, {"contact": {"stiffness": np.array([2e8, 3e6]), "damping": np.array([1e3, 1e9])}})
     params, _ = compiled_scene.compile_scenes(scenes, 1e-6)
     assert len(computed) == 1 + len(gaps)
     alone = [compiled_scene.compile_scenes([scene], 1e-6)[0] for scene in scenes]
     assert [one.tobytes() for one in alone] == [params[i : i + 1].tobytes() for i in range(len(scenes))]
+    for damping in (-1.0, np.nan, np.inf):
+        with pytest.raises(SceneError, match=r"contact\.damping"):
+            variants([centred] * 3, {"contact": {"damping": np.array([1.0, damping, 2.0])}})
 
 
 def test_a_member_that_fails_does_not_stop_the_others() -> None:
