@@ -15,7 +15,7 @@ from plow_twin.model.scene import Scene
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
-from plow_twin.stream import outputs
+from plow_twin.stream import session
 from plow_twin.stream.driven import MOST_STEPS, Driven
 
 #: Interval between checks for a requested stop [s].
@@ -88,7 +88,7 @@ def _prepare(settings: Settings, warm_up: Callable[[], None]) -> Prepared:
         excitation: Literal["scene", "sampled"] = "scene" if own else "sampled"
         twin = Twin(scene, tol=settings.tolerance, excitation=excitation, max_evaluations=bound, max_steps=MOST_STEPS)
     compile_s = twin.warm_up()
-    outputs.warm_up()
+    session.warm_up()
     warm_up()
     return Prepared(scene, twin, compile_s)
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import check_travel_speed
 from plow_twin.solve.samples import model_times
-from plow_twin.stream import journal
+from plow_twin.stream import journal, outputs
 from plow_twin.stream.driven import MOST_MEASURED, Driven, Following
 from plow_twin.stream.history import History
 from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
@@ -700,3 +700,9 @@ class Session:
 
 def _all_finite(rows: Rows | None) -> bool:
     return rows is None or (Published(rows, NOTHING.slow).finite and bool(np.isfinite(rows["wear_depth"]).all()))
+
+
+def warm_up() -> None:
+    """Compile the functions that process samples and make publications, or load them from the cache on disk."""
+    outputs.warm_up()
+    model_times(np.zeros(1, np.int64), 0, np.zeros(1))
