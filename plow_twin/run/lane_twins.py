@@ -89,10 +89,9 @@ class LaneTwins:
             if self._kernel is None:
                 self._kernel = for_arguments(advance_lanes, arguments)
             pace.run(self._kernel, arguments)
-            others: list[int] = self._other[: self._progress[OTHERS]].tolist()
-            if not others:
+            if self._progress[OTHERS] == 0:
                 return
             self.stale = True
-            for member in others:
+            for member in self._other[: self._progress[OTHERS]].tolist():
                 alone(member, int(self._place[member]))
                 self._place[member] += 1

@@ -410,9 +410,10 @@ def _get_ready(s, viscous, hysteretic, power, fraction, slip, rest, lanes, budge
     while True:
         if lanes.live[0] == 0 and not _next_block(s, hysteretic, power, slip, lanes):
             return False
-        in_range, ahead, reached, failed, left = bits_in_range(lanes), _limit_steps(lanes), 0, 0, 0
+        in_range, ahead, failed, left = bits_in_range(lanes), _limit_steps(lanes), 0, 0
+        reached = lanes.live[0] & in_range & ~ahead & ~lanes.failed[0]
         for lane in range(WIDTH):
-            if lanes.member[lane] < 0:
+            if lanes.member[lane] < 0 or reached >> lane & 1:
                 continue
             code = _look(s, rest, lanes, lane, budget, in_range >> lane & 1 == 1, ahead >> lane & 1 == 1)
             if lanes.failed[0] >> lane & 1:
