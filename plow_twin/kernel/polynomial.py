@@ -49,12 +49,18 @@ def sum_to_bernstein(b: Array, n: int) -> None:
 
 
 @kernel(inline="code")
-def _halve(left: Array, right: Array, n: int) -> None:
-    """Halve an interval with the coefficients `left`, and write those of its halves to `left` and `right`."""
+def _halve_top(b: Array, bounds: Array, top: int, n: int) -> None:
+    """Replace the interval `top`, whose coefficients are b[top], by its right half, and put the left half on top."""
+    left, right = b[top + 1], b[top]
+    for k in range(n + 1):
+        left[k] = right[k]
     for r in range(n + 1):
         right[n - r] = left[n]
         for j in range(n, r, -1):
             left[j] = 0.5 * (left[j] + left[j - 1])
+    middle = 0.5 * (bounds[top, 0] + bounds[top, 1])
+    bounds[top + 1, 0], bounds[top + 1, 1], bounds[top + 1, 2] = bounds[top, 0], middle, bounds[top, 2]
+    bounds[top, 0] = middle
 
 
 @kernel(fast=True)
@@ -124,13 +130,7 @@ def first_root_within(g: Array, n: int, h: float, w) -> float:
                 return low
             top -= 1
         else:
-            middle = 0.5 * (low + high)
-            # the left half is on top, so that it is searched first
-            for k in range(n + 1):
-                b[top + 1, k] = b[top, k]
-            _halve(b[top + 1], b[top], n)
-            bounds[top, 0] = middle
-            bounds[top + 1, 0], bounds[top + 1, 1] = low, middle
+            _halve_top(b, bounds, top, n)
             top += 1
     return np.inf
 
@@ -147,10 +147,11 @@ def _value(g: Array, n: int, x: float) -> float:
 def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
     """Return the larger of `floor` >= 0 and the maximum of g on [0, h], with a relative error of 1e-12.
 
-    If the Bernstein coefficients of g' change sign at most once, an interior maximum is the only root of g'. Otherwise
-    `_narrowed` halves intervals.
+    An interval where the Bernstein coefficients of g' change sign at most once has at most one interior maximum, the
+    root of g'. Other intervals are halved if the sums of their coefficients, which bound g, exceed the largest known
+    value.
     """
-    best, slope, b = max(floor, g[0], _value(g, n, h)), w.column[1], w.halves
+    best, slope, b, bounds = max(floor, g[0], _value(g, n, h)), w.column[1], w.halves, w.bounds
     steepest, power = 0.0, 1.0
     for k in range(2, n + 1):
         power *= h
@@ -161,35 +162,32 @@ def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
     for k in range(n):
         slope[k] = (k + 1) * g[k + 1]
     to_bernstein(slope, n - 1, h, w.binomial[n - 1], b[0])
-    changes, crossing, rises = 0, 0.0, b[0, 0] >= 0.0
-    positive = rises
-    for k in range(1, n):
-        if (b[0, k] >= 0.0) != positive:
-            changes += 1
-            crossing = h * (k - 1 + b[0, k - 1] / (b[0, k - 1] - b[0, k])) / (n - 1)
-            positive = not positive
-    if changes == 1 and rises:
-        return max(best, _value(g, n, _crossing(slope, n - 1, 0.0, h, crossing)))
-    return best if changes <= 1 else _narrowed(g, n, h, best, w)
-
-
-@kernel()
-def _narrowed(g: Array, n: int, h: float, best: float, w) -> float:
-    """Return the larger of `best` and the maximum of g on [0, h], by halving intervals that may exceed `best`."""
-    b = w.halves
-    to_bernstein(g, n, h, w.binomial[n], b[0])
+    bounds[0, 0], bounds[0, 1], bounds[0, 2] = 0.0, h, g[0]
     top = 0
     while top >= 0:
-        best = max(best, b[top, 0], b[top, n])
-        bound = b[top, 0]
-        for k in range(1, n + 1):
-            bound = max(bound, b[top, k])
-        if bound <= best * (1.0 + 1e-12) or top >= MAX_HALVINGS:
+        low, high, value = bounds[top, 0], bounds[top, 1], bounds[top, 2]
+        best, bound, share = max(best, value), value, (high - low) / n
+        changes, crossing, rises = 0, low, b[top, 0] >= 0.0
+        positive = rises
+        for k in range(n):
+            if (b[top, k] >= 0.0) != positive:
+                changes += 1
+                span = b[top, k - 1] - b[top, k]
+                crossing = low + (high - low) * (k - 1 + b[top, k - 1] / span) / (n - 1)
+                positive = not positive
+            value += share * b[top, k]
+            bound = max(bound, value)
+        if changes <= 1:
+            if changes == 1 and rises:
+                best = max(best, _value(g, n, _crossing(slope, n - 1, low, high, crossing)))
+            top -= 1
+        elif bound <= best * (1.0 + 1e-12) or top >= MAX_HALVINGS:
             top -= 1
         else:
-            for k in range(n + 1):
-                b[top + 1, k] = b[top, k]
-            _halve(b[top + 1], b[top], n)
+            _halve_top(b, bounds, top, n - 1)
+            bounds[top, 2] = bounds[top + 1, 2]
+            for k in range(n):
+                bounds[top, 2] += 0.5 * share * b[top + 1, k]
             top += 1
     return best
 

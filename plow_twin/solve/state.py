@@ -290,7 +290,7 @@ WORK: Final = np.dtype(
         # coefficients of a polynomial in time, for example of a guard function or a force
         ("column", "f8", (2, _ROWS)),
         ("halves", "f8", (MAX_HALVINGS + 2, _ROWS)),
-        ("bounds", "f8", (MAX_HALVINGS + 2, 2)),
+        ("bounds", "f8", (MAX_HALVINGS + 2, 3)),
         ("wrench", "f8", (2, 3)),  # linear load: value at the start of the step, and slope
         ("flight", "f8", (6, 6)),  # initial state of a flight, its bounds, and scratch space (`solve.method.flight`)
         ("rest", "f8", (4, 6)),  # position, rates and load at rest (`solve.method.rest`)

@@ -307,6 +307,24 @@ def isolate(lanes, column, w, order, bits):
 
 
 @kernel()
+def _isolate_first(lanes, column, w, order, bits):
+    """Return a bit mask of the polynomials of `bits` whose first root is the only root up to their lowest coefficient.
+
+    The intervals of `bits` are shortened to the place of their lowest Bernstein coefficients. A function that becomes
+    negative for a short time usually has one root there.
+    """
+    b, h, root = lanes.bernstein, exact_row(lanes.reach, 0), exact_row(lanes.root, 0)
+    lowest, place = exact_row(b, 0), exact_splat(0.0)
+    for k in range(1, order + 1):
+        lower = below(exact_row(b, k), lowest)
+        lowest, place = choose(lower, exact_row(b, k), lowest), choose(lower, exact_splat(1.0 * k), place)
+    set_row(lanes.reach, 0, choose(bits, place * h * (1.0 / order), h))
+    once, _ = isolate(lanes, column, w, order, bits)
+    set_row(lanes.root, 0, choose(once, exact_row(lanes.root, 0), root))
+    return once
+
+
+@kernel()
 def cross(lanes, column, order, bits) -> None:
     """Compute each polynomial's only root in [0, reach], by Halley's method with bisection as fallback."""
     low, high, x, zero = exact_splat(0.0), exact_row(lanes.reach, 0), exact_row(lanes.root, 0), exact_splat(0.0)
@@ -402,24 +420,27 @@ def _search(lanes, w, at, order, bits) -> None:
     """Search the first root of each guard function within the step of its lane."""
     guard = lanes.guard[at]
     single, several = isolate(lanes, guard, w, order, bits)
-    if single != 0:
-        cross(lanes, guard, order, single)
+    found = single
+    if several != 0:
+        found |= _isolate_first(lanes, guard, w, order, several)
+    if found != 0:
+        cross(lanes, guard, order, found)
     left = single | several
     while left != 0:
         i = lowest_bit(left)
         left &= left - 1
-        lane, begin, has_one = lanes.owner[at, i], lanes.begin[i], single >> i & 1 == 1
+        lane, begin = lanes.owner[at, i], lanes.begin[i]
         root, reach = lanes.root[i] + begin, lanes.step[lane] - begin
         if reach <= 0.0:
             continue
-        if not has_one:
+        if found >> i & 1 == 0:
             column = w.column[0]
             for k in range(order + 1):
                 column[k] = guard[k, i]
             root = first_root(column, order, reach, w) + begin
         if root < lanes.step[lane]:
             lanes.counts[GUARD_ROOTS, lane] += 1
-            _note_root(lanes, lane, lanes.guarded[at, i], root, has_one)
+            _note_root(lanes, lane, lanes.guarded[at, i], root, single >> i & 1 == 1)
 
 
 @kernel()
