@@ -162,6 +162,9 @@ def _undo(s, lanes, bits) -> None:
     for i in range(COUNTS):
         _copy_lanes(lanes.counts, i, lanes.kept_counts, i, bits)
     _copy_lanes(lanes.time, 0, lanes.knot, 0, bits)
+    for lane in range(WIDTH):
+        if bits >> lane & 1:
+            lanes.carrying[lane] = -1
     lanes.stale[0] = 1
     _clear_sums(s, lanes, bits)
 
@@ -300,7 +303,7 @@ def _write_outputs(lanes, reached, viscous, hysteretic, power, fraction) -> None
         depth, closing = penetration_at(lanes.rows[pair], c, s, x, y), linear_at(lanes.rows[pair], dc, ds, dx, dy)
         push = depth
         if viscous is not None:
-            push = fused(exact_row(lanes.ratio, pair), closing, depth)
+            push = fused(exact_row(lanes.damped, 0), closing, depth)
         if hysteretic is not None:
             push = fused(exact_row(lanes.factor, pair) * closing, depth, depth)
         if power is not None:

@@ -69,7 +69,7 @@ def _list_guards(lanes, order, hysteretic, power, fraction) -> None:
         _list_powers(lanes, order, hysteretic, fraction)
         return
     one, none, h = exact_splat(1.0), exact_splat(0.0), exact_row(lanes.step, 0)
-    damped = exact_row(lanes.viscous, 0) / exact_row(lanes.stiffness, 0)
+    damped = exact_row(lanes.damped, 0)
     for slot in range(PAIR_COUNT):
         taken, gear = lanes.taken[slot], lanes.gear[slot]
         if taken == 0:
@@ -111,12 +111,12 @@ def _may_end(series, factor, first, order, h):
     Term 0 of the guard function is `first`. Every higher term is the term of `series` times `factor`. `_write_guard`
     describes the test.
     """
-    reach = term = exact_splat(0.0)
+    lowest = term = zero = exact_splat(0.0)
     for k in range(order, 0, -1):
         term = exact_row(series, k) * factor
         if k > 1:
-            reach = fused(magnitude(term) - term, exact_splat(0.5), reach) * h
-    return below(fused(term, h, first), reach * h)
+            lowest = fused(lowest, h, choose(below(term, zero), term, zero))
+    return below(fused(lowest * h, h, fused(term, h, first)), zero)
 
 
 @kernel()
@@ -168,7 +168,7 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
     bit mask of the guard functions that may become negative, by the lower bound in `solve.events._unsafe_pairs`.
     """
     cosine, sine, x, y = lanes.series[COS], lanes.series[SIN], lanes.series[X], lanes.series[Y]
-    reach = term = deeper = zero = exact_splat(0.0)
+    lowest = term = deeper = zero = exact_splat(0.0)
     dc, ds, dx, dy = lanes.rates[0], lanes.rates[1], lanes.rates[2], lanes.rates[3]
     damped = below(zero, magnitude(of_rate))
     for k in range(order, 0, -1):
@@ -188,7 +188,7 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
                 term = fused(of_rate, deeper, term)
         set_row(guard, k, term)
         if k > 1:
-            reach = fused(magnitude(term) - term, exact_splat(0.5), reach) * h
+            lowest = fused(lowest, h, choose(below(term, zero), term, zero))
     depth = penetration_at(
         rows, _row_of(cosine, 0, places), _row_of(sine, 0, places), _row_of(x, 0, places), _row_of(y, 0, places)
     )
@@ -204,23 +204,27 @@ def _write_guard(lanes, places, rows, of_depth, of_rate, constant, guard, order,
         kept |= below(zero, exact_row(lanes.begin, 0))
     first = choose(kept, first, zero)
     set_row(guard, 0, first)
-    return below(fused(term, h, first), reach * h)
+    return below(fused(lowest * h, h, fused(term, h, first)), zero)
 
 
 @kernel()
 def _choose_guards(lanes, at, hysteretic, fraction) -> int:
     """Choose up to eight guard functions, first the next function of each lane, and return their number."""
-    count, before = 0, -1
-    while before < count < WIDTH:
-        before = count
-        for lane in range(WIDTH):
+    count = busy = 0
+    for lane in range(WIDTH):
+        busy |= 1 << lane if lanes.todo[lane] != 0 else 0
+    while busy != 0 and count < WIDTH:
+        left = busy
+        while left != 0 and count < WIDTH:
+            lane = lowest_bit(left)
+            left &= left - 1
             todo = lanes.todo[lane]
-            if todo != 0 and count < WIDTH:
-                guard = lowest_bit(todo)
-                lanes.todo[lane] = todo & ~(1 << guard)
-                lanes.guarded[at, count], lanes.owner[at, count] = guard, lane
-                _write_choice(lanes, lane, guard, count, hysteretic, fraction)
-                count += 1
+            guard, todo = lowest_bit(todo), todo & todo - 1
+            lanes.todo[lane] = todo
+            busy ^= 1 << lane if todo == 0 else 0
+            lanes.guarded[at, count], lanes.owner[at, count] = guard, lane
+            _write_choice(lanes, lane, guard, count, hysteretic, fraction)
+            count += 1
     for i in range(count, WIDTH):
         lanes.guarded[at, i], lanes.owner[at, i] = -1, 0
     return count
@@ -230,7 +234,7 @@ def _choose_guards(lanes, at, hysteretic, fraction) -> int:
 def _write_choice(lanes, lane, guard, i, hysteretic, fraction) -> None:
     """Write the guard function `i` of an iteration: factors of d and d', constant, and interval."""
     chosen, pair = lanes.chosen, guard % PAIR_COUNT
-    mode, sign, constant, rate = lanes.mode[pair, lane], 1.0, 0.0, lanes.viscous[lane] / lanes.stiffness[lane]
+    mode, sign, constant, rate = lanes.mode[pair, lane], 1.0, 0.0, lanes.damped[lane]
     begin = 0.0
     if guard < SECOND:
         sign, rate = -1.0 if mode == OFF else 1.0, rate if mode == ON else 0.0

@@ -117,41 +117,56 @@ def _look(members, flight, rest, lanes, lane, w, t_end, budget, in_range) -> int
 
 
 @kernel()
-def _fill_rows(lanes, lane, order, fraction, t, i, end, q, v) -> int:
-    """Fill the output rows within a lane's step from row i on, and return the first row after the step."""
-    last, begin, sigma = i, lanes.time[lane], lanes.root
-    while last < t.size and t[last] < end:
-        last += 1
-    while i < last:
-        count = min(last - i, WIDTH)
-        for j in range(WIDTH):
-            sigma[j] = sigma_of(lanes, lane, max(t[i + min(j, count - 1)] - begin, 0.0), fraction)
-        at = exact_row(sigma, 0)
-        # four independent sums keep the processor busy
-        for first in range(0, COMPONENTS, 4):
-            one, two = lanes.series[first], lanes.series[first + 1]
-            three, four = lanes.series[first + 2], lanes.series[first + 3]
-            a, b = exact_splat(one[order, lane]), exact_splat(two[order, lane])
-            c, d = exact_splat(three[order, lane]), exact_splat(four[order, lane])
-            for k in range(order - 1, -1, -1):
-                a, b = fused(a, at, exact_splat(one[k, lane])), fused(b, at, exact_splat(two[k, lane]))
-                c, d = fused(c, at, exact_splat(three[k, lane])), fused(d, at, exact_splat(four[k, lane]))
-            set_row(lanes.out, first, a)
-            set_row(lanes.out, first + 1, b)
-            set_row(lanes.out, first + 2, c)
-            set_row(lanes.out, first + 3, d)
-        turn(lanes.out, X, Y)
-        turn(lanes.out, VX, VY)
-        for j in range(count):
-            q[i + j, 0], q[i + j, 1], q[i + j, 2] = lanes.out[X, j], lanes.out[Y, j], lanes.out[THETA, j]
-            v[i + j, 0], v[i + j, 1], v[i + j, 2] = lanes.out[VX, j], lanes.out[VY, j], lanes.out[OMEGA, j]
-        i += count
-    return i
+def _fill_rows(members, lanes, order, fraction, t) -> None:
+    """Write the output rows within the steps of all lanes, one row of each lane at a time."""
+    at, due = lanes.root, lanes.live[0]
+    while True:
+        left, due = due, 0
+        while left != 0:
+            lane = lowest_bit(left)
+            left &= left - 1
+            i = members.first[lanes.member[lane]]
+            if i < t.size and t[i] < end_of(lanes, lane, fraction):
+                at[lane] = sigma_of(lanes, lane, max(t[i] - lanes.time[lane], 0.0), fraction)
+                due |= 1 << lane
+        if due == 0:
+            return
+        _evaluate(lanes, order, exact_row(at, 0))
+        left = due
+        while left != 0:
+            lane = lowest_bit(left)
+            left &= left - 1
+            member = lanes.member[lane]
+            i = members.first[member]
+            q, v, out = members.q[member, i], members.v[member, i], lanes.out
+            q[0], q[1], q[2] = out[X, lane], out[Y, lane], out[THETA, lane]
+            v[0], v[1], v[2] = out[VX, lane], out[VY, lane], out[OMEGA, lane]
+            members.first[member] = i + 1
+
+
+@kernel()
+def _evaluate(lanes, order, at) -> None:
+    """Write poses and rates at one value of each lane's series variable to `lanes.out`."""
+    # four independent sums keep the processor busy
+    for first in range(0, COMPONENTS, 4):
+        one, two, three, four = (
+            lanes.series[first], lanes.series[first + 1], lanes.series[first + 2], lanes.series[first + 3],
+        )  # fmt: skip
+        a, b, c, d = exact_row(one, order), exact_row(two, order), exact_row(three, order), exact_row(four, order)
+        for k in range(order - 1, -1, -1):
+            a, b = fused(a, at, exact_row(one, k)), fused(b, at, exact_row(two, k))
+            c, d = fused(c, at, exact_row(three, k)), fused(d, at, exact_row(four, k))
+        set_row(lanes.out, first, a)
+        set_row(lanes.out, first + 1, b)
+        set_row(lanes.out, first + 2, c)
+        set_row(lanes.out, first + 3, d)
+    turn(lanes.out, X, Y)
+    turn(lanes.out, VX, VY)
 
 
 @kernel()
 def turn(out, first, second) -> None:
-    """Convert a vector at eight times, or in eight lanes, to world axes."""
+    """Convert a vector to world axes."""
     c, s, x, y = exact_row(out, COS), exact_row(out, SIN), exact_row(out, first), exact_row(out, second)
     set_row(out, first, fused(c, x, s * y * -1.0))
     set_row(out, second, fused(s, x, c * y))
@@ -392,14 +407,7 @@ def _step(members, waves, second, viscous, hysteretic, power, fraction, slip, or
         note_durations(lanes)
     sum_step(lanes, w, order, power)
     add_step(members.totals, lanes, w, order, order, viscous, hysteretic, power, fraction)
-    for lane in range(WIDTH):
-        member = lanes.member[lane]
-        if member >= 0 and members.first[member] < t.size:
-            first, end = members.first[member], end_of(lanes, lane, fraction)
-            if t[first] < end:
-                members.first[member] = _fill_rows(
-                    lanes, lane, order, fraction, t, first, end, members.q[member], members.v[member]
-                )
+    _fill_rows(members, lanes, order, fraction, t)
     move(lanes)
     for lane in range(WIDTH):
         member = lanes.member[lane]

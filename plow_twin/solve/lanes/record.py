@@ -37,6 +37,7 @@ MOST_LACUNA: Final = 6
 _ROWS: Final = MAX_ORDER + 1
 _PAIRS: Final = (PAIR_COUNT, WIDTH)
 _LANES_OF: Final = (WIDTH,)
+_ALL: Final = 2**WIDTH - 1
 #: Indices of the blocks of `staged`: five rows of the penetrations, two rows of the arms, then state, lambda, modes,
 #: and whether a pair can touch.
 _ARM, _Y, _FACTOR, _MODE, _ENABLED, _BLOCKS = 5, 7, 8, 9, 10, 11
@@ -56,6 +57,7 @@ _BLOCK_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("weight", "f8", _LANES_OF),
     ("stiffness", "f8", _LANES_OF),
     ("viscous", "f8", _LANES_OF),
+    ("damped", "f8", _LANES_OF),  # C / K
     ("half_cavity", "f8", _LANES_OF),
     ("mass", "f8", (3, WIDTH)),  # sampled loads: mass, mass and inertia
     ("small", "f8", _LANES_OF),  # size of a term, over the longest admissible step, below which it is treated as zero
@@ -77,14 +79,12 @@ _BLOCK_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("touched", "i8", _LANES_OF),  # bit mask of the pairs that touch at the start of the step
     ("counts", "i8", (COUNTS, WIDTH)),  # counts of the state records, indexed by `STEPS` to `AT_ONCE`
     # the following fields are derived from the modes (`note_modes`, `_weigh_lanes`)
-    ("ratio", "f8", _PAIRS),  # C / K of pairs that are ON
-    ("filled", "i8", _LANES_OF),  # number of slots that are used by the lane
     ("on", "i8", (PAIR_COUNT,)),  # bit mask of the lanes in which the pair is ON
     ("off", "i8", (PAIR_COUNT,)),  # bit mask of the lanes in which the pair is OFF and can touch
     ("taken", "i8", (PAIR_COUNT,)),  # bit mask of the lanes that use the slot
     ("watched", "i8", _LANES_OF),  # bit mask of the guard functions that are always searched
-    ("inside", "i8", _LANES_OF),  # number of pairs that penetrate
-    ("carrying", "i8", _LANES_OF),  # bit mask of the pairs that are ON
+    ("inside", "i8", _LANES_OF),  # bit mask of the pairs that penetrate
+    ("carrying", "i8", _LANES_OF),  # bit mask of the pairs that are ON, or -1 for a lane to note anew
     ("along", "f8", (2, 6, WIDTH)),  # coefficients of c, s, X or Y and of their rates in the forces along X and Y
     # the moment is c Gc + s Gs - X fy + Y fx; coefficients of c, s, X, Y and of their rates in Gc and Gs
     ("turn", "f8", (2, 8, WIDTH)),
@@ -101,7 +101,7 @@ def _begin_of(field: str) -> int:
 
 #: Offsets in `BLOCK` [B] of the state, of the data derived from modes, of `slot` and of `gear`. `_SIZE` and `_GEAR` are
 #: the sizes [B] of a block and of one slot's data in `gear`.
-_STATE, _NOTES, _SLOTS, _GEARS = _begin_of("y"), _begin_of("ratio"), _begin_of("slot"), _begin_of("gear")
+_STATE, _NOTES, _SLOTS, _GEARS = _begin_of("y"), _begin_of("on"), _begin_of("slot"), _begin_of("gear")
 _SIZE: Final = BLOCK.itemsize
 _GEAR: Final = (_SIZE - _GEARS) // PAIR_COUNT
 
@@ -143,7 +143,7 @@ LANES: Final = np.dtype(
         ("peak", "f8", _PAIRS),
         ("impulse", "f8", _PAIRS),
         ("time_in_contact", "f8", _PAIRS),
-        ("out", "f8", (COMPONENTS, WIDTH)),  # values of one scene at eight times, or of eight scenes at one time
+        ("out", "f8", (COMPONENTS, WIDTH)),  # state at one time of each lane
         ("pair_values", "f8", (3, PAIR_COUNT, WIDTH)),  # penetration, rate, force
         # blocks whose rows are lanes and whose columns are pairs or components, and the transposes of these blocks
         ("staged", "f8", (_BLOCKS, WIDTH, PAIR_COUNT)),
@@ -243,7 +243,7 @@ def load_lane(p, state, power, slip, lanes, lane, member) -> None:
     lanes.inverse_mass[lane], lanes.inverse_inertia[lane] = p.inverse_mass, p.inverse_inertia
     lanes.radius[lane], lanes.weight[lane] = p.radius, p.weight
     lanes.stiffness[lane], lanes.viscous[lane] = p.stiffness, p.viscous
-    lanes.half_cavity[lane] = p.half_cavity
+    lanes.damped[lane], lanes.half_cavity[lane] = p.viscous / p.stiffness, p.half_cavity
     if power is not None:
         lanes.exponent[lane], lanes.release[lane] = p.exponent, p.release
     if slip is not None:
@@ -278,6 +278,9 @@ def join_lanes(lanes, bits) -> None:
         set_row(lanes.mode, pair, choose(bits, mode, exact_row(lanes.mode, pair)))
         enabled = exact_row(turned, WIDTH * _ENABLED + pair)
         set_row(lanes.enabled, pair, choose(bits, enabled, exact_row(lanes.enabled, pair)))
+    for lane in range(WIDTH):
+        if bits >> lane & 1:
+            lanes.carrying[lane] = -1
     note_modes(lanes)
     lanes.stale[0] = 1
 
@@ -320,31 +323,43 @@ def empty_lanes(lanes, bits) -> None:
     lanes.live[0] &= ~bits
 
 
+@kernel(inline="code")
+def _exchanged(bits):
+    """Return the transpose of the 8 x 8 bits of an integer."""
+    swapped = (bits ^ bits >> 7) & 0x00AA00AA00AA00AA
+    bits ^= swapped ^ swapped << 7
+    swapped = (bits ^ bits >> 14) & 0x0000CCCC0000CCCC
+    bits ^= swapped ^ swapped << 14
+    swapped = (bits ^ bits >> 28) & 0x00000000F0F0F0F0
+    return bits ^ swapped ^ swapped << 28
+
+
 @kernel()
 def note_modes(lanes) -> None:
     """Derive the guard functions of all lanes from the modes, and assign the pairs that are ON to slots."""
-    live, damped = lanes.live[0], exact_row(lanes.viscous, 0) / exact_row(lanes.stiffness, 0)
+    live, acting, inside, taken = lanes.live[0], 0, 0, 0
     lanes.noted[0] = live
-    for lane in range(WIDTH):
-        lanes.inside[lane] = lanes.carrying[lane] = lanes.watched[lane] = lanes.filled[lane] = 0
     for pair in range(PAIR_COUNT):
         on, off = equal(lanes.mode, pair, ON) & live, equal(lanes.mode, pair, OFF) & live
-        set_row(lanes.ratio, pair, choose(on, damped, exact_splat(0.0)))
         lanes.on[pair], lanes.off[pair] = on, off & ~equal(lanes.enabled, pair, 0)
-        lanes.taken[pair], left = 0, live & ~off
-        while left != 0:
-            lane = lowest_bit(left)
-            left &= left - 1
-            lanes.inside[lane] += 1
-            if on >> lane & 1:
-                lanes.carrying[lane] |= 1 << pair
-                _take_slot(lanes, lane, pair, lanes.filled[lane])
-                lanes.filled[lane] += 1
-            else:
-                lanes.watched[lane] |= 1 << pair | 1 << SECOND + pair
+        acting |= on << WIDTH * pair
+        inside |= (live & ~off) << WIDTH * pair
+    acting, inside = _exchanged(acting), _exchanged(inside)
     for lane in range(WIDTH):
-        for slot in range(lanes.filled[lane]):
-            lanes.taken[slot] |= 1 << lane
+        pairs = acting >> PAIR_COUNT * lane & _ALL
+        lanes.inside[lane] = inside >> PAIR_COUNT * lane & _ALL
+        lanes.watched[lane] = (lanes.inside[lane] ^ pairs) * (1 | 1 << SECOND)
+        same, slot = pairs == lanes.carrying[lane], 0
+        lanes.carrying[lane] = pairs
+        while pairs != 0:
+            pair = lowest_bit(pairs)
+            pairs &= pairs - 1
+            if not same:
+                _take_slot(lanes, lane, pair, slot)
+            taken |= 1 << WIDTH * slot + lane
+            slot += 1
+    for slot in range(PAIR_COUNT):
+        lanes.taken[slot] = taken >> WIDTH * slot & _ALL
 
 
 @kernel()

@@ -336,7 +336,7 @@ def _push(lanes, w, k, acts, viscous, hysteretic, slip, c, s, x, y, dc, ds, dx, 
                 half = fused(middle * 0.5, middle, half)
             push = fused(exact_row(gear, 7), half * (k + 1.0), push)
         elif viscous is not None:
-            push = fused(exact_row(lanes.viscous, 0) / exact_row(lanes.stiffness, 0), rate, push)
+            push = fused(exact_row(lanes.damped, 0), rate, push)
         push = choose(taken, push, exact_splat(0.0))
         set_row(lanes.push[slot], k, push)
         fx, fy, gc, gs = _add_force(lanes, gear, push, fx, fy, gc, gs)

@@ -133,10 +133,10 @@ def _raise_peaks(totals, lanes, w, slot, order, full, on) -> int:
         end = fused(end, h, term)
         if k > 1:
             # a function exceeds its end values by at most h^2 / 8 times its largest downward curvature
-            bend = fused(magnitude(term) - term, exact_splat(0.0625 * k * (k - 1)), bend) * h
+            bend = fused(bend, h, choose(below(term, zero), term, zero) * (-0.125 * k * (k - 1)))
     start, stiffness, peak = exact_row(push, 0), exact_row(lanes.stiffness, 0), exact_row(lanes.gained, 1)
     most = choose(below(start, end), end, start)
-    exceeds = below(peak, stiffness * fused(bend, h, most) * _ROUNDED) & on
+    exceeds = below(peak, stiffness * fused(bend * h, h, most) * _ROUNDED) & on
     if exceeds == 0:
         return 0
     reached = stiffness * most
