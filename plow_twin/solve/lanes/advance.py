@@ -475,7 +475,7 @@ def _step(s, viscous, hysteretic, power, fraction, slip, order, lanes, w) -> Non
         before_sticking(lanes, w, used, fraction)
     first_events(lanes, w, used, order, hysteretic, power, fraction)
     go_past_an_instant(s.params, lanes)
-    note_switches(lanes, used, viscous, fraction)
+    note_switches(lanes, viscous, fraction)
     if fraction is not None:
         note_durations(lanes)
     sum_step(lanes, w, used, power)

@@ -78,9 +78,9 @@ def _list_guards(lanes, order, hysteretic, power, fraction) -> None:
             ends = _write_guard(lanes, None, gear, one, damped, none, lanes.push[slot], order, h, None)
             _note(lanes, slot, 0, ends & taken)
         else:
-            ends = _write_guard(lanes, None, gear, one, none, none, lanes.guard[0], order, h, None)
+            ends = _write_guard(lanes, None, gear, one, none, none, lanes.guard, order, h, None)
             _note(lanes, slot, 0, ends & taken)
-            pull = _write_guard(lanes, None, gear, none, exact_row(gear, 7), one, lanes.guard[0], order, h, None)
+            pull = _write_guard(lanes, None, gear, none, exact_row(gear, 7), one, lanes.guard, order, h, None)
             _note(lanes, slot, SECOND, pull & taken)
 
 
@@ -395,6 +395,7 @@ def first_events(lanes, w, order, full, hysteretic, power, fraction) -> None:
         if count == 0:
             return
         bits = _write_chosen(lanes, at, order, full, fraction) & ((1 << count) - 1)
+        set_row(lanes.ending, at, never)
         if bits != 0:
             _search(lanes, w, at, full, bits)
     lanes.rounds[0] = GUARDS
@@ -403,7 +404,7 @@ def first_events(lanes, w, order, full, hysteretic, power, fraction) -> None:
 @kernel()
 def _write_chosen(lanes, at, order, full, fraction):
     """Write the guard functions of an iteration, and return a bit mask of those that may become negative."""
-    chosen, guard, zero = lanes.chosen, lanes.guard[at], exact_splat(0.0)
+    chosen, guard, zero = lanes.chosen, lanes.guard, exact_splat(0.0)
     places = places_of(lanes.row_place)
     for i in range(5):
         set_row(chosen, i, gathered(lanes.rows, i, places))
@@ -422,7 +423,7 @@ def _write_chosen(lanes, at, order, full, fraction):
 @kernel()
 def _search(lanes, w, at, order, bits) -> None:
     """Search the first root of each guard function within the step of its lane."""
-    guard = lanes.guard[at]
+    guard = lanes.guard
     single, several = isolate(lanes, guard, w, order, bits)
     found = single
     if several != 0:
@@ -433,15 +434,14 @@ def _search(lanes, w, at, order, bits) -> None:
     while left != 0:
         i = lowest_bit(left)
         left &= left - 1
-        lane, begin = lanes.owner[at, i], lanes.begin[i]
-        root, reach = lanes.root[i] + begin, lanes.step[lane] - begin
-        if reach <= 0.0:
-            continue
+        lane, begin, root = lanes.owner[at, i], lanes.begin[i], lanes.root[i]
         if found >> i & 1 == 0:
             column = w.column[0]
             for k in range(order + 1):
                 column[k] = guard[k, i]
-            root = first_root(column, order, reach, w) + begin
+            root = first_root(column, order, lanes.accurate[lane] - begin, w)
+        root += begin
+        lanes.ending[at, i] = root
         if root < lanes.step[lane]:
             lanes.counts[GUARD_ROOTS, lane] += 1
             _note_root(lanes, lane, lanes.guarded[at, i], root, single >> i & 1 == 1)
@@ -465,17 +465,7 @@ def _other_mode(mode):
 
 
 @kernel()
-def _ends_with(guard, order, at, within):
-    """Return a bit mask of the lanes whose guard function becomes negative before `at` + `within`."""
-    value, slope, zero = exact_row(guard, order), exact_splat(0.0), exact_splat(0.0)
-    for k in range(order - 1, -1, -1):
-        slope = fused(slope, at, value)
-        value = fused(value, at, exact_row(guard, k))
-    return below(slope, zero) & below(fused(slope, within, value), zero)
-
-
-@kernel()
-def note_switches(lanes, order, viscous, fraction) -> None:
+def note_switches(lanes, viscous, fraction) -> None:
     """Write the pairs that change their modes after the steps to `lanes.switching`, and the modes to `lanes.switch`.
 
     Events that differ only by rounding are simultaneous, so that a symmetric motion stays symmetric.
@@ -488,7 +478,7 @@ def note_switches(lanes, order, viscous, fraction) -> None:
         return
     for at in range(lanes.rounds[0]):
         step = picked(lanes.step, 0, exact_row(lanes.owner, at))
-        ended = _ends_with(lanes.guard[at], order, step, step * _AT_ONCE)
+        ended = below(exact_row(lanes.ending, at), step * (1.0 + _AT_ONCE))
         while ended != 0:
             i = lowest_bit(ended)
             ended &= ended - 1

@@ -29,6 +29,7 @@ from plow_twin.solve.lanes.record import (
     penetration_at,
     refresh,
     save_lanes,
+    set_state,
     write_place,
 )
 from plow_twin.solve.lanes.series import accurate_steps, before_sticking, expand, expand_loads
@@ -147,21 +148,19 @@ def _fill_rows(members, lanes, order, fraction, t) -> None:
 @kernel()
 def _evaluate(lanes, order, at) -> None:
     """Write poses and rates at one value of each lane's series variable to `lanes.out`."""
-    # four independent sums keep the processor busy
-    for first in range(0, COMPONENTS, 4):
-        one, two, three, four = (
-            lanes.series[first], lanes.series[first + 1], lanes.series[first + 2], lanes.series[first + 3],
-        )  # fmt: skip
-        a, b, c, d = exact_row(one, order), exact_row(two, order), exact_row(three, order), exact_row(four, order)
-        for k in range(order - 1, -1, -1):
-            a, b = fused(a, at, exact_row(one, k)), fused(b, at, exact_row(two, k))
-            c, d = fused(c, at, exact_row(three, k)), fused(d, at, exact_row(four, k))
-        set_row(lanes.out, first, a)
-        set_row(lanes.out, first + 1, b)
-        set_row(lanes.out, first + 2, c)
-        set_row(lanes.out, first + 3, d)
-    turn(lanes.out, X, Y)
-    turn(lanes.out, VX, VY)
+    # independent sums keep the processor busy
+    series, out = lanes.series, lanes.out
+    x, y, theta = exact_row(series[X], order), exact_row(series[Y], order), exact_row(series[THETA], order)
+    vx, vy, om = exact_row(series[VX], order), exact_row(series[VY], order), exact_row(series[OMEGA], order)
+    c, s = exact_row(series[COS], order), exact_row(series[SIN], order)
+    for k in range(order - 1, -1, -1):
+        x, y = fused(x, at, exact_row(series[X], k)), fused(y, at, exact_row(series[Y], k))
+        vx, vy = fused(vx, at, exact_row(series[VX], k)), fused(vy, at, exact_row(series[VY], k))
+        c, s = fused(c, at, exact_row(series[COS], k)), fused(s, at, exact_row(series[SIN], k))
+        theta, om = fused(theta, at, exact_row(series[THETA], k)), fused(om, at, exact_row(series[OMEGA], k))
+    set_state(out, x, y, vx, vy, om, c, s, theta)
+    turn(out, X, Y)
+    turn(out, VX, VY)
 
 
 @kernel()
@@ -402,7 +401,7 @@ def _step(members, waves, second, viscous, hysteretic, power, fraction, slip, or
         before_sticking(lanes, w, order, fraction)
     first_events(lanes, w, order, order, hysteretic, power, fraction)
     go_past_an_instant(members.params, lanes)
-    note_switches(lanes, order, viscous, fraction)
+    note_switches(lanes, viscous, fraction)
     if fraction is not None:
         note_durations(lanes)
     sum_step(lanes, w, order, power)

@@ -18,7 +18,7 @@ from plow_twin.kernel.polynomial import sum_to_bernstein
 from plow_twin.kernel.simd import choose, equal, exact_row, exact_splat, fused, lowest_bit, set_row, transpose
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.compiled_scene import CompiledScene, options
-from plow_twin.solve.state import COS, MAX_ORDER, OFF, ON, Terms, new_records
+from plow_twin.solve.state import COS, MAX_ORDER, OFF, OMEGA, ON, SIN, THETA, VX, VY, Terms, X, Y, new_records
 
 #: Number of scenes in a vector.
 WIDTH: Final = 8
@@ -114,7 +114,8 @@ LANES: Final = np.dtype(
         # penetration of the pair in each slot; not used if F is linear in d and d'
         ("depth", "f8", (PAIR_COUNT, _ROWS, WIDTH)),
         ("push", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # F / K of the pair in each slot
-        ("guard", "f8", (GUARDS, _ROWS, WIDTH)),  # eight guard functions of each iteration, which may be of any lanes
+        ("guard", "f8", (_ROWS, WIDTH)),  # eight guard functions of an iteration, which may be of any lanes
+        ("ending", "f8", (GUARDS, WIDTH)),  # first roots of the guard functions of each iteration, or infinity
         ("bernstein", "f8", (_ROWS, WIDTH)),
         ("bulge", "f8", (_ROWS, WIDTH)),  # forces whose maximum is not yet computed and may exceed the peak
         ("bulge_step", "f8", _LANES_OF),  # step sizes for the forces in `bulge`
@@ -431,6 +432,19 @@ def read_block(lanes, block) -> None:
 def write_block(block, lanes, new) -> None:
     """Copy the state of the lanes to their block, data derived from modes after changes, and constants if it is new."""
     copy_part(block, lanes, 0 if new else _STATE, _NOTES if lanes.noted[0] < 0 else _SIZE)
+
+
+@kernel(inline="code")
+def set_state(there, x, y, vx, vy, om, c, s, angle) -> None:
+    """Write the components of a state, or those of its change, of all lanes."""
+    set_row(there, X, x)
+    set_row(there, Y, y)
+    set_row(there, VX, vx)
+    set_row(there, VY, vy)
+    set_row(there, OMEGA, om)
+    set_row(there, COS, c)
+    set_row(there, SIN, s)
+    set_row(there, THETA, angle)
 
 
 @kernel(inline="code")

@@ -76,7 +76,7 @@ def expand_loads(harmonics, extent, second, fraction, lanes, w, order) -> None:
             _add_wave(lanes.load[2], k, lanes, 7, sine, cosine)
             scale = omega * w.inverse[k + 1]
             if fraction is None:
-                sine, cosine = scale * cosine, scale * sine * -1.0
+                sine, cosine = scale * cosine, scale * -1.0 * sine
             else:
                 new_sine = scale * fused(alpha, cosine, beta * cosine_before)
                 new_cosine = scale * fused(alpha, sine, beta * sine_before) * -1.0

@@ -8,8 +8,8 @@ from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, 
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.lanes.events import cross, isolate
 from plow_twin.solve.lanes.maps import duration_of
-from plow_twin.solve.lanes.record import COMPONENTS, WIDTH, linear_at, penetration_at, to_bernstein
-from plow_twin.solve.state import COS, SIN, X, Y
+from plow_twin.solve.lanes.record import WIDTH, linear_at, penetration_at, set_state, to_bernstein
+from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 from plow_twin.solve.totals import add_set_times
 
 #: Allowances for rounding: factor on the upper bound of a force, and ratio up to which a maximum equals a peak.
@@ -22,29 +22,25 @@ def sum_step(lanes, w, order, power) -> None:
 
     Only impulses with the exponent 1 need the integrals.
     """
-    h, zero = exact_row(lanes.step, 0), exact_splat(0.0)
-    # four independent sums keep the processor busy
-    for i in range(0, COMPONENTS, 4):
-        a = b = c = d = zero
-        for k in range(order, 0, -1):
-            a, b = fused(a, h, exact_row(lanes.series[i], k)), fused(b, h, exact_row(lanes.series[i + 1], k))
-            c, d = fused(c, h, exact_row(lanes.series[i + 2], k)), fused(d, h, exact_row(lanes.series[i + 3], k))
-        set_row(lanes.change, i, a * h)
-        set_row(lanes.change, i + 1, b * h)
-        set_row(lanes.change, i + 2, c * h)
-        set_row(lanes.change, i + 3, d * h)
-    if power is not None:
-        return
-    cosine, sine, x, y = lanes.series[COS], lanes.series[SIN], lanes.series[X], lanes.series[Y]
-    a = b = c = d = zero
+    series, h = lanes.series, exact_row(lanes.step, 0)
+    x = y = vx = vy = om = c = s = angle = sum_x = sum_y = sum_c = sum_s = exact_splat(0.0)
+    # independent sums keep the processor busy
     for k in range(order, 0, -1):
-        part = w.inverse[k + 1]
-        a, b = fused(a, h, exact_row(cosine, k) * part), fused(b, h, exact_row(sine, k) * part)
-        c, d = fused(c, h, exact_row(x, k) * part), fused(d, h, exact_row(y, k) * part)
-    set_row(lanes.sum, 0, a * h * h)
-    set_row(lanes.sum, 1, b * h * h)
-    set_row(lanes.sum, 2, c * h * h)
-    set_row(lanes.sum, 3, d * h * h)
+        next_x, next_y = exact_row(series[X], k), exact_row(series[Y], k)
+        next_c, next_s = exact_row(series[COS], k), exact_row(series[SIN], k)
+        x, y, c, s = fused(x, h, next_x), fused(y, h, next_y), fused(c, h, next_c), fused(s, h, next_s)
+        vx, vy = fused(vx, h, exact_row(series[VX], k)), fused(vy, h, exact_row(series[VY], k))
+        om, angle = fused(om, h, exact_row(series[OMEGA], k)), fused(angle, h, exact_row(series[THETA], k))
+        if power is None:
+            part = w.inverse[k + 1]
+            sum_x, sum_y = fused(sum_x, h, next_x * part), fused(sum_y, h, next_y * part)
+            sum_c, sum_s = fused(sum_c, h, next_c * part), fused(sum_s, h, next_s * part)
+    set_state(lanes.change, x * h, y * h, vx * h, vy * h, om * h, c * h, s * h, angle * h)
+    if power is None:
+        set_row(lanes.sum, 0, sum_c * h * h)
+        set_row(lanes.sum, 1, sum_s * h * h)
+        set_row(lanes.sum, 2, sum_x * h * h)
+        set_row(lanes.sum, 3, sum_y * h * h)
 
 
 @kernel()
@@ -201,7 +197,7 @@ def find_peaks(lanes, w, order) -> None:
     """
     if lanes.bulges[0] == 0:
         return
-    column, zero, bits = lanes.guard[0], exact_splat(0.0), (1 << lanes.bulges[0]) - 1
+    column, zero, bits = lanes.guard, exact_splat(0.0), (1 << lanes.bulges[0]) - 1
     lanes.bulges[0] = 0
     for k in range(order):
         set_row(column, k, exact_row(lanes.bulge, k + 1) * (k + 1.0))
