@@ -135,7 +135,7 @@ def test_a_single_stamp_far_ahead_neither_sets_the_clock_nor_ends_the_run(
 ) -> None:
     date = "2026-01-01T00:00:{:06.3f}".format
     rows = [f"{date(index * 1e-3)},1,2,3\n" for index in range(300)]
-    rows[150:150] = ["2080-01-01,1,2,3\n"]  # this stamp is more than fifty years after the previous stamp
+    rows[150:150] = ["2037-01-01,1,2,3\n"]  # this stamp is eleven years after the previous stamp
     rows[200:200] = ["9999-12-31,1,2,3\n", "9999-12-31,1,2,3\n"]
     path = tmp_path / "load.csv"
     path.write_text("time,fx,fy,m\n" + "".join(rows))
