@@ -36,7 +36,8 @@ _DAMPING = {"kelvin_voigt": 6e4, "ramped_damping": 6e4}
 def build_name() -> str:
     """Return a name of the compiler and the mathematical libraries, on which the bits of a result depend.
 
-    The hashes are equal on AMD Zen 3, AMD Zen 4 and an Intel Xeon with AVX-512.
+    The hashes are equal on AMD Zen 3 and on Intel Xeons with AVX-512. For Zen 4 and Zen 5, LLVM orders the sums of
+    friction differently, so the motion with friction has two hashes.
     """
     libc = "".join(platform.libc_ver())
     return f"numba{version('numba')}-numpy{version('numpy')}-{libc}"
