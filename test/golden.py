@@ -36,8 +36,8 @@ _DAMPING = {"kelvin_voigt": 6e4, "ramped_damping": 6e4}
 def build_name() -> str:
     """Return a name of the compiler and the mathematical libraries, on which the bits of a result depend.
 
-    The hashes are equal on AMD Zen 3 and on Intel Xeons with AVX-512. For Zen 4 and Zen 5, LLVM orders the sums of
-    friction differently, so the motion with friction has two hashes.
+    The hashes are equal on AMD Zen 3 and on Intel Xeons with AVX-512. The motion with friction has a second hash, for
+    the code that LLVM generates for Zen 4 and Zen 5.
     """
     libc = "".join(platform.libc_ver())
     return f"numba{version('numba')}-numpy{version('numpy')}-{libc}"
