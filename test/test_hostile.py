@@ -15,10 +15,9 @@ from hostile_files import MADE
 from hostile_files import run as recorded
 
 from plow_twin.dashboard.access import PageAccess
-from plow_twin.errors import InputError
+from plow_twin.errors import ExcessError, InputError
 from plow_twin.live.bridge.access import password
 from plow_twin.live.bridge.files import Files
-from plow_twin.live.bridge.source import BridgeError
 from plow_twin.scene_file.validation import MOST_PROBLEMS
 from plow_twin.scene_file.yaml_text import (
     DEEPEST,
@@ -338,5 +337,5 @@ def test_an_invalid_secret_file_is_named_and_not_shown(tmp_path: Path, content: 
 def test_a_header_too_wide_is_refused_before_a_row_is_read(tmp_path: Path, count: int, got: str) -> None:
     path = tmp_path / "wide.csv"
     path.write_text("t,fx,fy,m," + ",".join(f"c{i}" for i in range(count)) + "\n0,1,2,3" + ",0" * count + "\n")
-    with pytest.raises(BridgeError, match=got):
+    with pytest.raises(ExcessError, match=got):
         Files([path], follow=False).topics()

@@ -234,7 +234,7 @@ def test_a_speed_before_the_first_sample_acts_after_every_rollback(tmp_path: Pat
     live.driver.travel(T0 + 13 * MS, 1.7)
     live.send(*(_swinging(ms) for ms in (*range(50), *range(53, 59)) if ms != 8))
     live.send(_swinging(51))
-    assert live.driver.rolled_back == 1 and live.driver.session._speed == 1.7
+    assert live.driver.rolled_back == 1 and live.driver.session.travel_speed_m_s == 1.7
     assert _same(live.replayed())
 
 

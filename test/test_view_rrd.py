@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from plow_twin.cli.app import run as cli
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import CORNER_NAMES, PAIR_NAMES
 from plow_twin.model.scene import Wear
-from plow_twin.record.entries import EntryRecord
+from plow_twin.record.entries import NO_ENTRIES, Batch, EntryRecord
 from plow_twin.record.messages import JointState, Odometry
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.run.twin import Twin
@@ -215,9 +216,20 @@ def test_forces_along_the_face_measured_poses_and_other_scenes_are_drawn(tmp_pat
         assert band.min() >= low.min() and high[-2] <= band.max() <= high.max()
 
 
-def test_samples_that_come_too_late_for_other_scenes_are_counted(tmp_path: Path) -> None:
+def test_samples_that_come_too_late_for_other_scenes_are_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batches = RunReader.batches
+
+    def divided(reader: RunReader, **options: bool) -> Iterator[Batch]:
+        """Samples are sorted within a batch, so a sample can be too late only if it is in a later batch."""
+        for batch in batches(reader, **options):
+            yield from (Batch(batch.entries[index : index + 1], []) for index in range(len(batch.entries)))
+            yield Batch(NO_ENTRIES, batch.outputs)
+
+    monkeypatch.setattr(RunReader, "batches", divided)
     entries: list[Entry] = [paper_sample(index) for index in range(60)]
-    entries[50:50] = [Travel(entries[49].stamp_ns, 2.0), replace(paper_sample(20), stamp_ns=entries[20].stamp_ns + 1)]
+    entries[50:50] = [replace(paper_sample(20), stamp_ns=entries[20].stamp_ns + 1)]
     run = record_run(tmp_path / "run", entries, rollback_span_s=1.0)
     lost = [
         to_rrd(run.file, tmp_path / "run.rrd", others=others).lost

@@ -47,12 +47,14 @@ class History:
         shape, count = self.clearance.shape, len(self.travel)
         if shape != (count, 2) or self.deviation.shape != (count, 2) or count < 2:
             raise LifeError(f"history: got {count} travels and clearances {shape}, expected at least 2 rows of both")
-        finite = all(np.isfinite(column).all() for column in (self.travel, self.clearance, self.deviation))
-        positive = (self.clearance > 0.0).all() and (self.deviation > 0.0).all()
-        if not (finite and positive and (np.diff(self.travel) >= 0.0).all()):
+        columns = np.column_stack([self.travel, self.clearance, self.deviation])
+        rises = np.diff(self.travel, prepend=-np.inf) >= 0.0
+        possible = (np.isfinite(columns) & (columns > [-np.inf, 0.0, 0.0, 0.0, 0.0])).all(axis=1) & rises
+        if not possible.all():
+            row = int(np.argmin(possible))
             raise LifeError(
-                "history: got an impossible row, expected finite numbers, clearances and deviations above 0, and a "
-                "travel that does not decrease"
+                f"history: row {row}: got {columns[row].tolist()}, expected finite numbers, clearances and deviations "
+                "above 0, and a travel that does not decrease"
             )
 
 

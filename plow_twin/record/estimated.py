@@ -6,8 +6,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from mcap.exceptions import McapError
-
 from plow_twin.errors import RecordingError
 from plow_twin.estimate.measurements import UNSTATED, Deviation
 from plow_twin.estimate.window import Window, Windows
@@ -101,6 +99,7 @@ def left_by(reader: RunReader) -> tuple[Scene, journal.Estimated | None]:
 
 def _last_published_depth(reader: RunReader, after: int) -> tuple[float, ...] | None:
     """Return the wear depths [m] in the last message on `clearance`, or None if it precedes entry number `after`."""
+    from mcap.exceptions import McapError
     from mcap.reader import make_reader
 
     topic = reader.header.topic("clearance")
