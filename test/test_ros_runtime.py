@@ -78,16 +78,17 @@ def _node(**parameters: Any) -> Iterator[TwinNode]:
         context.try_shutdown()
 
 
-def test_a_failed_configure_leaves_nothing_behind(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("policy", "value"), [("reliability", "bogus"), ("depth", -1)])
+def test_a_failed_configure_leaves_nothing_behind(policy: str, value: object, tmp_path: Path) -> None:
     # the node creates this input last, so the other inputs exist when it fails
-    override = f"qos_overrides./r{os.getpid()}/head_pose.subscription.reliability"
-    with _node(**{override: "bogus", "record_path": str(tmp_path / "run")}) as node:
+    override = f"qos_overrides./r{os.getpid()}/head_pose.subscription"
+    with _node(**{f"{override}.{policy}": value, "record_path": str(tmp_path / "run")}) as node:
         threads = set(threading.enumerate())
         topics = ("contact_forces", "head_state", "excitation", "travel")
         before = len(list(node.publishers)), len(list(node.subscriptions)), len(list(node.timers))
         for _ in range(2):
             assert node.trigger_configure() == TransitionCallbackReturn.FAILURE
-            assert "bogus" in node.reason
+            assert f"{override}: got" in node.reason and str(value) in node.reason and "Trace" not in node.reason
             assert set(threading.enumerate()) == threads
             assert (len(list(node.publishers)), len(list(node.subscriptions)), len(list(node.timers))) == before
         assert [node.count_publishers(topic) for topic in topics] == [0] * len(topics)

@@ -13,6 +13,8 @@ from plow_twin.stream.topics import TOPICS, Topic
 OVERRIDABLE: Final = QoSOverridingOptions(
     policy_kinds=(QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
 )
+#: Values of these policies.
+EXPECTED: Final = "history keep_last or keep_all, depth 0 .. 2147483647, reliability reliable or best_effort"
 
 
 def sensor_input(depth: int) -> QoSProfile:

@@ -8,11 +8,13 @@ from collections.abc import Collection, Iterator
 from typing import Any, Final
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TwistStamped, WrenchStamped
+from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 
+from plow_twin.errors import ArgumentError
 from plow_twin.live.publishing import Front
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.tool_forces import ToolForces
@@ -21,7 +23,7 @@ from plow_twin.ros.connections import Connections
 from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.input_queue import InputQueue, Received
 from plow_twin.ros.messages import UNREADABLE, Read, deviations, read_wrench, stamp_ns
-from plow_twin.ros.qos import OVERRIDABLE, sensor_input
+from plow_twin.ros.qos import EXPECTED, OVERRIDABLE, sensor_input
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
 
@@ -118,14 +120,19 @@ class Subscriptions:
     def _subscribe(self, kind: type, topic: str, depth: int) -> None:
         if topic in self._elsewhere:
             return
-        subscription = self._node.create_subscription(
-            kind,
-            topic,
-            lambda message: None,  # the input queue delivers the messages
-            sensor_input(depth),
-            qos_overriding_options=OVERRIDABLE,
-            raw=True,
-        )
+        try:
+            subscription = self._node.create_subscription(
+                kind,
+                topic,
+                lambda message: None,  # the input queue delivers the messages
+                sensor_input(depth),
+                qos_overriding_options=OVERRIDABLE,
+                raw=True,
+            )
+        except (RuntimeError, TypeError, ParameterException) as error:
+            prefix = f"qos_overrides.{self._node.resolve_topic_name(topic)}.subscription"
+            given = {name: one.value for name, one in self._node.get_parameters_by_prefix(prefix).items()}
+            raise ArgumentError(f"{prefix}: got {given}, expected {EXPECTED} ({error})") from error
         if topic == self._source:
             self._since_ns, self._before = time.time_ns(), frozenset(self._present(topic))
             self._inputs.senders.start(self._before)
