@@ -131,7 +131,8 @@ class Subscriptions:
             )
         except (RuntimeError, TypeError, ParameterException) as error:
             prefix = f"qos_overrides.{self._node.resolve_topic_name(topic)}.subscription"
-            given = {name: one.value for name, one in self._node.get_parameters_by_prefix(prefix).items()}
+            names = self._node.get_parameters_by_prefix(prefix)
+            given = {name: self._node.get_parameter(f"{prefix}.{name}").value for name in names}
             raise ArgumentError(f"{prefix}: got {given}, expected {EXPECTED} ({error})") from error
         if topic == self._source:
             self._since_ns, self._before = time.time_ns(), frozenset(self._present(topic))
