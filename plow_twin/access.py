@@ -26,6 +26,11 @@ def is_loopback(host: str) -> bool:
     return host == "localhost" or (is_address(host) and ip_address(host).is_loopback)
 
 
+def in_url(host: str) -> str:
+    """Return a host as in a URL, where an IPv6 address has brackets."""
+    return f"[{host}]" if ":" in host else host
+
+
 def read_secret(path: Path) -> str:
     """Return a password or token, which is the first line of a file.
 

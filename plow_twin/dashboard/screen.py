@@ -7,6 +7,7 @@ from dataclasses import asdict
 from importlib.util import find_spec
 from typing import Any
 
+from plow_twin.access import in_url
 from plow_twin.dashboard.access import PageAccess, listening
 from plow_twin.dashboard.beside import Beside
 from plow_twin.dashboard.feed import Array, Feed
@@ -33,8 +34,7 @@ class Screen(Beside):
         with listening(access) as page:
             port = int(page.getsockname()[1])
             super().__init__("plow_twin.dashboard.server", asdict(access), (page.fileno(),))
-        host = f"[{access.host}]" if ":" in access.host else access.host
-        self.url = f"http://{host}:{port}/"
+        self.url = f"http://{in_url(access.host)}:{port}/"
         self.feed = Feed(self.link, facts, answer, load, on_error, by_second=True)
 
     @property

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from plow_twin.access import is_loopback, read_secret
+from plow_twin.access import in_url, is_loopback, read_secret
 from plow_twin.errors import InputError, Problem
 from plow_twin.scene_file.validation import TEXT, mapping, validate
 from plow_twin.scene_file.yaml_text import read_yaml
@@ -106,7 +106,7 @@ def mqtt_out(url: str, credentials: Credentials, *, plain: bool, sparkplug: str 
     host, port, prefix, tls = _address("--mqtt-out", url, ("mqtt", "mqtts"), expected, plain=plain)
     if not (prefix or sparkplug) or re.search(_NO_TOPIC, prefix):
         raise AccessError("--mqtt-out", url, f"{expected}, the prefix without + and #")
-    address = f"{'mqtts' if tls else 'mqtt'}://{_in_url(host)}:{port}"
+    address = f"{'mqtts' if tls else 'mqtt'}://{in_url(host)}:{port}"
     options = _broker_options(host, port, credentials, tls=tls)
     client_id, outputs = options["client_id"], []
     if prefix:
@@ -129,7 +129,7 @@ def influx_out(url: str, credentials: Credentials, *, plain: bool) -> OutputSpec
     org, _, bucket = path.partition("/")
     if not (org and bucket):
         raise AccessError("--influx", url, expected)
-    server = f"{'https' if encrypted else 'http'}://{_in_url(host)}:{port}"
+    server = f"{'https' if encrypted else 'http'}://{in_url(host)}:{port}"
     token = credentials.secret("influx", "token_file", "INFLUX_TOKEN")
     if not (token.isascii() and token.isprintable()):  # the message must not contain the token
         raise AccessError("the token of influx", f"{len(token)} characters", "ASCII, without line breaks")
@@ -156,7 +156,7 @@ def opcua_out(url: str, credentials: Credentials, *, plain: bool, acknowledges: 
         raise AccessError("--opcua", url, expected)
     if not (encrypted or plain or is_loopback(host)):
         raise AccessError("--opcua", url, "certificate and key in --out-access for other machines, or --plain")
-    address = f"opc.tcp://{_in_url(host)}:{port}"
+    address = f"opc.tcp://{in_url(host)}:{port}"
     first = {
         "output": "opcua",
         "endpoint": address,
@@ -166,10 +166,6 @@ def opcua_out(url: str, credentials: Credentials, *, plain: bool, acknowledges: 
         **files,
     }
     return OutputSpec("opcua_out", address, ("asyncua",), first, may_acknowledge=acknowledges)
-
-
-def _in_url(host: str) -> str:
-    return f"[{host}]" if ":" in host else host
 
 
 def _broker_options(host: str, port: int, credentials: Credentials, *, tls: bool) -> dict[str, Any]:
