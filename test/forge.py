@@ -218,4 +218,8 @@ def start(module: str, arguments: Sequence[str], **options: Any) -> subprocess.P
     changed = {name for name, _ in variables.items() ^ _KNOWN.items()}
     forked = module in _FORKED and changed <= _LATE and not options.keys() & {"preexec_fn", "start_new_session"}
     forked &= module != "plow_twin" or not _WITH_ROS & {*arguments}
-    return (Fork if forked else subprocess.Popen)(command, env=variables, **options)
+    if forked:
+        return Fork(command, env=variables, **options)
+    # as in a fork: a run of the tests by nohup ignores SIGHUP, and so would its programs
+    options.setdefault("preexec_fn", lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL))
+    return subprocess.Popen(command, env=variables, **options)

@@ -379,7 +379,7 @@ class _Drawn:
         self.changes: list[Array] = []
         self.by_phase: list[Array] = []
         self.q: list[Array] = []
-        #: number of motions drawn so far, and their work
+        #: number of motions drawn so far, and number of their solver steps
         self.drawn = self.work = 0
 
     def add(self, count: int, centre: Array, about: float, delay: float, most_work: int) -> None:

@@ -73,7 +73,7 @@ class Forward:
                 f"scene: got head.carries {scene.head.carries}, expected walls, because the fit cannot use a block"
             )
         if scene.support is not None:
-            raise EstimateError(f"scene: got {scene.support}, expected none: the fit assumes a fixed frame")
+            raise EstimateError("scene: got a support, expected a fixed frame, which the fit assumes")
         nominal = compile_scene(replace(scene, loads=(), wear=None), tuning.TOLERANCE, sampled=True)
         self._terms = nominal.parts.terms
         self._implicit = nominal.parts.implicit

@@ -245,7 +245,7 @@ SPECS: Final[Mapping[str, Field[Any]]] = {spec.name: spec for spec in fields(Set
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 #: Largest length of a text [characters]. A path on Linux has the same limit.
 _LONGEST: Final = 4096
-#: Number of items of a list that are checked. The lists of parameters are shorter.
+#: Number of items of a list up to which each item is checked. The lists of parameters are shorter.
 _MOST_ITEMS: Final = 20
 #: Pattern of a line without control characters, which could change the state of a terminal.
 _ONE_LINE: Final = r"^[^\x00-\x1f\x7f-\x9f]*\Z"

@@ -132,7 +132,7 @@ def influx_out(url: str, credentials: Credentials, *, plain: bool) -> OutputSpec
     server = f"{'https' if encrypted else 'http'}://{in_url(host)}:{port}"
     token = credentials.secret("influx", "token_file", "INFLUX_TOKEN")
     if not (token.isascii() and token.isprintable()):  # the message must not contain the token
-        raise AccessError("the token of influx", f"{len(token)} characters", "ASCII, without line breaks")
+        raise AccessError("the token of influx", f"{len(token)} characters", "printable ASCII characters only")
     first = {
         "output": "influx",
         "url": server,

@@ -66,7 +66,7 @@ class Influx:
         self._client.close()
 
     async def _write_all(self) -> None:
-        """Write the queued lines, unless the wait after a failed attempt has not ended."""
+        """Write the queued lines, but not during the wait after a failed attempt."""
         while self._waiting and time.monotonic() >= self._again_s:
             self._asked = [self._waiting.popleft() for _ in range(min(len(self._waiting), _AT_ONCE))]
             try:

@@ -69,7 +69,7 @@ class _Tail:
                     rows.read(line)
                     if len(rows.columns or ()) > MOST_COLUMNS:
                         found = f"{len(rows.columns or ())} columns"
-                        raise ExcessError(f"{self.path}: got {found}, expected at most {MOST_COLUMNS}")
+                        raise ExcessError(f"{self.path}: got {found}, expected at most {MOST_COLUMNS} columns")
         except FileNotFoundError:
             return None
         return rows.columns

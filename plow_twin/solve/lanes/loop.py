@@ -148,7 +148,7 @@ def _fill_rows(members, lanes, order, fraction, t) -> None:
 @kernel()
 def _evaluate(lanes, order, at) -> None:
     """Write poses and rates at one value of each lane's series variable to `lanes.out`."""
-    # independent sums keep the processor busy
+    # the processor adds independent sums in parallel
     series, out = lanes.series, lanes.out
     x, y, theta = exact_row(series[X], order), exact_row(series[Y], order), exact_row(series[THETA], order)
     vx, vy, om = exact_row(series[VX], order), exact_row(series[VY], order), exact_row(series[OMEGA], order)

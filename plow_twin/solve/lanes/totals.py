@@ -24,7 +24,7 @@ def sum_step(lanes, w, order, power) -> None:
     """
     series, h = lanes.series, exact_row(lanes.step, 0)
     x = y = vx = vy = om = c = s = angle = sum_x = sum_y = sum_c = sum_s = exact_splat(0.0)
-    # independent sums keep the processor busy
+    # the processor adds independent sums in parallel
     for k in range(order, 0, -1):
         next_x, next_y = exact_row(series[X], k), exact_row(series[Y], k)
         next_c, next_s = exact_row(series[COS], k), exact_row(series[SIN], k)

@@ -11,7 +11,7 @@ from plow_twin.record.times import EPOCH, FARTHEST_NS, datetime_ns
 
 _SEVERITY: Final = 0xC0000000
 _UNCERTAIN: Final = 0x40000000
-#: Bits of the status of a value that show that the queue of the server dropped earlier values.
+#: These status bits of a value show that the server's queue dropped earlier values.
 _OVERFLOW: Final = 0x00000480
 
 
