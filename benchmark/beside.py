@@ -63,10 +63,10 @@ print(json.dumps(found))
 def measure(tree: Path, cache: str) -> dict[str, float]:
     """Return the time [s] of each case, measured in a separate process."""
     environment = os.environ | {"PYTHONPATH": str(tree), "NUMBA_CACHE_DIR": cache}
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", _WORK, str(tree)], cwd=tree, env=environment, capture_output=True, text=True, check=True
     )
-    times: dict[str, float] = json.loads(done.stdout)
+    times: dict[str, float] = json.loads(completed.stdout)
     return times
 
 

@@ -41,10 +41,10 @@ def prepare(p: Array, law: str, method: str, roots: bool, rtol: float, output_dt
         with TemporaryDirectory() as folder:
             poses = Path(folder) / "poses"
             setting = [law, method, str(int(roots)), repr(rtol), repr(T_END), repr(output_dt), "1", str(poses)]
-            done = subprocess.run([executable, *setting], input=numbers, capture_output=True, text=True)
-            if done.returncode != 0:
-                raise RuntimeError(done.stderr.strip() or f"exit code {done.returncode}")
-            lines = done.stdout.split("\n")
+            completed = subprocess.run([executable, *setting], input=numbers, capture_output=True, text=True)
+            if completed.returncode != 0:
+                raise RuntimeError(completed.stderr.strip() or f"exit code {completed.returncode}")
+            lines = completed.stdout.split("\n")
             steps, evaluations, events = (int(word) for word in lines[1].split())
             return Sample(float(lines[0]), np.fromfile(poses).reshape(-1, 3), steps, evaluations, events)
 

@@ -49,12 +49,12 @@ def _known(truth: Truth) -> Estimated:
     assert contact.damping is not None
     horizontal, vertical = (Interval.normal(value, 3e-5) for value in truth.clearance)
     gain_fx, gain_fy, gain_m = (Interval.normal(gain, 0.003) for gain in truth.gain)
-    found = Estimate(
+    result = Estimate(
         0.0, 1.0, horizontal, vertical, State.ESTIMATED, State.ESTIMATED,
         Interval.normal(contact.stiffness, 2e-3 * contact.stiffness), Interval.normal(contact.damping, 5e-3),
         gain_fx, gain_fy, gain_m, noise=(5e-4, 5e-4, 2e-3),
     )  # fmt: skip
-    return Estimated(0, 1, 2, 3, (), (0.0,) * 6, json.dumps(found.as_dict()))
+    return Estimated(0, 1, 2, 3, (), (0.0,) * 6, json.dumps(result.as_dict()))
 
 
 def measured(truth: Truth, follow: str) -> tuple[list[int], list[int]]:

@@ -25,12 +25,12 @@ from plow_twin.estimate.forces import ForceEnsemble
 def main(group: str, truths: int, seed: int, members: int) -> None:
     for number in range(seed, seed + truths):
         truth = draw(GROUPS[group], number)
-        found = estimate(truth.nominal, truth.load, truth.poses)
+        result = estimate(truth.nominal, truth.load, truth.poses)
         true_load = truth.scene.loads[0]
         assert isinstance(true_load, Table)
         t = true_load.t
         believed = np.stack([np.interp(t, truth.load.t, column) for column in truth.load.wrench.T], axis=1)
-        ensemble = ForceEnsemble(truth.nominal, found, members)
+        ensemble = ForceEnsemble(truth.nominal, result, members)
         settled = int(np.searchsorted(t, PERIOD))
         ensemble.advance(t[:settled], believed[:settled])
         begin = time.process_time()

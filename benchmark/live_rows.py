@@ -113,11 +113,11 @@ def _start_row(name: str, cache: str) -> Row:
     environment = os.environ | {"NUMBA_CACHE_DIR": cache, "PYTHONPATH": os.pathsep.join(paths)}
     scene = Path(ROOT) / "config" / "paper.yaml"
     command = [sys.executable, "-c", _START, str(scene)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True)
-    if done.returncode != 0:
-        row.status = f"failed: {done.stderr.strip().splitlines()[-1]}"
+    completed = subprocess.run(command, env=environment, capture_output=True, text=True)
+    if completed.returncode != 0:
+        row.status = f"failed: {completed.stderr.strip().splitlines()[-1]}"
         return row
-    said = json.loads(done.stdout)
+    said = json.loads(completed.stdout)
     row.time([said["ready_s"]])
     row.value = float(said["compiled"])
     row.setting += f", import {said['import_s']:.2f} s, {said['read']} kernels read from the cache"

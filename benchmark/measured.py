@@ -500,10 +500,10 @@ def of_table(drops: Drops) -> dict[str, Any]:
     known = []
     for pose in drops.pose:
         clearance = replace(square.clearance, vertical_m=true + 0.01 * rng.standard_normal())
-        found = estimate(replace(square, clearance=clearance, marks=marks), nothing, Poses(t, pose - [0.0, 1.0, 0.0]))
-        if found.vertical_state.known:
-            rough = found.vertical_state is State.ROUGH
-            known.append((found.vertical.mean, found.vertical.p05, found.vertical.p95, rough))
+        result = estimate(replace(square, clearance=clearance, marks=marks), nothing, Poses(t, pose - [0.0, 1.0, 0.0]))
+        if result.vertical_state.known:
+            rough = result.vertical_state is State.ROUGH
+            known.append((result.vertical.mean, result.vertical.p05, result.vertical.p95, rough))
     mean, low, high, rough = np.array(known).T
     off = 0.5 * np.abs(mean - true)
     return {
@@ -527,8 +527,10 @@ def of_heights(drops: Drops) -> dict[str, Any]:
     for pose in drops.pose:
         motion = MARKER.state_of_block(np.concatenate([pose, np.zeros_like(pose)], axis=1))[:, :3] - [0.0, 1.0, 0.0]
         end = motion[-12:]
-        found, _ = impacts(square, nothing, Poses(t, motion), noise_level(motion))
-        below = [one.deeper - one.distance for one in found if one.wall == "bottom" and one.gained < tuning.GAINED]
+        impacts_found, _ = impacts(square, nothing, Poses(t, motion), noise_level(motion))
+        below = [
+            one.deeper - one.distance for one in impacts_found if one.wall == "bottom" and one.gained < tuning.GAINED
+        ]
         if len(below) and np.ptp(end[:, 1]) < 1e-3 and np.ptp(end[:, 2]) < 5e-3 and end[:, 1].mean() < -0.967:
             places.append(end[:, 0].mean())
             rests.append(end[:, 1].mean())

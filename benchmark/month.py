@@ -94,11 +94,11 @@ def one_month(seed: int, day_m: float) -> dict[str, Any]:
         depth = np.array([np.interp(exposure, path.exposure, pad) for pad in path.depth.T])
         worn = replace(one.scene, wear=Wear(0.0, PAD_AREA_M2, SPEED_M_S, initial_depth_m=tuple(depth.tolist())))
         load, poses = visit(one, worn, rng)
-        found = estimate(one.believed, load, poses)
-        if State.ESTIMATED is found.horizontal_state is found.vertical_state:
-            told = [[value.mean, value.deviation] for value in found.in_scene_frame()]
+        result = estimate(one.believed, load, poses)
+        if State.ESTIMATED is result.horizontal_state is result.vertical_state:
+            told = [[value.mean, value.deviation] for value in result.in_scene_frame()]
             rows.append((float(day), told, clearances(worn, depth)[:2]))
-            under = under_load(with_estimate(one.believed, found.as_dict())[0], found, load)
+            under = under_load(with_estimate(one.believed, result.as_dict())[0], result, load)
     days, values, true = (np.array([row[i] for row in rows]) for i in range(3))
     history = History((days - days[0]) * day_m, values[:, :, 0], values[:, :, 1])
     known = coefficient(under, history)

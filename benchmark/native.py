@@ -27,8 +27,10 @@ def compile_c(source: str, libraries: Sequence[str], flags: Sequence[str] = FLAG
     program = BUILD / f"{Path(source).stem}-{hashlib.blake2b(text, digest_size=6).hexdigest()}"
     if not program.exists():
         command = [compiler, *flags, "-o", str(program), str(HERE / source), *libraries]
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode != 0:
-            missing = next((line for line in done.stderr.splitlines() if "error" in line or "cannot find" in line), "")
+        completed = subprocess.run(command, capture_output=True, text=True)
+        if completed.returncode != 0:
+            missing = next(
+                (line for line in completed.stderr.splitlines() if "error" in line or "cannot find" in line), ""
+            )
             raise NotInstalled(f"gcc cannot build {source}: {missing.rpartition('error: ')[2][:120]}")
     return str(program)

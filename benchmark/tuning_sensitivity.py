@@ -65,11 +65,11 @@ def varied(name: str, value: tuning.Value) -> Iterator[None]:
 def run(truth: Truth) -> dict[str, Any]:
     """Return errors, intervals and states of one estimate, or its error as `failed`."""
     try:
-        found = estimate(truth.nominal, truth.load, truth.poses, forces=truth.forces)
+        result = estimate(truth.nominal, truth.load, truth.poses, forces=truth.forces)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
         return {"failed": f"{type(error).__name__}: {error}"}
-    row: dict[str, Any] = {"model": found.model, "sensor": found.sensor}
-    pairs = ((found.horizontal, found.horizontal_state), (found.vertical, found.vertical_state))
+    row: dict[str, Any] = {"model": result.model, "sensor": result.sensor}
+    pairs = ((result.horizontal, result.horizontal_state), (result.vertical, result.vertical_state))
     for axis, (value, state), true in zip("hv", pairs, truth.clearance.tolist(), strict=True):
         row[axis] = [value.mean - true, value.p05 - true, value.p95 - true, state.value]
     return row

@@ -54,7 +54,7 @@ def clean_environment(**extra: str) -> dict[str, str]:
 
 def run(*command: str | Path, cwd: Path, env: dict[str, str] | None = None, code: int = 0) -> str:
     """Run a command and check its exit code. Return its output, or its error output if `code` is not 0."""
-    done = subprocess.run(
+    completed = subprocess.run(
         [str(part) for part in command],
         cwd=cwd,
         env=env if env is not None else clean_environment(),
@@ -63,8 +63,10 @@ def run(*command: str | Path, cwd: Path, env: dict[str, str] | None = None, code
         timeout=300,
         stdin=subprocess.DEVNULL,
     )
-    assert done.returncode == code, f"{command} ended with {done.returncode}\n{done.stdout}\n{done.stderr}"
-    return done.stderr if code else done.stdout
+    assert completed.returncode == code, (
+        f"{command} ended with {completed.returncode}\n{completed.stdout}\n{completed.stderr}"
+    )
+    return completed.stderr if code else completed.stdout
 
 
 def make_environment(folder: Path) -> Path:

@@ -25,8 +25,8 @@ def run(code: str, *arguments: str) -> str:
 def rows(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, str]]:
     table = tmp_path_factory.mktemp("benchmark") / "quick.csv"
     command = [sys.executable, str(BENCHMARK / "run.py"), "--quick", "--out", str(table)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    completed = subprocess.run(command, capture_output=True, text=True)
+    assert completed.returncode == 0, completed.stderr
     with table.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 

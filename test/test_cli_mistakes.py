@@ -64,7 +64,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "message"),
     [
         (["estimate", "mm"], 2, "x: got 12, expected less than half the frame or the clearance, 0.165 m; they look"),
         (["estimate", "bars"], 1, "t|fx|fy|m (expected commas, semicolons or tabs between them), expected t, fx, fy"),
@@ -120,7 +120,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_mistake_in_a_command_is_reported_in_a_message(
     arguments: list[str],
     code: int,
-    said: str,
+    message: str,
     desk: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -129,7 +129,7 @@ def test_a_mistake_in_a_command_is_reported_in_a_message(
     before = sorted(desk.rglob("*"))
     assert cli(arguments) == code
     shown = capsys.readouterr().err
-    assert said in " ".join(shown.split()), shown
+    assert message in " ".join(shown.split()), shown
     # the message names the mistake in one line without the contents of the file, and no output file remains
     assert len([line for line in shown.splitlines() if not line.startswith("Usage")]) <= 3 and len(shown) < 500
     assert sorted(desk.rglob("*")) == before

@@ -63,16 +63,16 @@ def test_an_analysis_without_measurements_shows_only_the_model(
     capsys.readouterr()
     given = [str(run.folder), str(copy), str(made)]
     assert cli(["analyse", *given, "--workers", "1", "--out", str(tmp_path / "out")]) == 0
-    said = capsys.readouterr()
-    assert f"{copy}: left out: the same run as {run.folder}" in said.err
-    assert said.out.count("Contacts computed") == 1 and "plow-twin compare" in said.out
-    assert "bias" not in said.out and said.out.count("no measured values to compare") == 2
+    printed = capsys.readouterr()
+    assert f"{copy}: left out: the same run as {run.folder}" in printed.err
+    assert printed.out.count("Contacts computed") == 1 and "plow-twin compare" in printed.out
+    assert "bias" not in printed.out and printed.out.count("no measured values to compare") == 2
 
 
 def test_replay_of_an_unchanged_recording_exits_with_0(run: Run) -> None:
-    done = plow_twin("replay", run.folder, "--json")
-    assert (done.returncode, done.stderr) == (0, "")
-    facts = json.loads(done.stdout)
+    completed = plow_twin("replay", run.folder, "--json")
+    assert (completed.returncode, completed.stderr) == (0, "")
+    facts = json.loads(completed.stdout)
     assert (facts["result"], facts["samples"], facts["divergences"]) == ("the same", SAMPLES, 0)
     assert facts["messages_compared"]["contact_forces"] == SAMPLES
     quiet = plow_twin_here("replay", run.file, "--quiet")

@@ -29,8 +29,8 @@ RUN = ["simulate", "paper", "--t-end", "2", "--output-dt", "0.01"]
 
 
 def test_csv_and_json_keep_the_contract(tmp_path: Path) -> None:
-    done = plow_twin(*RUN, "--tol", "1e-10", "--out", "run.csv", "--json", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    completed = plow_twin(*RUN, "--tol", "1e-10", "--out", "run.csv", "--json", cwd=tmp_path)
+    assert completed.returncode == 0, completed.stderr
     result = simulate(load_scene(scene_path("paper")), 2.0, 0.01, tol=1e-10)
 
     with (tmp_path / "run.csv").open() as file:
@@ -39,7 +39,7 @@ def test_csv_and_json_keep_the_contract(tmp_path: Path) -> None:
     expected = np.column_stack([result.t, result.q, result.v, result.force])
     np.testing.assert_array_equal(np.array(rows, dtype=float), expected)  # 17 digits represent each number exactly
 
-    answer = json.loads(done.stdout)
+    answer = json.loads(completed.stdout)
     assert answer.keys() == {"scene", "t_end", "pairs", "contact_sets", "solver", "wall_s", "compile_s"}
     assert (answer["scene"], answer["t_end"]) == ("paper", 2.0)
     assert tuple(answer["pairs"]) == PAIR_NAMES
@@ -123,7 +123,7 @@ def test_fixed_step_methods_run_the_same_scene(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["simulate", "paper"], "--t-end"),
         (["simulate", "paper", "--t-end", "nan"], "got 'nan', expected a finite number > 0"),
@@ -154,33 +154,33 @@ def test_fixed_step_methods_run_the_same_scene(tmp_path: Path) -> None:
         (["nonsense"], "nonsense"),
     ],
 )
-def test_wrong_usage_and_wrong_scenes_exit_with_2(arguments: list[str], said: str, tmp_path: Path) -> None:
+def test_wrong_usage_and_wrong_scenes_exit_with_2(arguments: list[str], message: str, tmp_path: Path) -> None:
     plain = dump_scene(replace(load_scene(scene_path("paper")), marks={}))
     (tmp_path / "bad.yaml").write_text(plain.replace("mass_kg", "mass"))
     done = plow_twin_here(*arguments, cwd=tmp_path)
     assert done.returncode == 2, done.stderr
-    assert said in done.stderr
+    assert message in done.stderr
     assert "Traceback" not in done.stderr
     assert done.stdout == ""
 
 
 def test_a_closed_standard_output_causes_no_traceback() -> None:
     command = [sys.executable, "-m", "plow_twin", "info", "paper"]
-    done = subprocess.run(["sh", "-c", '"$@" >&-', "sh", *command], capture_output=True, text=True, timeout=100)
-    assert (done.returncode, done.stderr) == (0, "")
+    completed = subprocess.run(["sh", "-c", '"$@" >&-', "sh", *command], capture_output=True, text=True, timeout=100)
+    assert (completed.returncode, completed.stderr) == (0, "")
 
 
 def test_failures_exit_with_1(tmp_path: Path) -> None:
     (tmp_path / "no.mcap").write_bytes(b"not a recording")
     (tmp_path / "full.csv").symlink_to("/dev/full")
-    for arguments, said in (
+    for arguments, message in (
         (["info", "no.mcap"], "no.mcap"),
         (["replay", "no.mcap"], "no.mcap"),
         (["simulate", "paper", "--t-end", "0.1", "--out", "full.csv"], "full.csv: No space left on device"),
     ):
         done = plow_twin_here(*arguments, cwd=tmp_path)
         assert done.returncode == 1, done.stderr
-        assert said in done.stderr
+        assert message in done.stderr
         assert "Traceback" not in done.stderr
 
 
@@ -196,10 +196,10 @@ used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (used + 2**28, used + 2**28))
 main(["simulate", "paper", "--t-end", "1", "--output-dt", "1.1e-7", "--quiet"])
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=110, check=False)
-    assert done.returncode == 1, done.stderr
-    assert done.stderr.startswith("plow-twin: not enough memory")
-    assert "Traceback" not in done.stderr
+    completed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=110, check=False)
+    assert completed.returncode == 1, completed.stderr
+    assert completed.stderr.startswith("plow-twin: not enough memory")
+    assert "Traceback" not in completed.stderr
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -210,18 +210,18 @@ from plow_twin.cli import main
 atexit.register(os.kill, os.getpid(), {int(number)})
 main(["simulate", "no such scene"])
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=110, check=False)
-    assert (done.returncode, "Traceback" in done.stderr) == (2, False), done.stderr
+    completed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=110, check=False)
+    assert (completed.returncode, "Traceback" in completed.stderr) == (2, False), completed.stderr
 
 
 def test_a_missing_extra_is_named_with_its_pip_command(tmp_path: Path) -> None:
     (tmp_path / "mcap.py").write_text("raise ModuleNotFoundError(\"No module named 'mcap'\", name='mcap')")
     (tmp_path / "run.mcap").write_bytes(mcap_bytes.beginning())
     # `python -m` puts the working directory, which contains this mcap.py, first on the path
-    done = plow_twin("replay", "run.mcap", cwd=tmp_path)
-    assert done.returncode == 1
-    assert "pip install 'plow_twin[record]'" in done.stderr
-    assert "Traceback" not in done.stderr
+    completed = plow_twin("replay", "run.mcap", cwd=tmp_path)
+    assert completed.returncode == 1
+    assert "pip install 'plow_twin[record]'" in completed.stderr
+    assert "Traceback" not in completed.stderr
 
 
 def test_info_lists_marks_and_versions() -> None:

@@ -95,13 +95,13 @@ def test_estimates_and_comparisons_are_printed_in_full_with_units(
 
     scene = load_scene(scene_path("paper"))
     small = Interval(-5.300854e-06, -4.592612e-05, 3.532441e-05)
-    found = Estimate(
+    result = Estimate(
         *(0.0, 13.99, Interval(0.025, 0.0249, 0.0251), Interval(0.03, 0.0299, 0.0301)),
         *(State.NOT_OBSERVABLE, State.WITHDRAWN, Interval(9.695005e10, 9.6750615e10, 9.714991e10)),
         *(Interval(0.72597344, 0.71644036, 0.73563338), small, small, small, small, small, small, small),
         groups={"horizontal_bottom": (small, State.NOT_OBSERVABLE)},
     )
-    estimate_verb.show_estimate(found, scene)
+    estimate_verb.show_estimate(result, scene)
     lines = printed()
     assert max(map(len, lines)) <= WIDTH and not any("…" in line for line in lines)
     for head in ("stiffness [MN/m]", "damping [s/m]", "horizontal, bottom [mm]"):
@@ -155,5 +155,5 @@ def test_progress_has_a_rate_and_the_time_left(monkeypatch: pytest.MonkeyPatch) 
 
 def test_the_help_of_the_node_starts_no_node() -> None:
     code = "import sys; sys.modules['rclpy'] = None; from plow_twin.ros.main import main; main(['--help'])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0 and "--ros-args" in done.stdout
+    completed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert completed.returncode == 0 and "--ros-args" in completed.stdout

@@ -275,10 +275,10 @@ def test_a_frozen_page_takes_no_memory_and_later_continues_with_the_newest_data(
             while newest.get("motion", {}).get("t", 0) < 200.0:
                 newest = json.loads(page.recv(timeout=30))
             assert _memory_kb(screen.process.pid) - before < 5_000
-            told = json.loads(frozen.recv(timeout=30))
-            while told.get("motion", {}).get("t", 0) < 200.0:
-                told = json.loads(frozen.recv(timeout=30))
-            assert told["skipped"] > 20 and told["seconds"][-1][1] == 199.0
+            message = json.loads(frozen.recv(timeout=30))
+            while message.get("motion", {}).get("t", 0) < 200.0:
+                message = json.loads(frozen.recv(timeout=30))
+            assert message["skipped"] > 20 and message["seconds"][-1][1] == 199.0
 
 
 def _row(index: int) -> str:

@@ -132,10 +132,10 @@ def test_every_table_of_the_pages_agrees_with_results_and_code() -> None:
         "named = re.findall('<!-- made: (.*) -->', '\\n'.join(texts.values()))\n"
         "print(set(named) ^ pages.TABLES.keys(), 'made: speed' in texts['README.md'])\n"
     )
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT / "tools", capture_output=True, text=True, timeout=280, check=False
     )
-    assert done.stdout.splitlines() == ["[]", "set() True"], done.stderr or done.stdout
+    assert completed.stdout.splitlines() == ["[]", "set() True"], completed.stderr or completed.stdout
 
 
 def test_drawn_pictures_agree_with_their_scripts() -> None:
@@ -166,17 +166,17 @@ def test_every_test_named_beside_a_promise_exists() -> None:
 def test_the_page_s_example_runs(page: str) -> None:
     (example,) = blocks(ROOT / page, "python")
     code = f"{example}\nprint(result.solver)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=280, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "'method': 'events'" in done.stdout
+    completed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=280, check=False)
+    assert completed.returncode == 0, completed.stderr
+    assert "'method': 'events'" in completed.stdout
 
 
 def test_the_law_of_the_how_to_runs() -> None:
     (example,) = blocks(ROOT / "docs" / "how_to_own_law.md", "python")
     # a separate process, because an added law cannot be removed
     code = f"{example}\nfrom plow_twin.model.contact_laws import LAWS\nprint(LAWS[contact.law].damping_number(0.4))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=280, check=False)
-    assert (done.stdout.strip(), done.stderr) == (str(1.2 * (1.0 - 0.4) / 0.4), "")
+    completed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=280, check=False)
+    assert (completed.stdout.strip(), completed.stderr) == (str(1.2 * (1.0 - 0.4) / 0.4), "")
 
 
 def test_the_interface_page_agrees_with_the_code() -> None:

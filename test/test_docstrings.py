@@ -55,13 +55,13 @@ def test_every_parameter_is_described_and_every_result(package: griffe.Module) -
     for name, function in public(package):
         if not function.is_function:
             continue
-        said, text = described(function), function.docstring.value
+        docstring, text = described(function), function.docstring.value
         parameters = [p for p in function.parameters if p.name not in ("self", "cls")]
-        lacking += [f"{name}({p.name})" for p in parameters if p.name not in said]
+        lacking += [f"{name}({p.name})" for p in parameters if p.name not in docstring]
         lacking += [
             f"{name}({p.name}): no shape"
             for p in parameters
-            if ARRAYS.search(str(p.annotation)) and "shape" not in said.get(p.name, "")
+            if ARRAYS.search(str(p.annotation)) and "shape" not in docstring.get(p.name, "")
         ]
         summary = text.partition("\n\n")[0].lower()
         if str(function.returns) != "None" and "Returns\n" not in text and "return" not in summary:
@@ -74,13 +74,17 @@ def test_every_field_is_described(package: griffe.Module) -> None:
     for name, item in public(package):
         if not item.is_class:
             continue
-        said = described(item)
+        docstring = described(item)
         for key, field in item.members.items():
             if not field.is_attribute or key.startswith("_") or DECLARED.search(str(field.value)):
                 continue
-            if key not in said and field.docstring is None:
+            if key not in docstring and field.docstring is None:
                 lacking.append(f"{name}.{key}")
-            elif ARRAYS.search(str(field.annotation)) and "property" not in field.labels and "shape" not in said[key]:
+            elif (
+                ARRAYS.search(str(field.annotation))
+                and "property" not in field.labels
+                and "shape" not in docstring[key]
+            ):
                 lacking.append(f"{name}.{key}: no shape")
     assert lacking == []
 
@@ -90,10 +94,10 @@ def test_errors_that_a_function_raises_are_documented(package: griffe.Module) ->
     for name, function in public(package):
         if function.is_function:
             raised = {*re.findall(r"^ +raise (\w+)\(", function.source, re.MULTILINE)}
-            said = function.docstring.value
+            docstring = function.docstring.value
             # ArgumentError is a ValueError, so a docstring that names ValueError covers it
-            said += "ArgumentError" if "ValueError" in said else ""
-            lacking += [f"{name}: {error}" for error in raised if error not in said]
+            docstring += "ArgumentError" if "ValueError" in docstring else ""
+            lacking += [f"{name}: {error}" for error in raised if error not in docstring]
     assert lacking == []
 
 

@@ -71,22 +71,22 @@ def test_walls_without_impacts_are_not_observable(drops) -> None:
         "contact.stiffness": replace(stiffness, deviation=1e6),
         "clearance.horizontal_m": replace(width, deviation=2e-3),
     }
-    found = of_drop(drops, 0, scene=replace(scene, marks={**scene.marks, **stated}))
+    result = of_drop(drops, 0, scene=replace(scene, marks={**scene.marks, **stated}))
     # with impacts on a single wall, a bias has the same effect as another clearance
-    assert found.bias_x is None and found.bias_y is None and found.bias_theta is not None
-    assert found.horizontal_state is State.NOT_OBSERVABLE
-    assert found.horizontal.mean == SQUARE.clearance.horizontal_m
+    assert result.bias_x is None and result.bias_y is None and result.bias_theta is not None
+    assert result.horizontal_state is State.NOT_OBSERVABLE
+    assert result.horizontal.mean == SQUARE.clearance.horizontal_m
     # the scene states this deviation
-    assert found.horizontal.deviation == pytest.approx(2e-3)
-    assert found.stiffness is not None and found.stiffness.deviation == pytest.approx(1e6, rel=0.05)
-    assert any("0 impacts on the right wall" in reason for reason in found.reasons)
+    assert result.horizontal.deviation == pytest.approx(2e-3)
+    assert result.stiffness is not None and result.stiffness.deviation == pytest.approx(1e6, rel=0.05)
+    assert any("0 impacts on the right wall" in reason for reason in result.reasons)
 
 
 def test_impact_far_from_the_walls_is_left_out_and_reported(drops) -> None:
     # in this drop, the block hits an obstacle 0.7 m from the origin
-    found = of_drop(drops, 10)
-    assert found.horizontal_state is State.NOT_OBSERVABLE
-    assert any(reason.startswith("left wall: 1 impacts left out, got one at 0.69") for reason in found.reasons)
+    result = of_drop(drops, 10)
+    assert result.horizontal_state is State.NOT_OBSERVABLE
+    assert any(reason.startswith("left wall: 1 impacts left out, got one at 0.69") for reason in result.reasons)
 
 
 def test_block_between_four_walls_with_a_rotated_sensor_is_estimated() -> None:
@@ -111,15 +111,15 @@ def test_block_between_four_walls_with_a_rotated_sensor_is_estimated() -> None:
     along = np.sin(7.0 * t) + np.sin(11.0 * t + 1.0)
     wrench = np.stack([60.0 * along, 55.0 * along, np.sin(5.0 * t)], axis=1)
     nominal = replace(guide, clearance=Clearance(*(true + np.array([4e-3, -3e-3])).tolist()), loads=())
-    found = estimate(nominal, Load(t, wrench), Poses(motion.t, measured))
+    result = estimate(nominal, Load(t, wrench), Poses(motion.t, measured))
     for value, clearance, state in zip(
-        (found.horizontal, found.vertical), true, (found.horizontal_state, found.vertical_state), strict=True
+        (result.horizontal, result.vertical), true, (result.horizontal_state, result.vertical_state), strict=True
     ):
-        assert state.known, found.reasons
+        assert state.known, result.reasons
         assert abs(value.mean - clearance) < 1e-3
         assert value.p05 < clearance < value.p95
-    assert found.bias_x is not None and found.bias_x.p05 < 1.5e-3 < found.bias_x.p95
-    assert found.bias_theta is not None and found.bias_theta.p05 < 8e-3 < found.bias_theta.p95
+    assert result.bias_x is not None and result.bias_x.p05 < 1.5e-3 < result.bias_x.p95
+    assert result.bias_theta is not None and result.bias_theta.p05 < 8e-3 < result.bias_theta.p95
 
 
 @pytest.mark.parametrize(
@@ -132,9 +132,9 @@ def test_unusable_poses_are_named(drops, change, word) -> None:
         pose[:, 2] = np.nan
     else:
         pose, t = pose[change[0]], t[change[0]]
-    found = estimate(unknown_table(0.0), Load(np.array([0.0, 0.8]), np.zeros((2, 3))), Poses(t, pose))
-    assert found.vertical_state is State.NOT_OBSERVABLE
-    assert word in found.reasons[0]
+    result = estimate(unknown_table(0.0), Load(np.array([0.0, 0.8]), np.zeros((2, 3))), Poses(t, pose))
+    assert result.vertical_state is State.NOT_OBSERVABLE
+    assert word in result.reasons[0]
 
 
 # the following twins need other kernels, which must be compiled
@@ -195,8 +195,8 @@ def of_guide(t: np.ndarray, q: np.ndarray, stiffness: float) -> Estimate:
 
 
 def test_an_unknown_stiffness_widens_the_interval(elastic) -> None:
-    found = of_guide(*elastic[1e8], stiffness=1e5)
-    for value, true in ((found.horizontal, 0.030), (found.vertical, 0.022)):
+    result = of_guide(*elastic[1e8], stiffness=1e5)
+    for value, true in ((result.horizontal, 0.030), (result.vertical, 0.022)):
         assert value.p05 < true < value.p95
 
 
@@ -204,9 +204,9 @@ def test_an_unknown_stiffness_widens_the_interval(elastic) -> None:
 def test_contacts_longer_than_two_poses_determine_nothing(elastic, stiffness, every) -> None:
     """A soft contact lasts for many rows. At 50 Hz, two impacts look like one impact."""
     t, q = elastic[stiffness]
-    found = of_guide(t[::every], q[::every], stiffness)
-    assert found.horizontal_state is State.NOT_OBSERVABLE
-    assert "impacts" in found.reasons[0]
+    result = of_guide(t[::every], q[::every], stiffness)
+    assert result.horizontal_state is State.NOT_OBSERVABLE
+    assert "impacts" in result.reasons[0]
 
 
 @pytest.mark.parametrize("too_stiff", [300.0, 30.0])
@@ -214,8 +214,8 @@ def test_a_contact_much_softer_than_assumed_leaves_the_clearance_in_its_interval
     """The impacts scatter more than rigid impacts, and the interval is correspondingly wide."""
     motion = simulate(guide(1e7), t_end=12.0, output_dt=0.004, tol=1e-6, energy_balance=True)
     noise = np.random.default_rng(1).normal(0.0, [3e-5, 3e-5, 2e-4], motion.q.shape)
-    found = of_guide(motion.t, motion.q + noise, 1e7 * too_stiff)
-    for value, true in ((found.horizontal, 0.030), (found.vertical, 0.022)):
+    result = of_guide(motion.t, motion.q + noise, 1e7 * too_stiff)
+    for value, true in ((result.horizontal, 0.030), (result.vertical, 0.022)):
         assert abs(value.mean - true) < 1.5e-3
         assert value.p05 < true < value.p95
 
@@ -229,7 +229,7 @@ def test_rounded_block_between_four_walls_is_estimated() -> None:
     along = np.sin(7.0 * at) + np.sin(11.0 * at)
     wrench = np.stack([60.0 * along, 55.0 * along, 0.0 * at], axis=1)
     nominal = replace(rounded, clearance=Clearance(0.034, 0.019), loads=())
-    found = estimate(nominal, Load(at, wrench), Poses(motion.t, motion.q + noise))
-    for value, true in ((found.horizontal, 0.030), (found.vertical, 0.022)):
+    result = estimate(nominal, Load(at, wrench), Poses(motion.t, motion.q + noise))
+    for value, true in ((result.horizontal, 0.030), (result.vertical, 0.022)):
         assert abs(value.mean - true) < 5e-4
         assert value.p05 < true < value.p95

@@ -26,9 +26,9 @@ def test_the_command_keeps_the_contract(tmp_path: Path) -> None:
     with (tmp_path / "pose.csv").open("a") as file:
         file.write("99,what,0,0\n")
     words = ["estimate", tmp_path, "--json", "--out", tmp_path / "out", "--plot", tmp_path / "fit.png"]
-    done = plow_twin(*words, "--forces", "20")
-    assert done.returncode == 3, done.stderr
-    facts = json.loads(done.stdout)
+    completed = plow_twin(*words, "--forces", "20")
+    assert completed.returncode == 3, completed.stderr
+    facts = json.loads(completed.stdout)
     assert facts == json.loads((tmp_path / "out" / "estimate.json").read_text())
     for name, true in zip(("horizontal", "vertical"), truth.clearance, strict=True):
         value = facts[name]
@@ -48,8 +48,8 @@ def test_without_a_load_intervals_of_rough_clearances_contain_the_truth(tmp_path
     truth = draw(replace(GROUPS["hard"], periods=5.0), 30100)
     truth.write(tmp_path)
     (tmp_path / "load.csv").unlink()
-    done = plow_twin("estimate", tmp_path, "--json")
-    facts = json.loads(done.stdout)
+    completed = plow_twin("estimate", tmp_path, "--json")
+    facts = json.loads(completed.stdout)
     assert facts["model"] == "suspect" and facts["reasons"][0].startswith("load: ")
     for name, true in zip(("horizontal", "vertical"), truth.clearance, strict=True):
         value = facts[name]
@@ -58,9 +58,9 @@ def test_without_a_load_intervals_of_rough_clearances_contain_the_truth(tmp_path
 
 def test_a_bag_is_read_by_its_mapping(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", motion(), StoragePlugin.SQLITE3)
-    done = plow_twin("estimate", bag, "--map", tmp_path / "map.yaml", "--json", "--scene", "paper")
-    assert done.returncode == 0, done.stderr
-    facts = json.loads(done.stdout)
+    completed = plow_twin("estimate", bag, "--map", tmp_path / "map.yaml", "--json", "--scene", "paper")
+    assert completed.returncode == 0, completed.stderr
+    facts = json.loads(completed.stdout)
     assert facts["delay"]["mean"] == pytest.approx(LAG_S, abs=2e-3)
     assert [facts[f"bias_{name}"]["mean"] for name in ("x", "y", "theta")] == pytest.approx(np.negative(BIAS), abs=3e-4)
     assert facts["horizontal"]["mean_m"] == pytest.approx(0.025, abs=3e-4)

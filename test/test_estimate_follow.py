@@ -83,10 +83,10 @@ def _run(follower: Follower, truth: Truth, end: float, begin: float = -1.0, late
     return np.asarray(rows["force"])
 
 
-def _take(follower: Follower, found: Estimate) -> bool:
+def _take(follower: Follower, estimate: Estimate) -> bool:
     """Add an estimate at the present time. Return whether the twins follow it; if not, they follow the prior again."""
     before = follower.drawn
-    follower.add_estimate(json.dumps(found.as_dict()), follower.time)
+    follower.add_estimate(json.dumps(estimate.as_dict()), follower.time)
     return follower.drawn != before
 
 
@@ -144,12 +144,12 @@ def test_rows_on_a_grid_equal_rows_at_the_samples(truth: Truth) -> None:
 def test_without_measurements_the_motion_stays_nominal(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
     load, _ = _until(truth, 2.0)
     monkeypatch.setattr(TwinBatch, "move", lambda *_: pytest.fail("a member was moved"))
-    told = follow(truth.nominal, load, Poses(np.zeros(0), np.zeros((0, 3))), MEMBERS)
+    followed = follow(truth.nominal, load, Poses(np.zeros(0), np.zeros((0, 3))), MEMBERS)
     alone = TwinBatch([replace(truth.nominal, loads=())], tol=TOLERANCE)
     rows = alone.advance_samples(load.t, load.wrench)
-    assert _error(told.rows.force, rows.force[0]) < 1e-6
-    assert not told.taken_over
-    assert np.array_equal(told.rows.clearance[0], told.rows.clearance[-1])
+    assert _error(followed.rows.force, rows.force[0]) < 1e-6
+    assert not followed.taken_over
+    assert np.array_equal(followed.rows.clearance[0], followed.rows.clearance[-1])
 
 
 def test_an_estimate_is_adopted_without_a_false_impact(
@@ -160,8 +160,8 @@ def test_an_estimate_is_adopted_without_a_false_impact(
     follower.span()
     assert _take(follower, _known(truth))
     monkeypatch.setattr(TwinBatch, "change", lambda *_: pytest.fail("nothing is left to learn"))
-    told = _run(follower, truth, 6.0, 4.0)
-    assert _error(told, forces[401:601]) < 0.04
+    followed = _run(follower, truth, 6.0, 4.0)
+    assert _error(followed, forces[401:601]) < 0.04
     peak = simulate(truth.scene, 6.0, 1e-3, 1e-6).force[4000:].max(axis=0)
     assert (follower.span().peak[0] < 1.1 * peak + 2e3).all()
 
@@ -342,9 +342,9 @@ def test_a_member_is_never_pushed_into_a_hard_wall() -> None:
     truth = draw(replace(GROUPS["hard"], periods=0.7), 71102)
     follower = Follower(truth.nominal, MEMBERS)
     _take(follower, _known(truth))
-    told = _run(follower, truth, float(truth.load.t[-1]))
+    followed = _run(follower, truth, float(truth.load.t[-1]))
     true = simulate(truth.scene, float(truth.load.t[-1]), 1e-4, 1e-6).force
-    assert np.isfinite(told).all()
+    assert np.isfinite(followed).all()
     assert follower.span().peak[0].max() < 3.0 * true.max()
 
 
@@ -406,11 +406,11 @@ def test_poses_with_missing_components_give_finite_numbers(truth: Truth) -> None
     load, poses = _until(truth, 2.0)
     q = poses.q.copy()
     q[::3, 1], q[1::5, 0] = np.nan, np.nan
-    told = follow(truth.nominal, load, Poses(poses.t, q), MEMBERS, span=0.5)
-    assert len(told.spans) == 4
-    for part in (*vars(told.rows).values(), *(span.peak for span in told.spans)):
+    followed = follow(truth.nominal, load, Poses(poses.t, q), MEMBERS, span=0.5)
+    assert len(followed.spans) == 4
+    for part in (*vars(followed.rows).values(), *(span.peak for span in followed.spans)):
         assert np.isfinite(part).all()
-    assert (told.rows.low <= told.rows.force).all() and (told.rows.force <= told.rows.high).all()
+    assert (followed.rows.low <= followed.rows.force).all() and (followed.rows.force <= followed.rows.high).all()
 
 
 def test_moving_a_twin_to_its_own_pose_changes_nothing() -> None:
@@ -458,8 +458,8 @@ def test_the_command_writes_a_row_for_each_sample(truth: Truth, tmp_path: Path) 
     points = ("", "/p05", "/p95")
     assert names == ["t", *(f"{name}{point}" for name in (*PAIR_NAMES, "horizontal", "vertical") for point in points)]
     assert np.allclose([float(row[0]) for row in rows], load.t, rtol=1e-12)
-    told = follow(truth.nominal, load, poses, 20)
-    assert np.allclose(np.array(rows, dtype=float), table(told.rows)[1], rtol=1e-6)
+    followed = follow(truth.nominal, load, poses, 20)
+    assert np.allclose(np.array(rows, dtype=float), table(followed.rows)[1], rtol=1e-6)
     refused = plow_twin_here("estimate", tmp_path / "in", "--follow")
     assert refused.returncode == 2 and "expected the folder for followed.csv" in refused.stderr
     dense = ("--follow", "--follow-dt", "1e-9", "--out", tmp_path / "dense")

@@ -93,9 +93,9 @@ def test_harmonics_are_found_where_the_residuals_do_not_repeat_with_the_load() -
     """The motion differs from period to period, so the residuals without the harmonics differ too."""
     truth = draw(replace(GROUPS["plain"], third_harmonic=SHARE), 78000)
     load, poses = truth.load, truth.poses.between(0.0, 10.0)
-    found = estimate(truth.nominal, Load(load.t[:1001], load.wrench[:1001]), poses)
-    assert found.load_harmonics is not None
-    assert abs(found.vertical.mean - truth.clearance[1]) < 3e-4
+    result = estimate(truth.nominal, Load(load.t[:1001], load.wrench[:1001]), poses)
+    assert result.load_harmonics is not None
+    assert abs(result.vertical.mean - truth.clearance[1]) < 3e-4
 
 
 @pytest.mark.parametrize("kind", ["load_5", pytest.param("friction_05", marks=pytest.mark.stress)])

@@ -90,9 +90,9 @@ def test_quantiles_scale_with_the_coefficient_and_end_at_the_horizon(tmp_path: P
     limits = ["--limit-horizontal", "28", "--limit-vertical", "34", "--horizon", "20000", "--stop", "1000", "--json"]
     limits += ["--scenario", "hard:coefficient=2"]
     picture = tmp_path / "plots" / "forecast.png"
-    done = plow_twin("forecast", file, *limits, "--plot", picture)
-    assert done.returncode == 0, done.stderr
-    facts = json.loads(done.stdout)
+    completed = plow_twin("forecast", file, *limits, "--plot", picture)
+    assert completed.returncode == 0, completed.stderr
+    facts = json.loads(completed.stdout)
     assert facts["p50"]["passes"] == pytest.approx(facts["p50"]["km"] * 1000.0 / 250.0)
     assert 0.0 <= facts["probability_before_stop"] <= 1.0
     other = facts["scenarios"]["hard"]
@@ -112,12 +112,12 @@ def test_scenarios_are_separate_forecasts_from_the_same_draws() -> None:
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     dry, heavy = Scenario.parse("dry: coefficient=0.5"), Scenario.parse("heavy:load=1.3,coefficient=1")
     plan = Plan(0.0255, 0.0305, 1e5, draws=200, scenarios=(dry, heavy))
-    found = forecast(scene, plan)
+    result = forecast(scene, plan)
     alone = forecast(scene, replace(plan, scenarios=()))
-    assert np.array_equal(found.hours, alone.hours)
-    assert found.scenarios["dry"].hours == pytest.approx(2.0 * found.hours, rel=1e-2)
+    assert np.array_equal(result.hours, alone.hours)
+    assert result.scenarios["dry"].hours == pytest.approx(2.0 * result.hours, rel=1e-2)
     # a heavier load causes larger forces and a shorter life; the ratio depends on the contact
-    middle, sooner = found.quantile(0.5), found.scenarios["heavy"].quantile(0.5)
+    middle, sooner = result.quantile(0.5), result.scenarios["heavy"].quantile(0.5)
     assert middle is not None and sooner is not None and 0.6 * middle < sooner < 0.95 * middle
     for text in ("no numbers:load", "a:speed=2", "b:load=0", ":load=2", "c:load=nan"):
         with pytest.raises(LifeError, match="scenario: got"):
@@ -146,9 +146,9 @@ def test_an_estimated_clearance_includes_the_present_wear() -> None:
         for name, mean in (("horizontal", 0.029), ("vertical", 0.034))
     }
     now, deviation = with_estimate(worn, facts)
-    found = forecast(now, Plan(0.033, 0.038, 1e6, draws=50), deviation)
-    assert np.quantile(found.now, 0.5, axis=0) == pytest.approx([0.029, 0.034], abs=5e-5)
-    assert found.clearances(np.zeros(1))[1, 0] == pytest.approx([0.029, 0.034], abs=5e-5)
+    result = forecast(now, Plan(0.033, 0.038, 1e6, draws=50), deviation)
+    assert np.quantile(result.now, 0.5, axis=0) == pytest.approx([0.029, 0.034], abs=5e-5)
+    assert result.clearances(np.zeros(1))[1, 0] == pytest.approx([0.029, 0.034], abs=5e-5)
 
 
 def test_a_forecast_of_a_run_uses_its_last_pads_and_no_estimate_of_earlier_pads(tmp_path: Path) -> None:
@@ -259,8 +259,8 @@ def test_an_unfinished_path_is_an_error_and_not_an_unreached_limit() -> None:
     """From a clearance of a micrometre, 400 steps make no progress. The result must not be `not reached`."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     tight = replace(scene, clearance=Clearance(1e-6, 0.030))
-    found = forecast(tight, Plan(0.002, 0.034, 1e3, draws=50))
-    assert 0.0 < (found.quantile(0.5) or 0.0) < 1e3
+    result = forecast(tight, Plan(0.002, 0.034, 1e3, draws=50))
+    assert 0.0 < (result.quantile(0.5) or 0.0) < 1e3
     assert forecast(scene, Plan(0.02, 0.02, 1e3, stop_h=0.0, draws=50)).as_dict()["probability_before_stop"] == 1.0
     with pytest.raises(LifeError, match="mm at the end of the path, expected clearances with which the model runs"):
         mean_forces(scene, np.full(8, 0.5))
@@ -269,8 +269,8 @@ def test_an_unfinished_path_is_an_error_and_not_an_unreached_limit() -> None:
 def test_drawn_clearances_are_never_below_zero() -> None:
     """A clearance drawn from its prior can be -70 mm, from which the path leaves the range of the model."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
-    found = forecast(scene, Plan(0.026, 0.031, 1e3, draws=50), (0.03, 0.03))
-    assert found.now.min() > 0.0
+    result = forecast(scene, Plan(0.026, 0.031, 1e3, draws=50), (0.03, 0.03))
+    assert result.now.min() > 0.0
     with pytest.raises(LifeError, match="deviations: got"):
         forecast(scene, Plan(0.026, 0.031, 1e3), (float("nan"), 0.0))
     for numbers in ((np.nan, 0.03, 1.0), (0.03, np.inf, 1.0), (0.03, 0.03, -1.0)):

@@ -219,9 +219,9 @@ def test_the_live_estimate_is_published_and_repeated_by_the_journal(tmp_path: Pa
         assert value(status, name) == "estimated"
     assert (value(status, "model"), value(status, "sensor")) == ("ok", "ok")
 
-    done = plow_twin("estimate", run, "--json")
-    assert done.returncode == 0, done.stderr
-    facts = json.loads(done.stdout)
+    completed = plow_twin("estimate", run, "--json")
+    assert completed.returncode == 0, completed.stderr
+    facts = json.loads(completed.stdout)
     assert facts["live"]["repeated"] is True and facts["live"]["estimates"] >= 1
     assert facts["horizontal"]["mean_m"] == found["horizontal"]
     # gaps were measured, so clearances of the groups of pads are estimated too
@@ -457,10 +457,10 @@ node.release()
 node.destroy_node()
 context.try_shutdown()
 """
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT / "test", capture_output=True, text=True, timeout=110
     )
-    assert done.returncode == 0, done.stderr
+    assert completed.returncode == 0, completed.stderr
 
 
 @pytest.mark.timeout(600)  # at first, the twin and the worker each compile for 65 s of processor time

@@ -372,9 +372,9 @@ def test_a_fit_that_cannot_be_computed_is_withdrawn(monkeypatch: pytest.MonkeyPa
 
 def test_a_rough_load_costs_little_accuracy() -> None:
     truth = draw(replace(GROUPS["stochastic"], periods=5.0), 20004)
-    found = estimate(truth.nominal, truth.load, truth.poses)
-    assert (found.model, found.sensor) == ("ok", "ok")
-    for value, true in zip((found.horizontal, found.vertical), truth.clearance, strict=True):
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert (result.model, result.sensor) == ("ok", "ok")
+    for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):
         # without links between the swings, the interval would be twice as wide, and the error 0.2 mm
         assert value.p95 - value.p05 < 2.5e-4 and abs(value.mean - true) < 1.5e-4
 

@@ -19,14 +19,14 @@ def test_a_machine_of_another_size_is_estimated_like_the_paper_s_machine() -> No
     truth, result = known()[0]
     desk = Units(8.0, 1024.0, 4.0)  # a machine that is an eighth as large, a thousandth as heavy and four times as fast
     scene = desk.scene(truth.nominal)
-    found = estimate(scene, desk.load(truth.load), desk.poses(truth.poses))
-    assert found.t_end == result.t_end / 4.0 and found.bias_x is not None and found.delay is not None
+    estimated = estimate(scene, desk.load(truth.load), desk.poses(truth.poses))
+    assert estimated.t_end == result.t_end / 4.0 and estimated.bias_x is not None and estimated.delay is not None
     # the factors are powers of two, so the conversion changes no bit of a mantissa
-    back = desk.in_si(found, truth.nominal)
-    assert back == replace(result, lost=back.lost) and found.horizontal.mean == result.horizontal.mean / 8.0
+    back = desk.in_si(estimated, truth.nominal)
+    assert back == replace(result, lost=back.lost) and estimated.horizontal.mean == result.horizontal.mean / 8.0
     assert back.motion is not None and result.motion is not None
     np.testing.assert_array_equal(back.motion.model, result.motion.model)
-    twins, gain = draw_scenes(scene, found, 20, np.random.default_rng(0))
+    twins, gain = draw_scenes(scene, estimated, 20, np.random.default_rng(0))
     alike, same = draw_scenes(truth.nominal, result, 20, np.random.default_rng(0))
     assert gain == pytest.approx(same)
     assert [8.0 * twin.clearance.vertical_m for twin in twins] == pytest.approx(

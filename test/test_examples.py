@@ -56,13 +56,13 @@ LONG = ("a_year", "calibration", "measured_drop")
 )
 def test_the_example_runs(folder: Path, tmp_path: Path) -> None:
     command = [sys.executable, str(folder / "run.py"), str(tmp_path)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=240)
-    assert done.returncode == 0, done.stderr
-    assert re.search(SAID[folder.name], done.stdout), done.stdout
+    completed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=240)
+    assert completed.returncode == 0, completed.stderr
+    assert re.search(SAID[folder.name], completed.stdout), completed.stdout
     if folder.name == "first_scene":
         assert (tmp_path / "motion.png").read_bytes().startswith(b"\x89PNG")
     if folder.name == "sweep":
-        table = [float(number) for row in re.findall(r" mm(.+)", done.stdout) for number in row.split()]
+        table = [float(number) for row in re.findall(r" mm(.+)", completed.stdout) for number in row.split()]
         assert table == pytest.approx(table_of_the_command(folder, tmp_path), abs=0.051)
 
 

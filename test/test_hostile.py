@@ -103,7 +103,7 @@ for name in {files!r}:
     code = run([word.replace("FILE", name + ".yaml") for word in {READERS[reader]!r}])
     print("code", code, file=sys.stderr)
 """
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", code],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "10000"},
@@ -111,12 +111,12 @@ for name in {files!r}:
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stderr[-2000:]
-    said = done.stderr
+    assert completed.returncode == 0, completed.stderr[-2000:]
+    errors = completed.stderr
     for name in files:
-        _, _, rest = said.partition(f"{name}\n")
-        text, code_line, said = rest.partition("\ncode ")
-        assert code_line and said.startswith("2\n"), (name, text[:500])
+        _, _, rest = errors.partition(f"{name}\n")
+        text, code_line, errors = rest.partition("\ncode ")
+        assert code_line and errors.startswith("2\n"), (name, text[:500])
         lines = [line for line in text.splitlines() if ": got " in line]
         assert "Traceback" not in text and len(text) < 20_000, (name, text[:500])
         assert len(lines) == 1 or name in WITHIN, (name, text[:500])
@@ -247,7 +247,7 @@ def test_absurd_recordings_end_with_one_line(tmp_path: Path) -> None:
             )
     (tmp_path / "plain.mcap").write_bytes(recorded())
     plain = [[word.replace("FILE", "plain.mcap") for word in words] for words in PLAIN]
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", RUNNER],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "10000"},
@@ -256,8 +256,8 @@ def test_absurd_recordings_end_with_one_line(tmp_path: Path) -> None:
         text=True,
         check=False,
     )
-    answers = [json.loads(line) for line in done.stdout.splitlines()]
-    assert len(answers) == len(asked), done.stderr[-2000:]
+    answers = [json.loads(line) for line in completed.stdout.splitlines()]
+    assert len(answers) == len(asked), completed.stderr[-2000:]
     for name, words, code, text, memory_mb in answers:
         where = (name, words[0], code, memory_mb, text[-500:])
         unread = name == "header_file" and words[0] != "replay"  # these commands need no scene

@@ -38,8 +38,10 @@ MISSES = (
 
 def run(cache: Path, program: str = MISSES) -> str:
     environment = os.environ | {"NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
-    return done.stdout.strip()
+    completed = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
+    )
+    return completed.stdout.strip()
 
 
 def test_an_index_of_other_sources_is_replaced_unread(tmp_path: Path) -> None:
@@ -125,10 +127,10 @@ def test_a_kernel_is_compiled_once_for_numbers_and_constants(tmp_path: Path) -> 
 def test_an_unwritable_cache_gives_one_warning_and_the_run_continues(tmp_path: Path) -> None:
     full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)); "
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-c", full + LINKED], env=environment, capture_output=True, text=True)
-    assert (done.returncode, done.stdout) == (0, "0\n"), done.stderr
-    said = [line for line in done.stderr.splitlines() if "RuntimeWarning:" in line]
-    assert len(said) == 1 and said[0].endswith(f"{tmp_path}: File too large"), done.stderr
+    completed = subprocess.run([sys.executable, "-c", full + LINKED], env=environment, capture_output=True, text=True)
+    assert (completed.returncode, completed.stdout) == (0, "0\n"), completed.stderr
+    errors = [line for line in completed.stderr.splitlines() if "RuntimeWarning:" in line]
+    assert len(errors) == 1 and errors[0].endswith(f"{tmp_path}: File too large"), completed.stderr
 
 
 def test_no_kernel_assigns_an_array_to_a_slice() -> None:

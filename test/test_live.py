@@ -245,16 +245,25 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
     report = replay(rewrite(file, tmp_path / "other.mcap", metadata=other_thresholds))
     assert report.exit_code == 1 and report.first_divergence is not None
     # the alarm of the residual was raised and then released; the replay raises no alarm, so there are two divergences
-    found = report.first_divergence
-    assert (report.divergences, found.topic, found.recorded, found.computed) == (2, "alarms", "a message", "none")
+    divergence = report.first_divergence
+    assert (report.divergences, divergence.topic, divergence.recorded, divergence.computed) == (
+        2,
+        "alarms",
+        "a message",
+        "none",
+    )
 
     def other_level(topic: str, message: Any) -> bytes | None:
         return bytes(message.data).replace(b"warn", b"none") if topic == "/alarms" else None
 
     report = replay(rewrite(file, tmp_path / "told.mcap", other_level))
     assert report.first_divergence is not None
-    found = report.first_divergence
-    assert (found.topic, found.recorded, found.computed) == ("alarms", "none", "warn") and "_l" in found.field
+    divergence = report.first_divergence
+    assert (divergence.topic, divergence.recorded, divergence.computed) == (
+        "alarms",
+        "none",
+        "warn",
+    ) and "_l" in divergence.field
     # after a kill and a repair, the outputs end before the journal
     last = max(record.sequence for record in records_of(file) if getattr(record, "topic", "") == "/alarms")
 
@@ -348,7 +357,7 @@ def test_a_mapping_has_units_offsets_and_clocks_and_its_faults_are_named(tmp_pat
     # many databases write the first date for `empty`; the other two dates cannot be stamps
     assert time_ns("9999-12-31") is None and time_ns("2300-01-01T00:00:00") is None and time_ns("0001-01-01") is None
     assert time_ns(10**400) is None and time_ns("20260102") == (20_260_102 + 1) * 10**9
-    for text, said in (
+    for text, message in (
         ("unit: {x: N}", "unit.x: got 'N', expected one of m, cm, mm, um"),
         ("limits: {x: [2, 1]}", "limits.x: got [2, 1], expected the smallest number"),
         ("clock_offset: soon", "clock_offset: got 'soon'"),
@@ -369,7 +378,7 @@ def test_a_mapping_has_units_offsets_and_clocks_and_its_faults_are_named(tmp_pat
         path.write_text(f"head_pose: {{topic: p, {text}}}")
         with pytest.raises(RecordingError, match="head_pose") as caught:
             read_map(path, None)
-        assert said in str(caught.value)
+        assert message in str(caught.value)
     # if the requested field with the time is missing, the time of receipt does not replace it
     assert read("head_pose: {topic: p, stamp: at}", x=1, y=2, theta=3) is None
     for key, name in (("stamp", "at"), ("sequence", "n")):
@@ -773,13 +782,15 @@ print(*apply_realtime(wrong), sep="\\n")
 print(os.sched_getaffinity(0) == {one})
 """
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    said = done.stdout.splitlines()
-    assert [line.partition(" ")[0].rstrip(":") for line in said] == ["priority", "lock_memory", "cpu_affinity", "True"]
+    completed = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    lines = completed.stdout.splitlines()
+    assert [line.partition(" ")[0].rstrip(":") for line in lines] == ["priority", "lock_memory", "cpu_affinity", "True"]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "message"),
     [
         (["nowhere.csv"], 1, "no such file"),
         (["load.csv", "--set", "excitation_timeot=1"], 2, "did you mean excitation_timeout"),
@@ -796,7 +807,7 @@ print(os.sched_getaffinity(0) == {one})
 def test_a_message_about_a_wrong_call_states_the_expected_call(
     arguments: list[str],
     code: int,
-    said: str,
+    message: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
@@ -809,7 +820,7 @@ def test_a_message_about_a_wrong_call_states_the_expected_call(
     (tmp_path / "twice.yaml").write_text("excitation: {topic: load}\nexcitation: {topic: other}\n")
     (tmp_path / "junk.csv").write_bytes(b"\x1b[31m" + bytes(range(256)) * 100)
     assert run_cli(["live", *arguments, "--quiet"]) == code
-    assert said in " ".join(capfd.readouterr().err.split())
+    assert message in " ".join(capfd.readouterr().err.split())
 
 
 def test_prometheus_reads_the_numbers_of_the_diagnostics(tmp_path: Path) -> None:
@@ -885,7 +896,7 @@ def test_impossible_poses_gaps_and_speeds_are_not_used() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "code", "said"),
+    ("text", "code", "message"),
     [
         ("t,fx,fy,m\n", 3, "no sample arrived on load"),
         ("t,fx,fy,m\n" + "1.0,inf,2.0,3.0\n" * 40, 3, "40 loads have a number that is not finite (nan or inf)"),
@@ -893,20 +904,20 @@ def test_impossible_poses_gaps_and_speeds_are_not_used() -> None:
     ],
 )
 def test_an_input_without_a_sample_or_without_a_header_is_named(
-    text: str, code: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    text: str, code: int, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "load.csv").write_text(text)
     assert run_cli(["live", str(tmp_path / "load.csv"), "--quiet"]) == code
     shown = capsys.readouterr().err
-    assert said in shown and "no --scene: the preset paper is used" in shown
+    assert message in shown and "no --scene: the preset paper is used" in shown
 
 
 def test_every_view_of_a_run_reports_failed_advances(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, run = _csv(tmp_path / "load.csv", 720, times=3.0), tmp_path / "run"
     assert run_cli(["live", str(path), "--scene", "paper", "--record", str(run)]) == 3
-    said = capsys.readouterr().err
-    assert "10 advances failed, without forces from 0.681 s to 0.690 s: the head turned to -45.3 degrees" in said
-    assert "the model is valid up to 45; then the head was set to the initial position, with its wear" in said
+    errors = capsys.readouterr().err
+    assert "10 advances failed, without forces from 0.681 s to 0.690 s: the head turned to -45.3 degrees" in errors
+    assert "the model is valid up to 45; then the head was set to the initial position, with its wear" in errors
     for arguments in (["info"], ["doctor"]):
         code = run_cli([*arguments, str(run), "--json"])
         assert (code, json.loads(capsys.readouterr().out)["failed_advances"]) == (3 * (arguments == ["info"]), 10)
@@ -981,7 +992,7 @@ def _mistaken(name: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("name", "code", "said"),
+    ("name", "code", "message"),
     [
         ("decimal commas", 3, "3000 malformed; the first: load has a line without the 4 cells of its header"),
         ("local dates", 3, "load has no time at 't': got '25.10.2026 02:59:00.000', expected a number or a date"),
@@ -996,11 +1007,11 @@ def _mistaken(name: str) -> str:
     ],
 )
 def test_a_natural_mistake_in_a_file_is_named(
-    name: str, code: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str, code: int, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "load.csv").write_text(_mistaken(name))
     assert run_cli(["live", str(tmp_path / "load.csv"), "--scene", "paper", "--quiet"]) == code
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_utf16_a_used_folder_and_a_threshold_in_kilonewtons_are_reported(

@@ -102,12 +102,12 @@ def _known(truth: Truth, state: State = State.ESTIMATED) -> Estimated:
     assert contact.damping is not None
     fx, fy, m = (Interval.normal(gain, 0.003) for gain in truth.gain)
     horizontal, vertical = (Interval.normal(value, 3e-5) for value in (clearance.horizontal_m, clearance.vertical_m))
-    found = Estimate(
+    result = Estimate(
         0.0, 1.0, horizontal, vertical, state, state,
         Interval.normal(contact.stiffness, 2e-3 * contact.stiffness), Interval.normal(contact.damping, 5e-3),
         fx, fy, m, noise=(5e-4, 5e-4, 2e-3),
     )  # fmt: skip
-    return Estimated(0, 1, 2, 3, (), (0.0,) * 6, json.dumps(found.as_dict()))
+    return Estimated(0, 1, 2, 3, (), (0.0,) * 6, json.dumps(result.as_dict()))
 
 
 #: A change of the model: the horizontal clearance is smaller by 1 mm.
@@ -396,9 +396,9 @@ def test_penetrations_of_members_do_not_depend_on_the_centre_of_mass(truth: Trut
     gravity = replace(truth.nominal.gravity, arm_m=0.0)
     scene = replace(truth.nominal, head=head, gravity=gravity)
     poses = np.tile([1e-3, -2e-3, 0.01], (MEMBERS, 1))
-    found = Follower(scene, MEMBERS)._ensemble._penetration(poses)
+    penetration = Follower(scene, MEMBERS)._ensemble._penetration(poses)
     # the pose is that of the cavity, so the penetrations do not depend on the centre of mass
-    assert found[0] == pytest.approx(-gaps_at(truth.nominal, poses)[0], abs=1e-12)
+    assert penetration[0] == pytest.approx(-gaps_at(truth.nominal, poses)[0], abs=1e-12)
 
 
 @pytest.mark.parametrize("wear", [None, Wear(2e-14, 0.015, 2.0)])
@@ -675,8 +675,8 @@ def test_a_runtime_reports_its_twins_and_follows_with_parameters_if_samples_wait
     assert report.compared["force_intervals"] == sent["force_intervals"]
     residual = {}
     for name, given_scene in (("followed", None), ("nominal", scene)):
-        found = analyse(tmp_path / "run", scene=given_scene)
-        residual[name] = found.comparisons(found.predictions[0])["x"].rms
+        analysis = analyse(tmp_path / "run", scene=given_scene)
+        residual[name] = analysis.comparisons(analysis.predictions[0])["x"].rms
     assert residual["followed"] < 0.5 * residual["nominal"]
     drawn = to_rrd(tmp_path / "run", tmp_path / "run.rrd")
     entities = {chunk.entity_path for chunk in RrdReader(str(drawn.path)).stream() if not chunk.is_static}
@@ -732,8 +732,8 @@ runtime.close()
         "    __getattr__ = lambda self, name: lambda *_: ''\n",
         encoding="utf-8",
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.stdout.strip() == there, done.stderr
+    completed = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert completed.stdout.strip() == there, completed.stderr
 
 
 def test_hard_real_time_excludes_following(truth: Truth) -> None:

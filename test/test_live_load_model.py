@@ -114,7 +114,7 @@ def test_telemetry_of_the_drive_runs_the_twin_and_its_interval_is_in_the_journal
 
 
 @pytest.mark.parametrize(
-    ("entry", "said"),
+    ("entry", "message"),
     [
         (
             "push_ratio: [0.5, 0.1], at_m: [0, 0], efficiency: 0.8",
@@ -133,8 +133,8 @@ def test_telemetry_of_the_drive_runs_the_twin_and_its_interval_is_in_the_journal
         ),
     ],
 )
-def test_coefficients_that_cannot_be_used_are_named(entry: str, said: str, tmp_path: Path) -> None:
+def test_coefficients_that_cannot_be_used_are_named(entry: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "map.yaml").write_text(f"load_model: {{{entry}}}")
     with pytest.raises(PlowTwinError) as caught:
         read_load_model(tmp_path / "map.yaml")
-    assert said in str(caught.value)
+    assert message in str(caught.value)

@@ -206,7 +206,7 @@ def test_values_with_one_stamp_form_a_sample_and_unchanged_fields_are_repeated()
 
 def test_a_wrong_mapping_of_nodes_names_the_key(tmp_path: Path) -> None:
     path = tmp_path / "map.yaml"
-    for text, said in (
+    for text, message in (
         ("excitation: {fx: {node: 5}, fy: {node: a}, m: {node: b}}", "excitation.fx"),
         ("head_pose: {x: {node: a, unit: kN}}", "unit.x: got 'kN', expected one of m"),
         ("head_pose: {x: {node: a}, stamp: t}", "stamp: got 't', expected source or server"),
@@ -216,7 +216,7 @@ def test_a_wrong_mapping_of_nodes_names_the_key(tmp_path: Path) -> None:
         path.write_text(text)
         with pytest.raises(Exception, match="got") as caught:
             read_map(path, None)
-        assert said in str(caught.value)
+        assert message in str(caught.value)
 
 
 def test_samples_have_source_stamps_and_bad_values_are_counted(server: Plant, roles: Any) -> None:
@@ -500,7 +500,7 @@ def test_untrusted_and_unencrypted_connections_are_refused(
     secured: tuple[Plant, Access], certificates: Path, roles: Any, server: Plant
 ) -> None:
     _, access = secured
-    for wrong, said in (
+    for wrong, message in (
         ({"password": "guess"}, "refused"),
         ({"ca": certificates / "other.pem"}, "certificate verify failed"),
         ({"key": certificates / "other.key"}, "the key does not belong to the certificate"),
@@ -508,14 +508,14 @@ def test_untrusted_and_unencrypted_connections_are_refused(
         ({"url": f"opc.tcp://127.0.0.1:{server.port}/plant"}, "offers no encryption"),
         ({"url": "opc.tcp://localhost:1"}, "no server at localhost:1"),
     ):
-        with pytest.raises(BridgeError, match=said):
+        with pytest.raises(BridgeError, match=message):
             OpcUa(replace(access, **wrong), roles).start([])  # type: ignore[arg-type]
-    for wrong, said in (
+    for wrong, message in (
         ({"url": "opc.tcp://plough.example", "certificate": None, "key": None, "ca": None}, "without certificates"),
         ({"url": "opc.tcp://user:secret@localhost"}, "user and topics are set by other options"),
         ({"key": None}, "together"),
     ):
-        with pytest.raises(BridgeError, match=said) as caught:
+        with pytest.raises(BridgeError, match=message) as caught:
             OpcUa(replace(access, **wrong), roles)  # type: ignore[arg-type]
         assert "secret" not in str(caught.value)
 

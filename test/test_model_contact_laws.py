@@ -148,6 +148,6 @@ def test_the_command_line_adds_laws_from_a_file(tmp_path: Path) -> None:
     refused = plow_twin("info", scene)
     assert refused.returncode == 2 and "contact.law: got 'of_a_file'" in refused.stderr
     assert plow_twin("--laws", laws, "info", scene).returncode == 0
-    for wrong, said in ((empty, "calls plow_twin.add_law"), (tmp_path / "none.py", "No such file")):
-        done = plow_twin("--laws", wrong, "info", scene)
-        assert done.returncode == 2 and said in done.stderr and "Traceback" not in done.stderr
+    for wrong, message in ((empty, "calls plow_twin.add_law"), (tmp_path / "none.py", "No such file")):
+        completed = plow_twin("--laws", wrong, "info", scene)
+        assert completed.returncode == 2 and message in completed.stderr and "Traceback" not in completed.stderr

@@ -200,23 +200,23 @@ def test_a_misspelt_topic_of_a_broker_is_an_error(
 @pytest.mark.filterwarnings("ignore:unclosed <ssl.SSLSocket:ResourceWarning")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_wrong_password_a_strange_certificate_and_a_broker_without_tls_are_refused(broker: Access) -> None:
-    for wrong, said in (
+    for wrong, message in (
         ({"password": "guess"}, "refused" if AMQTT >= (0, 12) else "the connection broke"),
         ({"ca": None}, "certificate verify failed"),
         ({"url": broker.url.replace("mqtts", "mqtt")}, "no answer"),
     ):
         bridge = Mqtt(
-            replace(broker, **wrong), connect_s=60.0 if said in ("refused", "certificate verify failed") else 2.0
+            replace(broker, **wrong), connect_s=60.0 if message in ("refused", "certificate verify failed") else 2.0
         )
-        with pytest.raises(BridgeError, match=said):
+        with pytest.raises(BridgeError, match=message):
             bridge.start(["plough/load"])
         assert not bridge.connected
-    for topic, said in (
+    for topic, message in (
         ("prohibited", "refused: prohibited"),
         ("plough/+/load", r"topic: got 'plough/\+/load'"),
         ("p" * 70_000, r"70000 characters\)', expected one topic of up to 65,535"),
     ):
-        with pytest.raises(BridgeError, match=said):
+        with pytest.raises(BridgeError, match=message):
             Mqtt(replace(broker, client_id="other"), connect_s=60.0).start(["plough/load", topic])
 
 
@@ -245,7 +245,7 @@ def _hostile(*answers: bytes) -> Iterator[Access]:
 
 
 @pytest.mark.parametrize(
-    ("answer", "said"),
+    ("answer", "message"),
     [
         (b"\x20\x02\x00\x05", "refused: .*not authori[sz]ed"),
         (b"", "no answer within 1 s; the connection broke"),
@@ -253,8 +253,8 @@ def _hostile(*answers: bytes) -> Iterator[Access]:
     ],
     ids=["refuses", "closes", "is none"],
 )
-def test_a_refusal_by_the_broker_is_reported(answer: bytes, said: str) -> None:
-    with _hostile(answer) as access, pytest.raises(BridgeError, match=f"(?i){said}"):
+def test_a_refusal_by_the_broker_is_reported(answer: bytes, message: str) -> None:
+    with _hostile(answer) as access, pytest.raises(BridgeError, match=f"(?i){message}"):
         Mqtt(access, connect_s=1.0).start(["a"])
 
 
@@ -352,8 +352,8 @@ def test_a_run_that_ends_without_its_broker_is_an_error(tmp_path: Path) -> None:
         broker.close()
         live.until(lambda heard: not connected(heard), "the broker is gone")
         live.process.terminate()
-        said = live.process.communicate(timeout=60.0)[1].decode()
-    assert live.process.returncode == 3 and "not connected at the end: the connection broke" in said, said
+        output = live.process.communicate(timeout=60.0)[1].decode()
+    assert live.process.returncode == 3 and "not connected at the end: the connection broke" in output, output
 
 
 def test_a_missing_broker_is_reported_and_does_not_affect_the_twin(tmp_path: Path) -> None:
@@ -451,7 +451,7 @@ def test_a_sparkplug_host_receives_birth_data_rebirth_and_death_in_sequence(tmp_
 
 
 @pytest.mark.parametrize(
-    ("url", "said"),
+    ("url", "message"),
     [
         ("mqtt://plant.example/plough", "mqtts:// for another machine, or --plain"),
         ("mqtt://user:secret@localhost/plough", "user and password in --out-access"),
@@ -459,6 +459,6 @@ def test_a_sparkplug_host_receives_birth_data_rebirth_and_death_in_sequence(tmp_
         ("mqtt://localhost/a/+/b", "the prefix without + and #"),
     ],
 )
-def test_a_bad_address_is_refused_with_the_expected_form(url: str, said: str, tmp_path: Path) -> None:
+def test_a_bad_address_is_refused_with_the_expected_form(url: str, message: str, tmp_path: Path) -> None:
     done = plow_twin_here("live", _csv(tmp_path / "load.csv", 3), "--mqtt-out", url, "--quiet")
-    assert done.returncode == 2 and said in " ".join(done.stderr.split()) and "secret" not in done.stderr
+    assert done.returncode == 2 and message in " ".join(done.stderr.split()) and "secret" not in done.stderr

@@ -270,5 +270,5 @@ sys.meta_path.insert(0, Interrupting())
 from plow_twin.cli import main
 main(["info"])
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert (done.returncode, done.stdout, done.stderr) == (1, "", "plow-twin: interrupted\n")
+    completed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (completed.returncode, completed.stdout, completed.stderr) == (1, "", "plow-twin: interrupted\n")

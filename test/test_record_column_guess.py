@@ -44,8 +44,8 @@ def test_a_spreadsheet_s_file_becomes_a_mapping_with_which_the_twin_runs(
     file = _file(tmp_path / "own.csv", "Zeit;Kraft_x [kN];Kraft y;Drehmoment;Weg_x_mm", step=1.0, comma=True)
     out = tmp_path / "out"
     assert cli(["setup", str(file), "--out", str(out)]) == 0
-    said = capsys.readouterr().out
-    assert "semicolon, decimal commas, a row each 0.001 s" in said and "plow-twin live" in said
+    output = capsys.readouterr().out
+    assert "semicolon, decimal commas, a row each 0.001 s" in output and "plow-twin live" in output
     assert (out / "setup.png").stat().st_size > 10_000
     assert cli(["info", str(file), "--map", str(out / "map.yaml"), "--json"]) == 0
     read = json.loads(capsys.readouterr().out)["roles"]
@@ -106,16 +106,16 @@ def test_loads_far_too_large_for_the_scene_are_refused_before_a_file_is_written(
     file = _file(tmp_path / "own.csv", "t;fx [kN];fy [kN];m [kN m];x", step=1e-3, size=1.0)
     command = ["setup", str(file), "--scene", "paper", "--out", str(tmp_path / "out")]
     assert cli(command) == 2
-    said = capsys.readouterr().err
-    assert "fx: got 2.97e+07 N" in said and not (tmp_path / "out").exists()
-    options = [option for option in ("fx=N", "fy=N", "m=Nm") if f"--unit {option}" in said]
+    errors = capsys.readouterr().err
+    assert "fx: got 2.97e+07 N" in errors and not (tmp_path / "out").exists()
+    options = [option for option in ("fx=N", "fy=N", "m=Nm") if f"--unit {option}" in errors]
     assert len(options) == 3
     assert cli([*command, *(part for option in options for part in ("--unit", option))]) == 0
     written = yaml.safe_load((tmp_path / "out" / "map.yaml").read_text())["excitation"]["unit"]
     assert written == {"fx": "N", "fy": "N", "m": "Nm"}
 
 
-def _in_terminal(folder: Path, *said: bytes) -> tuple[int, str]:
+def _in_terminal(folder: Path, *expected: bytes) -> tuple[int, str]:
     """Run `setup own.csv` in a terminal, and type one answer at each prompt. Return exit code and screen."""
     command = [sys.executable, "-m", "plow_twin", "setup", "own.csv", "--out", "out"]
     near, far = pty.openpty()
@@ -127,11 +127,11 @@ def _in_terminal(folder: Path, *said: bytes) -> tuple[int, str]:
         command, cwd=folder, stdin=far, stdout=far, stderr=far, start_new_session=True, preexec_fn=own_terminal
     )
     os.close(far)
-    screen, answers, seen = b"", list(said), 0
+    screen, answers, seen = b"", list(expected), 0
     with suppress(OSError):  # reading fails after the program has closed its side of the terminal
         while True:
             # readline may miss a signal just before it waits, so the key is pressed again
-            while said[-1] == CTRL_C and not answers and not select.select([near], [], [], 5.0)[0]:
+            while expected[-1] == CTRL_C and not answers and not select.select([near], [], [], 5.0)[0]:
                 os.write(near, CTRL_C)
             found = os.read(near, 4096)
             if not found:
@@ -177,15 +177,15 @@ def test_dates_that_cannot_be_read_and_stamps_that_fall_are_named(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("zone", "said"), [("", "by its name; dates without a zone are UTC"), ("+01:00", "by its name")]
+    ("zone", "message"), [("", "by its name; dates without a zone are UTC"), ("+01:00", "by its name")]
 )
-def test_dates_without_a_zone_and_cells_without_a_number_are_mentioned(tmp_path: Path, zone: str, said: str) -> None:
+def test_dates_without_a_zone_and_cells_without_a_number_are_mentioned(tmp_path: Path, zone: str, message: str) -> None:
     rows = [f"2026-01-02T03:04:{index:02}.5{zone},{'nan' if index % 3 else 1e3},-1e3,2e3" for index in range(30)]
     file = tmp_path / "own.csv"
     file.write_text("\n".join(["t,fx,fy,m", *rows]) + "\n")
     because = guess_columns(file, PAPER, {}, {}).because
     assert because == {
-        "t": said,
+        "t": message,
         "fx": "by its name; 20 of 30 cells have no number",
         "fy": "by its name",
         "m": "by its name",

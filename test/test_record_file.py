@@ -243,9 +243,9 @@ def check_large(run: Run, folder: Path, images: int, image_size: int, attachment
         "most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "print(report.exit_code, report.messages_compared, 1024 * most)"
     )
-    done = subprocess.run([sys.executable, "-c", code, str(file)], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    code_, compared, most = map(int, done.stdout.split())
+    completed = subprocess.run([sys.executable, "-c", code, str(file)], capture_output=True, text=True, check=False)
+    assert completed.returncode == 0, completed.stderr
+    code_, compared, most = map(int, completed.stdout.split())
     assert (code_, compared) == (0, replay(run.folder).messages_compared)
     return most
 

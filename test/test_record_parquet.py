@@ -219,9 +219,9 @@ def test_invalid_or_excessive_parquet_gives_one_line(tmp_path: Path, capsys: pyt
     for name, code in expected.items():
         for words in (["live"], ["setup"], ["analyse", "--scene", "paper"], ["info", "--unit", "fx=kN"]):
             assert cli([*words, str(files[name])]) == code, (name, words)
-            said = capsys.readouterr().err
-            lines = [line for line in said.splitlines() if "no --scene" not in line]
-            assert len(lines) == 1 and files[name].name in lines[0], (name, words, said)
+            errors = capsys.readouterr().err
+            lines = [line for line in errors.splitlines() if "no --scene" not in line]
+            assert len(lines) == 1 and files[name].name in lines[0], (name, words, errors)
     parquet.write_table(_table(10), tmp_path / "good.parquet")
     assert cli(["live", str(tmp_path / "good.parquet"), "--follow"]) == 1
     assert "does not grow" in capsys.readouterr().err

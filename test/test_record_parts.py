@@ -231,10 +231,10 @@ def test_a_part_of_another_run_is_named_and_not_read(tmp_path: Path, capsys: pyt
     assert {RunReader(part).header.run_id for part in parts} == {RunReader(run.folder).header.run_id}
     for part in (parts[1], parts[-1]):
         shutil.copy(other.file, part)
-        after, found, (facts, lossy) = replay(run.folder), examine(run.folder), read_recording(run.folder)
+        after, report, (facts, lossy) = replay(run.folder), examine(run.folder), read_recording(run.folder)
         assert (after.exit_code, after.divergences, after.repeated) == (3, 0, 0) and lossy
         assert after.foreign_parts[part.name] == facts["foreign_parts"][part.name] == ["run_id"]
-        assert f"{part.name}: belongs to another run (its run_id differ) and is not read" in found.problems
+        assert f"{part.name}: belongs to another run (its run_id differ) and is not read" in report.problems
         count = len(after.foreign_parts)
         counted = {"missing_parts": count, "foreign_parts": count}
         assert facts["lost"] == counted and facts["damaged_chunks"] == 0
@@ -261,10 +261,10 @@ def test_repeated_entries_are_counted_and_used_once(tmp_path: Path) -> None:
     # the repeated bytes begin with a journal chunk and end before an outputs chunk
     begin, end = spans[2][0] - head, spans[8][0] - head
     run.file.write_bytes(whole[:end] + whole[begin:end] + whole[end:])
-    after, found = replay(run.folder), examine(run.folder)
-    assert after.divergences == 0 and after.samples == before.samples and after.repeated == found.repeated > 0
+    after, report = replay(run.folder), examine(run.folder)
+    assert after.divergences == 0 and after.samples == before.samples and after.repeated == report.repeated > 0
     assert after.inputs == before.inputs and before.inputs
-    assert found.gaps == 0 and any("more than once" in problem for problem in found.problems)
+    assert report.gaps == 0 and any("more than once" in problem for problem in report.problems)
 
 
 def test_on_a_full_disk_a_repair_leaves_no_incomplete_file(tmp_path: Path) -> None:
@@ -320,8 +320,8 @@ def test_a_full_disk_ends_the_writing_of_a_replay_with_a_message(
         assert cli(["replay", str(run.folder), "--write", str(full), "-q"]) == 1
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    said = capsys.readouterr().err
-    assert str(full / "full_0.mcap") in said and "too large" in said and "Traceback" not in said
+    errors = capsys.readouterr().err
+    assert str(full / "full_0.mcap") in errors and "too large" in errors and "Traceback" not in errors
     # the written part is a truncated recording, and the source is unchanged
     assert run.file.read_bytes() == before and (full / "full_0.mcap").stat().st_size <= 200_000
     report = replay(full)
@@ -336,9 +336,9 @@ def test_an_invalid_part_is_named_and_the_others_are_read(tmp_path: Path) -> Non
     for part in (parts[0], parts[1], parts[-1]):
         good, samples = part.read_bytes(), examine(part).entries[Sample.__name__]
         part.write_bytes(b"\0" * len(good))
-        found, after = examine(run.folder), replay(run.folder)
-        assert f"{part.name}: not an MCAP file: it cannot be read" in found.problems
-        assert found.entries[Sample.__name__] == after.samples == COUNT - samples
+        report, after = examine(run.folder), replay(run.folder)
+        assert f"{part.name}: not an MCAP file: it cannot be read" in report.problems
+        assert report.entries[Sample.__name__] == after.samples == COUNT - samples
         assert (after.exit_code, after.divergences) == (3, 0) and after.status is FileStatus.DAMAGED
         part.write_bytes(good)
     parts[1].write_bytes(b"no recording")
@@ -380,19 +380,21 @@ def test_a_missing_part_is_counted_and_the_load_has_a_gap_there(which: int, tmp_
     assert not whole.lossy and not read_recording(run.folder)[1]
     RunReader(run.folder).parts[which].unlink()
     for listing in (True, False):  # without a listing, the numbers of the parts show only a missing part in the middle
-        report, found, (facts, lossy) = replay(run.folder), analyse(run.folder), read_recording(run.folder)
+        report, analysis, (facts, lossy) = replay(run.folder), analyse(run.folder), read_recording(run.folder)
         problems = examine(run.folder).problems
         if listing or which == 1:
-            assert report.lost["missing_parts"] == found.losses["missing_parts"] == facts["lost"]["missing_parts"] == 1
-            assert report.exit_code == 3 and found.lossy and lossy
+            assert (
+                report.lost["missing_parts"] == analysis.losses["missing_parts"] == facts["lost"]["missing_parts"] == 1
+            )
+            assert report.exit_code == 3 and analysis.lossy and lossy
             assert (
                 sum("is missing: meta" in problem or "as the part numbers show" in problem for problem in problems) == 1
             )
         (run.folder / "metadata.yaml").unlink(missing_ok=True)
-    assert found.input["samples_used"] == report.samples < COUNT
-    times = np.diff(found.predictions[0].series()[0])
+    assert analysis.input["samples_used"] == report.samples < COUNT
+    times = np.diff(analysis.predictions[0].series()[0])
     assert times.max() == 1_000_000  # no row is missing among the remaining rows
-    assert found.predictions[0].loads.duration_s < whole.predictions[0].loads.duration_s
+    assert analysis.predictions[0].loads.duration_s < whole.predictions[0].loads.duration_s
 
 
 def test_parts_removed_during_reading_are_skipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -430,12 +432,12 @@ def test_estimate_and_forecast_report_missing_parts_and_rows_beyond_the_limit(
     assert newest.lost == {"older_rows": 2 * (COUNT - 100)} and len(newest.poses) == 100
     np.testing.assert_array_equal(newest.load[:, 1:], whole.load[-100:, 1:])
     RunReader(run.folder).parts[1].unlink()
-    found = read_measured(run.folder)
-    assert found.lost["missing_parts"] == 1 and found.unreadable == sum(found.lost.values())
+    recording = read_measured(run.folder)
+    assert recording.lost["missing_parts"] == 1 and recording.unreadable == sum(recording.lost.values())
     capsys.readouterr()
     assert cli(forecast) == 3
-    said = capsys.readouterr()
-    assert json.loads(said.out)["lost"] == {"missing_parts": 1} and "there may be a newer estimate" in said.err
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["lost"] == {"missing_parts": 1} and "there may be a newer estimate" in printed.err
     (empty := tmp_path / "empty").mkdir()
     assert cli(["forecast", str(empty), *forecast[2:]]) == 1 and "got no .mcap file" in capsys.readouterr().err
 
@@ -451,12 +453,12 @@ def test_an_estimate_does_not_interpolate_the_load_over_a_damaged_chunk(tmp_path
     data = bytearray(run.file.read_bytes())
     data[start + length // 2] ^= 0xFF
     run.file.write_bytes(data)
-    found = read_measured(run.folder)
-    apart = np.diff(found.load[:, 0])
-    assert apart.max() == pytest.approx(1e-3, abs=1e-6) and found.lost["damaged_chunks"] == 1
-    kept, aside = len(found.load), found.lost["samples_of_other_stretches"]
+    measured = read_measured(run.folder)
+    apart = np.diff(measured.load[:, 0])
+    assert apart.max() == pytest.approx(1e-3, abs=1e-6) and measured.lost["damaged_chunks"] == 1
+    kept, aside = len(measured.load), measured.lost["samples_of_other_stretches"]
     assert kept > COUNT // 2 and 0 < aside < COUNT - kept and 0.02 < 1e-3 * (COUNT - kept - aside) < 0.5
-    assert found.load[0, 0] > 0.0  # times are counted from the first sample of the whole recording
+    assert measured.load[0, 0] > 0.0  # times are counted from the first sample of the whole recording
 
 
 def test_a_missing_part_of_a_foreign_recording_is_counted(tmp_path: Path) -> None:

@@ -31,8 +31,8 @@ def test_mcap_s_own_reader_in_javascript_finds_every_message(run: Run, tmp_path:
     script = tmp_path / "read_mcap.mjs"
     script.write_bytes(Path(__file__).with_name("read_mcap.mjs").read_bytes())
     install = ["npm", "install", "--no-audit", "--no-fund", "--ignore-scripts", *PACKAGES]
-    done = subprocess.run(install, cwd=tmp_path, capture_output=True, text=True, timeout=200, check=False)
-    if done.returncode != 0:
+    completed = subprocess.run(install, cwd=tmp_path, capture_output=True, text=True, timeout=200, check=False)
+    if completed.returncode != 0:
         pytest.skip("npm's registry does not answer")
     command = ["node", str(script), str(run.file)]
     found = json.loads(subprocess.run(command, capture_output=True, text=True, timeout=100, check=True).stdout)

@@ -559,8 +559,8 @@ def test_only_with_sync_the_recorder_waits_for_the_disk(tmp_path: Path) -> None:
     waited = []
     for sync in (False, True):
         command = writer_command(tmp_path / str(sync), count=20, begin=SYNCS, end="recorder.close()", sync=sync)
-        done = subprocess.run(command, capture_output=True, text=True)
-        lines = [line.split() for line in done.stdout.splitlines() if line.startswith("synced")]
+        completed = subprocess.run(command, capture_output=True, text=True)
+        lines = [line.split() for line in completed.stdout.splitlines() if line.startswith("synced")]
         waited.append({path: int(size) for _, size, path in lines})
     assert not waited[0]
     folder = tmp_path / "True"

@@ -120,9 +120,9 @@ def test_a_changed_output_is_found_and_does_not_affect_the_others(run: Run, tmp_
 
     report = replay(rewrite(run.file, tmp_path / "changed.mcap", change))
     assert report.exit_code == 1 and report.divergences == 1 and report.first_divergence is not None
-    found = report.first_divergence
-    assert (found.step, found.topic, found.field) == (index, "contact_forces", "effort[3]")
-    assert float(found.recorded) == float(found.computed) + 1.0
+    divergence = report.first_divergence
+    assert (divergence.step, divergence.topic, divergence.field) == (index, "contact_forces", "effort[3]")
+    assert float(divergence.recorded) == float(divergence.computed) + 1.0
 
 
 def test_a_flipped_bit_anywhere_in_an_output_is_found(run: Run, tmp_path: Path) -> None:

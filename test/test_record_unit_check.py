@@ -49,10 +49,10 @@ def test_a_wrong_unit_is_refused_with_the_option_that_states_it(
     command = [verb, str(path), "--map", str(tmp_path / "map.yaml"), "--scene", "paper", "--quiet"]
     record = ["--record", str(tmp_path / "run")] if verb == "live" else []
     assert cli([*command, *record]) == 2
-    said = capsys.readouterr().err
+    errors = capsys.readouterr().err
     stated = [part for option in options for part in ("--unit", option)]
     for option in options:
-        assert f"--unit {option}" in said
+        assert f"--unit {option}" in errors
     assert not (tmp_path / "run").exists()  # no empty run remains of a refused start
     assert cli([*command, *stated]) == 0
 

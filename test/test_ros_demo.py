@@ -45,8 +45,8 @@ def test_the_processes_of_the_demo_always_end_with_it(tmp_path: Path) -> None:
         "print(child._process.pid, flush=True)\n"
         "os.kill(os.getpid(), 9)"
     )
-    done = subprocess.run([sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, timeout=110)
-    child = Path("/proc", done.stdout.strip(), "cmdline")
+    completed = subprocess.run([sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, timeout=110)
+    child = Path("/proc", completed.stdout.strip(), "cmdline")
     # the child has ended if its command line is empty (a zombie) or absent
     until(lambda: not child.exists() or not child.read_bytes(), "the end of the child")
 

@@ -539,9 +539,9 @@ def test_two_minutes_of_recording_account_for_every_message_in_constant_memory()
     command = [sys.executable, str(ROOT / "benchmark" / "live_load.py"), "--minutes", "2", "--rate", "500"]
     # a separate ROS domain, because other nodes publish reports too
     environment = os.environ | {"ROS_DOMAIN_ID": "97"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=400.0)
-    rows = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    completed = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=400.0)
+    rows = [json.loads(line) for line in completed.stdout.splitlines() if line.startswith("{")]
+    assert completed.returncode == 0, completed.stdout[-2000:] + completed.stderr[-2000:]
     assert len(rows) >= 10 and all(row["age_p50_ms"] is not None for row in rows[1:-1])
     first, last = rows[2], rows[-1]
     assert (last["threads"], last["files"]) == (first["threads"], first["files"])

@@ -183,7 +183,7 @@ def test_all_bad_parameters_are_named_at_once(tmp_path: Path) -> None:
     settings = [word for item in given for word in ("-p", item)]
     twin = Process("plow_twin.ros.main", ["--ros-args", *settings], tmp_path / "twin.log")
     assert twin.wait() == 2
-    said = twin.output()
+    output = twin.output()
     twin.close()
     for name, got in (
         ("excitation_source", "'drum'"),
@@ -195,10 +195,10 @@ def test_all_bad_parameters_are_named_at_once(tmp_path: Path) -> None:
         ("child_frame_id", "'hhh"),
         ("alarm_wear_rate", "[-1.0, -1.0"),
     ):
-        assert f"{name}: got {got}" in said
-    assert said.count("expected one line of at most 4096 characters") == 2 and len(said) < 4000
-    assert "expected a number from 0 to 3600 [s]" in said
-    assert "Traceback" not in said
+        assert f"{name}: got {got}" in output
+    assert output.count("expected one line of at most 4096 characters") == 2 and len(output) < 4000
+    assert "expected a number from 0 to 3600 [s]" in output
+    assert "Traceback" not in output
 
 
 @pytest.mark.parametrize("program", ["ros.main", "demo.excitation_publisher"])
@@ -206,10 +206,10 @@ def test_arguments_that_ros_cannot_read_are_reported_without_a_traceback(tmp_pat
     path = tmp_path / "missing.yaml"
     process = Process(f"plow_twin.{program}", ["--ros-args", "--params-file", str(path)], tmp_path / "log")
     assert process.wait() == 2
-    said = process.output()
+    output = process.output()
     process.close()
-    assert str(path) in said and "Error opening YAML file" in said
-    assert "Traceback" not in said and "/src/" not in said
+    assert str(path) in output and "Error opening YAML file" in output
+    assert "Traceback" not in output and "/src/" not in output
 
 
 def test_a_parameter_file_with_integers_for_doubles_and_a_typing_error(tmp_path: Path) -> None:
@@ -345,6 +345,8 @@ def test_quality_of_service_of_an_input_can_be_overridden(tmp_path: Path) -> Non
         running.probe.until_figure("input", "refused_publishers", "1", timeout_s=60.0)
         assert value(running.probe.status[-1], "publishers_excitation") == "0"
         running.probe.until(lambda: "nothing is sent to the subscriber" in running.twin.output(), "said")
-        said = running.twin.output()
-        assert f"{publisher.topic_name}: nothing is received from the publisher {node.get_name()}: incompatible" in said
-        assert said.count("is sent to the subscriber") == 1 and f"{subscription.topic_name}: nothing is" in said
+        output = running.twin.output()
+        assert (
+            f"{publisher.topic_name}: nothing is received from the publisher {node.get_name()}: incompatible" in output
+        )
+        assert output.count("is sent to the subscriber") == 1 and f"{subscription.topic_name}: nothing is" in output

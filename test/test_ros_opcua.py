@@ -74,7 +74,7 @@ def test_credentials_of_a_server_come_from_a_file(tmp_path: Path, monkeypatch: p
     assert found == Access("opc.tcp://plant", "plough", "s3cret", **files)
     monkeypatch.setenv("PLOW_TWIN_OPCUA_PASSWORD", "other")
     assert read_access("opc.tcp://plant", None).password == "other"
-    for text, said in (("{password: x}", "password"), ("{plain: 1}", "true or false"), ("[1]", r"got \[1\]")):
+    for text, message in (("{password: x}", "password"), ("{plain: 1}", "true or false"), ("[1]", r"got \[1\]")):
         path.write_text(text)
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=message):
             read_access("opc.tcp://plant", path)

@@ -89,8 +89,8 @@ def test_markers_show_the_head_where_it_is_and_the_forces_on_it(tmp_path: Path) 
 
 def test_without_markers_their_messages_are_not_imported() -> None:
     code = "import sys, plow_twin.ros.main, plow_twin.ros.front; print('visualization_msgs' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"
+    completed = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert completed.stdout.strip() == "False"
 
 
 def test_layouts_name_topics_and_numbers_that_exist() -> None:

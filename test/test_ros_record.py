@@ -77,8 +77,8 @@ def test_other_topics_are_recorded_in_the_run_s_folder_with_their_types(tmp_path
         poses = [store.deserialize_cdr(data, c.msgtype) for c, _, data in reader.messages() if "camera" in c.topic]
         assert [pose.pose.position.x for pose in poses] == list(np.arange(COUNT, dtype=float))
     (tmp_path / "map.yaml").write_text(MAP % namespace)
-    found = analyse(run, mapping=tmp_path / "map.yaml")
-    assert found.comparisons(found.predictions[0])["x"].n == COUNT
+    analysis = analyse(run, mapping=tmp_path / "map.yaml")
+    assert analysis.comparisons(analysis.predictions[0])["x"].n == COUNT
 
 
 def test_a_named_topic_without_a_publisher_is_an_error(tmp_path: Path) -> None:
@@ -87,6 +87,6 @@ def test_a_named_topic_without_a_publisher_is_an_error(tmp_path: Path) -> None:
         assert recorder.stderr is not None
         assert "recording to" in recorder.stderr.readline()
         recorder.send_signal(signal.SIGTERM)
-        said = recorder.stderr.read()
-    assert "/never: not recorded: no publisher, expected one" in said
+        errors = recorder.stderr.read()
+    assert "/never: not recorded: no publisher, expected one" in errors
     assert recorder.returncode == 3

@@ -169,8 +169,8 @@ def test_an_incompatible_peer_is_named_although_its_topics_are_discovered_first(
         assert [connections.publishers(taken) for _ in range(3)] == [([], 0), ([], 1), ([], 0)]
         identity = [2]  # a publisher without a name is reported too
         assert [connections.publishers(taken) for _ in range(2)] == [([], 0), ([], 1)]
-    said = [line for line in capfd.readouterr().err.splitlines() if "nothing is received" in line]
-    assert ["publisher sender: type" in line for line in said] == [True, False]
+    lines = [line for line in capfd.readouterr().err.splitlines() if "nothing is received" in line]
+    assert ["publisher sender: type" in line for line in lines] == [True, False]
 
 
 def test_unsaved_wear_survives_a_cleanup(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

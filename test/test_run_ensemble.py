@@ -76,8 +76,8 @@ def test_a_run_inside_the_callback_of_another_run_changes_no_bit() -> None:
     def run_another(share: float) -> None:
         within.append(simulate(inner, 0.9, 0.1).q)
 
-    found = simulate(scene, 60.0, 0.1, 1e-11, on_progress=run_another)
-    assert within and np.array_equal(found.q, expected.q) and np.array_equal(found.v, expected.v)
+    result = simulate(scene, 60.0, 0.1, 1e-11, on_progress=run_another)
+    assert within and np.array_equal(result.q, expected.q) and np.array_equal(result.v, expected.v)
     assert all(np.array_equal(q, within[0]) for q in within)
 
 

@@ -99,9 +99,9 @@ def test_ctrl_c_ends_a_run_with_the_rows_computed_so_far(fixed: dict[str, object
 def test_the_command_line_writes_the_rows_computed_so_far(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "part.npz"
     code = run(["simulate", "paper", "--t-end", "10", "--max-steps", "100", "--out", str(out), "--json"])
-    told = capsys.readouterr()
-    found = json.loads(told.out)
-    assert code == 1 and "max_steps = 100 reached at t = " in told.err
+    printed = capsys.readouterr()
+    found = json.loads(printed.out)
+    assert code == 1 and "max_steps = 100 reached at t = " in printed.err
     assert found["solver"]["steps"] == 100 and 0.0 < found["t_end"] < 10.0
     with np.load(out) as file:
         assert 0 < len(file["t"]) < 1001 and np.isfinite(file["q"]).all()
@@ -218,20 +218,20 @@ print(json.dumps(told))
 def test_slices_of_lanes_stay_bounded_through_many_short_ones() -> None:
     """A scene at rest leaves its lane repeatedly, so that more than thirty consecutive slices take almost no time."""
     scene = replace(preset("bench_kv"), loads=())
-    found = simulate_many([scene], 1e6, 1e6, 1e-6, workers=1)
-    assert found.status[0] == Status.OK and found.steps[0] > 10_000
+    results = simulate_many([scene], 1e6, 1e6, 1e-6, workers=1)
+    assert results.status[0] == Status.OK and results.steps[0] > 10_000
 
 
 def test_a_process_that_gets_sigint_returns_within_a_slice_of_work() -> None:
     with started([sys.executable, "-c", INTERRUPTED], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None and process.stdout.readline() == "under way\n"
         process.send_signal(signal.SIGINT)
-        told = json.loads(process.communicate(timeout=60)[0])
-    slices = told["slices"]
+        message = json.loads(process.communicate(timeout=60)[0])
+    slices = message["slices"]
     largest = max(after - before for before, after in itertools.pairwise(slices))
     # the run ends after the slice in which the signal arrived; a slice may be four times as large as the previous slice
-    assert 0 <= told["returned"] - told["signalled"] <= 4 * largest
-    assert told["rows"] >= 1
+    assert 0 <= message["returned"] - message["signalled"] <= 4 * largest
+    assert message["rows"] >= 1
 
 
 #: Program that runs the command line, and prints when the motion has begun.
@@ -268,11 +268,11 @@ def test_the_command_that_gets_sigint_writes_the_rows_computed_so_far(tmp_path: 
 
 
 def test_a_notebook_shows_the_contacts_of_a_motion_as_a_table() -> None:
-    found = simulate(preset("paper"), 2.0)
-    shown = found._repr_html_()
+    result = simulate(preset("paper"), 2.0)
+    shown = result._repr_html_()
     root = ElementTree.fromstring(shown)
     rows = [[cell.text or "" for cell in row] for row in root.iter("tr")]
-    assert rows[0][:2] == ["pair", "largest force [kN]"] and [row[0] for row in rows[1:]] == list(found.statistics)
+    assert rows[0][:2] == ["pair", "largest force [kN]"] and [row[0] for row in rows[1:]] == list(result.statistics)
     largest = {row[0]: float(row[1]) for row in rows[1:]}
-    assert largest == pytest.approx({pair: 1e-3 * of["max"] for pair, of in found.statistics.items()}, rel=1e-3)
+    assert largest == pytest.approx({pair: 1e-3 * of["max"] for pair, of in result.statistics.items()}, rel=1e-3)
     assert max(largest.values()) > 50.0 and "2 s of motion" in shown

@@ -61,8 +61,8 @@ def test_the_exponent_of_a_ball_on_a_vibrating_table_is_that_of_its_map() -> Non
 
 def test_the_derivatives_are_finite_differences_of_the_motion() -> None:
     scene = replace(preset("bench_kv"), initial=Initial((0.001, 0.002, 0.003), (0.1, 0.0, 0.2)))
-    found = simulate(scene, 0.5, sensitivity=True).sensitivity
-    assert found is not None
+    result = simulate(scene, 0.5, sensitivity=True).sensitivity
+    assert result is not None
     for column, (name, size) in enumerate(
         [("q", 1e-6), ("q", 1e-6), ("q", 1e-6), ("v", 1e-6), ("v", 1e-6), ("v", 1e-6)]
     ):
@@ -74,7 +74,7 @@ def test_the_derivatives_are_finite_differences_of_the_motion() -> None:
             run = simulate(other, 0.5, tol=1e-12)
             ends.append(np.concatenate([run.q[-1], run.v[-1]]))
         expected = (ends[0] - ends[1]) / (2.0 * size)
-        assert found.from_start[-1][:, column] == pytest.approx(expected, abs=1e-3 * abs(found.from_start[-1]).max())
+        assert result.from_start[-1][:, column] == pytest.approx(expected, abs=1e-3 * abs(result.from_start[-1]).max())
 
 
 @pytest.mark.parametrize("name", ["bench_kv", pytest.param("paper", marks=pytest.mark.stress)])
@@ -147,8 +147,8 @@ def test_the_linearised_equations_agree_with_displaced_motions(name: str, monkey
 def test_a_contact_of_many_stretches_keeps_the_speed_of_its_touch() -> None:
     """In a short motion, the derivatives were wrong by a third: stretches ended within contacts."""
     scene = _law("Hertz with restitution")
-    found = simulate(scene, 0.25, sensitivity=("contact.restitution",)).sensitivity
-    assert found is not None
+    result = simulate(scene, 0.25, sensitivity=("contact.restitution",)).sensitivity
+    assert result is not None
 
     def end(e: float, speed: float) -> np.ndarray:
         (vx, vy, omega), contact = scene.initial.v, replace(scene.contact, restitution=e)
@@ -158,7 +158,7 @@ def test_a_contact_of_many_stretches_keeps_the_speed_of_its_touch() -> None:
 
     by_e, by_speed = end(0.70001, 0.0) - end(0.69999, 0.0), end(0.7, 1e-6) - end(0.7, -1e-6)
     expected = by_e / 2e-5, by_speed / 2e-6
-    derivatives = found.by_parameter["contact.restitution"][-1], found.from_start[-1][:, 3]
+    derivatives = result.by_parameter["contact.restitution"][-1], result.from_start[-1][:, 3]
     for one, other in zip(derivatives, expected, strict=True):
         assert one == pytest.approx(other, abs=1e-3 * np.abs(other).max())
 
@@ -290,8 +290,8 @@ def test_a_live_twin_has_the_derivative_by_restitution_without_damping(e: float)
 def test_a_scene_that_amplifies_gives_a_warning() -> None:
     hard = replace(preset("bench_kv"), contact=Contact("kelvin_voigt", 1e9, damping=1e4))
     with pytest.warns(ToleranceWarning, match=r"an error grows \S+ times, largest Lyapunov exponent"):
-        found = simulate(hard, 2.0, tol=1e-9, sensitivity=True).sensitivity
-    assert found is not None and found.good_until(1e-9) < found.good_until(1e-4) <= 2.0
+        result = simulate(hard, 2.0, tol=1e-9, sensitivity=True).sensitivity
+    assert result is not None and result.good_until(1e-9) < result.good_until(1e-4) <= 2.0
     calm = simulate(preset("bench_kv"), 2.0, sensitivity=True).sensitivity
     assert calm is not None and calm.trusted and calm.good_until(1e-2) == 2.0
     assert simulate(preset("bench_kv"), 2.0).sensitivity is None

@@ -261,8 +261,8 @@ def test_strongly_damped_block_sinks_in_as_deep_as_its_weight_presses() -> None:
     stiffness, start = 1e4, -WALL + 0.5 * SIDE
     damped = Contact("kelvin_voigt", stiffness=stiffness, damping=4e4)
     scene = block(contact=damped, initial=Initial((0.0, start, 0.0), (0.0, 0.0, 0.0)), friction=None)
-    found = simulate(scene, t_end=60.0, output_dt=1.0)
+    result = simulate(scene, t_end=60.0, output_dt=1.0)
     # each corner obeys C x' = m g / 2 - K x, except in the first m / (2 C) = 13 us
-    depth = 0.5 * MASS * 9.81 / stiffness * (1.0 - np.exp(-found.t * stiffness / 4e4))
-    np.testing.assert_allclose(start - found.q[:, 1], depth, atol=2e-7)
-    assert found.solver["steps"] < 2000
+    depth = 0.5 * MASS * 9.81 / stiffness * (1.0 - np.exp(-result.t * stiffness / 4e4))
+    np.testing.assert_allclose(start - result.q[:, 1], depth, atol=2e-7)
+    assert result.solver["steps"] < 2000

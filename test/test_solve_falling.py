@@ -164,8 +164,8 @@ def test_impact_that_contains_the_start_continues_unchanged() -> None:
     run = simulate(whole, t_end=3e-4, output_dt=1e-6, energy_balance=True)
     inside = int(np.argmax(run.penetration[:, 6] > 1e-5))
     begun = replace(whole, initial=Initial(tuple(run.q[inside]), tuple(run.v[inside])))  # type: ignore[arg-type]
-    found = simulate(begun, t_end=0.01, output_dt=1e-3, energy_balance=True)
-    assert found.v[-1, 1] == pytest.approx(3.0 * E * 30.0**-FALL, abs=2e-4)
+    result = simulate(begun, t_end=0.01, output_dt=1e-3, energy_balance=True)
+    assert result.v[-1, 1] == pytest.approx(3.0 * E * 30.0**-FALL, abs=2e-4)
 
 
 def test_block_with_a_falling_restitution_agrees_with_an_independent_integration() -> None:
@@ -184,11 +184,11 @@ def test_block_with_a_falling_restitution_agrees_with_an_independent_integration
         return [vx, vy, omega, 0.0, normal / MASS - 9.81, ax * normal / INERTIA]
 
     only = replace(scene, pairs=("bottom_left_bottom",))
-    found = simulate(only, t_end=0.006, output_dt=1e-3, tol=1e-9, energy_balance=True)
+    result = simulate(only, t_end=0.006, output_dt=1e-3, tol=1e-9, energy_balance=True)
     z0 = [*scene.initial.q, *scene.initial.v]
     reference = solve_ivp(rate, (0.0, 0.006), z0, "DOP853", rtol=1e-10, atol=1e-12, max_step=1e-6)
     # the touch follows a flight of a microsecond, in which weight and rotation change the speed slightly
-    assert (np.abs(found.v[-1] - reference.y[3:, -1]) < [1e-3, 1e-3, 0.05]).all()
+    assert (np.abs(result.v[-1] - reference.y[3:, -1]) < [1e-3, 1e-3, 0.05]).all()
 
 
 def test_live_twin_and_batch_have_the_motion_of_the_run() -> None:

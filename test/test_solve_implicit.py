@@ -129,10 +129,10 @@ def test_growth_while_dampers_hold_the_head_is_reported() -> None:
     """Rest on two corners at a depth of 1e-8 m amplifies rounding errors, but not during the whole rest."""
     scene = replace(BENCH, contact=overdamped("kelvin_voigt", 1e11), friction=Friction(0.2, 0.02))
     with pytest.warns(ToleranceWarning, match=r"an error grows \S+ times"):
-        found = simulate(scene, 1.77, output_dt=0.01, sensitivity=True)
-    assert found.sensitivity is not None and 1e4 < found.sensitivity.growth[-1] < 1e6
+        result = simulate(scene, 1.77, output_dt=0.01, sensitivity=True)
+    assert result.sensitivity is not None and 1e4 < result.sensitivity.growth[-1] < 1e6
     exact = simulate(scene, 1.77, output_dt=0.01, tol=1e-12)
-    assert 10.0 < pose_error(scene, found.q, exact.q) / 1e-9 < found.sensitivity.growth[-1]
+    assert 10.0 < pose_error(scene, result.q, exact.q) / 1e-9 < result.sensitivity.growth[-1]
 
 
 @pytest.mark.parametrize(("law", "damping"), [("exact_restitution", 0.05), ("hunt_crossley", 1e8)])

@@ -195,21 +195,21 @@ def test_many_random_scenes_move_as_in_the_loop_of_a_single_scene(seed: int, pow
 
 @pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-9])
 def test_the_bench_scene_meets_its_reference_with_every_event(tol: float) -> None:
-    found, exact = simulate_many([preset("bench_kv")], 20.0, 0.1, tol), reference("bench_kv")
+    results, exact = simulate_many([preset("bench_kv")], 20.0, 0.1, tol), reference("bench_kv")
     stride = round(0.1 / (exact["t"][1] - exact["t"][0]))
-    assert pose_error(preset("bench_kv"), found.q[0], exact["q"][::stride]) < 10.0 * tol
-    assert found.events[0] == 366 and found.makes.sum() == 120
+    assert pose_error(preset("bench_kv"), results.q[0], exact["q"][::stride]) < 10.0 * tol
+    assert results.events[0] == 366 and results.makes.sum() == 120
     # a CLIPPED pair that separates changes no force, so its event ends no step
-    assert found.steps[0] < 0.95 * simulate(preset("bench_kv"), 20.0, 0.1, tol=tol).solver["steps"]
+    assert results.steps[0] < 0.95 * simulate(preset("bench_kv"), 20.0, 0.1, tol=tol).solver["steps"]
 
 
 @pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-9])
 def test_the_bench_scene_with_exponent_one_and_a_half_meets_its_reference_with_every_event(tol: float) -> None:
     scene, exact = preset("bench_hc"), reference("bench_hc")
-    found, alone = simulate_many([scene], 20.0, 0.1, tol), simulate(scene, 20.0, 0.1, tol=tol)
+    results, alone = simulate_many([scene], 20.0, 0.1, tol), simulate(scene, 20.0, 0.1, tol=tol)
     stride = round(0.1 / (exact["t"][1] - exact["t"][0]))
-    assert pose_error(scene, found.q[0], exact["q"][::stride]) < 10.0 * tol
-    assert found.events[0] == len(alone.events) and found.steps[0] < alone.solver["steps"]
+    assert pose_error(scene, results.q[0], exact["q"][::stride]) < 10.0 * tol
+    assert results.events[0] == len(alone.events) and results.steps[0] < alone.solver["steps"]
 
 
 @pytest.mark.parametrize("build", [fallen, swaying])

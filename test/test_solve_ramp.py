@@ -126,8 +126,8 @@ def test_a_clipped_pair_does_not_push_before_its_time() -> None:
     )  # fmt: skip
     exact = simulate(scene, 1.0, output_dt=0.005, tol=1e-12)
     for tol in (1e-4, 1e-6, 1e-8, 1e-10):
-        found = simulate(scene, 1.0, output_dt=0.005, tol=tol)
-        assert pose_error(scene, found.q, exact.q) < 0.1 * tol
+        result = simulate(scene, 1.0, output_dt=0.005, tol=tol)
+        assert pose_error(scene, result.q, exact.q) < 0.1 * tol
 
 
 @pytest.mark.parametrize(

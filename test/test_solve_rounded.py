@@ -91,12 +91,12 @@ def on_table(t: float, z: np.ndarray) -> list[float]:
 def test_rounded_block_agrees_with_an_independent_integration_of_four_discs() -> None:
     # the friction moves nothing; with it, the kernels of the tests below are used
     scene = block(friction=replace(STICK, coefficient=1e-12), contact=ELASTIC)
-    found = simulate(scene, t_end=0.4, output_dt=0.004, tol=1e-9, energy_balance=True)
+    result = simulate(scene, t_end=0.4, output_dt=0.004, tol=1e-9, energy_balance=True)
     reference = solve_ivp(
-        on_table, (0.0, 0.4), [0.0, -0.85, 0.3, 0.4, 0.0, 6.0], "DOP853", found.t, rtol=1e-9, atol=1e-11, max_step=1e-4
+        on_table, (0.0, 0.4), [0.0, -0.85, 0.3, 0.4, 0.0, 6.0], "DOP853", result.t, rtol=1e-9, atol=1e-11, max_step=1e-4
     )
-    np.testing.assert_allclose(found.q, reference.y[:3].T, atol=1e-6)
-    assert abs(found.q[-1, 2]) > 1.0, "the block turns over a corner"
+    np.testing.assert_allclose(result.q, reference.y[:3].T, atol=1e-6)
+    assert abs(result.q[-1, 2]) > 1.0, "the block turns over a corner"
 
 
 def test_disc_of_rounded_corners_rolls_without_sliding() -> None:
@@ -110,12 +110,12 @@ def test_disc_of_rounded_corners_rolls_without_sliding() -> None:
         loads=(Constant("push", (push, 0.0)),),
         initial=Initial(q=(0.0, -1.0 + 0.5 * SIDE, 0.0)),
     )
-    found = simulate(disc, t_end=0.6, output_dt=0.01, energy_balance=True)
-    expected = 0.5 * push / (MASS + inertia / radius**2) * found.t**2
-    np.testing.assert_allclose(found.q[:, 0], expected, atol=1e-5)
-    np.testing.assert_allclose(found.q[:, 2], -expected / radius, atol=1e-3)
+    result = simulate(disc, t_end=0.6, output_dt=0.01, energy_balance=True)
+    expected = 0.5 * push / (MASS + inertia / radius**2) * result.t**2
+    np.testing.assert_allclose(result.q[:, 0], expected, atol=1e-5)
+    np.testing.assert_allclose(result.q[:, 2], -expected / radius, atol=1e-3)
     # the disc has rolled by more than a quarter turn
-    assert found.q[-1, 2] < -1.6
+    assert result.q[-1, 2] < -1.6
 
 
 def pairings(*quick: str) -> pytest.MarkDecorator:

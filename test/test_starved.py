@@ -36,7 +36,7 @@ def _run(
 ) -> tuple[int, list[str]]:
     """Run a command under a shortage. Return its exit code and the lines of its standard error."""
     given = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "10000", **environment}
-    done = subprocess.run(
+    completed = subprocess.run(
         [*within, sys.executable, "-m", "plow_twin", *words],
         cwd=folder,
         env={name: value for name, value in given.items() if value is not None},
@@ -46,7 +46,7 @@ def _run(
         text=True,
         check=False,
     )
-    return done.returncode, done.stderr.splitlines()
+    return completed.returncode, completed.stderr.splitlines()
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +119,7 @@ def test_a_recording_in_progress_is_replayed_up_to_its_end(folder: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("lacking", "code", "said"),
+    ("lacking", "code", "message"),
     [
         ({"before": _limit(AS=150_000_000)}, 1, "a library cannot be loaded"),
         ({"before": _limit(FSIZE=0)}, 1, "File too large"),
@@ -128,9 +128,9 @@ def test_a_recording_in_progress_is_replayed_up_to_its_end(folder: Path) -> None
     ],
     ids=["150 MB of addresses", "no room for a file", "100 kB for a file", "no compiled code"],
 )
-def test_lacking_resources_are_named(lacking: dict[str, object], code: int, said: str, folder: Path) -> None:
+def test_lacking_resources_are_named(lacking: dict[str, object], code: int, message: str, folder: Path) -> None:
     found, lines = _run(folder, *LIVE, **lacking)  # type: ignore[arg-type]
-    assert found == code and said in lines[0], lines
+    assert found == code and message in lines[0], lines
     assert len(lines) <= (2 if code == 3 else 1), lines  # a loss (exit code 3) may add a second line
 
 
@@ -171,19 +171,19 @@ def test_a_missing_library_is_named_with_its_extra(tmp_path: Path) -> None:
     (tmp_path / "load.parquet").write_bytes(b"PAR1")
     (tmp_path / "map.yaml").write_text("excitation: {topic: a, fields: {fx: x, fy: y, m: m}}\n")
     (tmp_path / "nodes.yaml").write_text("excitation: {fx: {node: i=1}, fy: {node: i=2}, m: {node: i=3}}\n")
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", f"NEEDING = {NEEDING!r}\n{WITHOUT}"],
         cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "10000"},
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False,
     )  # fmt: skip
-    said = [line for line in done.stderr.splitlines() if not line.startswith("OK status")]
+    errors = [line for line in completed.stderr.splitlines() if not line.startswith("OK status")]
     expected = [
         [f"needs {module}, which is not installed: pip install 'plow_twin[{EXTRA_OF_MODULE[module]}]'",
          f"ended {module} 1 False"]
         for module in NEEDING
     ]  # fmt: skip
-    assert len(said) == 2 * len(NEEDING), said
-    for part, line in zip((part for both in expected for part in both), said, strict=True):
+    assert len(errors) == 2 * len(NEEDING), errors
+    for part, line in zip((part for both in expected for part in both), errors, strict=True):
         assert part in line
 
 
@@ -191,8 +191,8 @@ def test_two_runs_into_one_folder_are_both_complete(folder: Path) -> None:
     words = [sys.executable, "-m", "plow_twin", *LIVE]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     runs = [subprocess.Popen(words, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True) for _ in range(2)]
-    said = [run.communicate()[1] for run in runs]
-    assert [run.returncode for run in runs] == [0, 0], said
+    output = [run.communicate()[1] for run in runs]
+    assert [run.returncode for run in runs] == [0, 0], output
     found = sorted(folder.glob("run*"))
-    assert len(found) == 2 and any("is not empty" in text for text in said), (found, said)
+    assert len(found) == 2 and any("is not empty" in text for text in output), (found, output)
     assert [(replay(run).exit_code, replay(run).samples) for run in found] == [(0, 1500)] * 2

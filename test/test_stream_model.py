@@ -135,7 +135,7 @@ def test_setting_the_same_model_has_no_effect() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"contact.damping": 0.0}, "configure the node again"),
         ({"contact.restitution": 0.4}, "the scene has no restitution"),
@@ -146,12 +146,12 @@ def test_setting_the_same_model_has_no_effect() -> None:
     ],
 )
 def test_an_impossible_change_while_the_twin_runs_is_refused_without_effect(
-    changes: dict[str, float], said: str
+    changes: dict[str, float], message: str
 ) -> None:
     bench = Bench(PAPER)
     bench.send(0, 10)
     count = len(bench.journal)
-    with pytest.raises(ArgumentError, match=said):
+    with pytest.raises(ArgumentError, match=message):
         bench.driver.set_model(T0, changes)
     assert len(bench.journal) == count and bench.session.changes == {}
     assert changed_scene(PAPER, {}) == PAPER

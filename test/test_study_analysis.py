@@ -42,8 +42,8 @@ from plow_twin.study.analysis.signals import LARGEST_LAG_S, compare
 BEST_FIT = PAPER.with_name("paper_best_fit.yaml")
 
 
-def check(found: Analysis, bias: tuple[float, ...] = BIAS) -> None:
-    signals = found.comparisons(found.predictions[0])
+def check(analysis: Analysis, bias: tuple[float, ...] = BIAS) -> None:
+    signals = analysis.comparisons(analysis.predictions[0])
     assert set(signals) == {"x", "y", "theta"}
     for name, expected in zip(signals, bias, strict=True):
         signal = signals[name]
@@ -55,9 +55,9 @@ def check(found: Analysis, bias: tuple[float, ...] = BIAS) -> None:
 @pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
 def test_an_analysis_of_a_bag_finds_bias_and_lag_and_writes_a_run(plugin: StoragePlugin, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", motion(), plugin)
-    found = analyse(bag, scene=PAPER, mapping=tmp_path / "map.yaml", out=tmp_path / "out")
-    check(found)
-    assert found.input == {"samples_in": COUNT, "samples_used": COUNT} and not found.lossy
+    analysis = analyse(bag, scene=PAPER, mapping=tmp_path / "map.yaml", out=tmp_path / "out")
+    check(analysis)
+    assert analysis.input == {"samples_in": COUNT, "samples_used": COUNT} and not analysis.lossy
     assert RunReader(tmp_path / "out" / "run").duration_s() == pytest.approx(COUNT * 1e-3, abs=0.01)
     report = replay(tmp_path / "out" / "run")
     assert (report.exit_code, report.samples, report.digests_compared) == (0, COUNT, COUNT // 100 + 1)
@@ -73,8 +73,8 @@ def test_csv_files_are_read_by_their_columns(tmp_path: Path) -> None:
         rows = csv.writer(stream)
         rows.writerow(["t", "x", "y", "theta"])
         rows.writerows([t, q[0], "", q[2]] for t, q in measured(motion()))
-    found = analyse(tmp_path, scene=PAPER)
-    signals = found.comparisons(found.predictions[0])
+    analysis = analyse(tmp_path, scene=PAPER)
+    signals = analysis.comparisons(analysis.predictions[0])
     assert set(signals) == {"x", "theta"}  # the cells of y are empty, so y was not measured
     assert signals["x"].lag_s == pytest.approx(LAG_S, abs=0.004)
 
@@ -86,30 +86,30 @@ def test_values_of_another_clock_and_impossible_ones_are_counted(tmp_path: Path)
     poses = [(0.01 + 0.01 * n, [n * 1e-5, 0.0, 0.0]) for n in range(40)]
     poses[7][1][0] = 1e200
     pose.write_text("t,x,y,theta\n" + "".join(f"{t},{x},{y},{theta}\n" for t, (x, y, theta) in poses))
-    found = analyse(tmp_path, scene=PAPER)
-    assert found.lost == {"measured_implausible": 1} and found.lossy
-    facts = json.loads(json.dumps(found.facts(), allow_nan=False))
-    assert facts["signals"]["x"]["n"] == 39 and facts["lost"] == found.lost
+    analysis = analyse(tmp_path, scene=PAPER)
+    assert analysis.lost == {"measured_implausible": 1} and analysis.lossy
+    facts = json.loads(json.dumps(analysis.facts(), allow_nan=False))
+    assert facts["signals"]["x"]["n"] == 39 and facts["lost"] == analysis.lost
     assert "outside" not in facts
     late = ((t + 0.3, x, "", "") if t < 0.3 else (t + 1e6, "", y, "") for t, (x, y, _) in poses)
     pose.write_text("t,x,y,theta\n" + "".join(f"{t},{x},{y},{theta}\n" for t, x, y, theta in late))
-    found = analyse(tmp_path, scene=PAPER, out=tmp_path / "out")
-    assert found.facts()["outside"] == {"x": 10, "y": 11} and found.facts()["signals"]["x"]["n"] == 18
+    analysis = analyse(tmp_path, scene=PAPER, out=tmp_path / "out")
+    assert analysis.facts()["outside"] == {"x": 10, "y": 11} and analysis.facts()["signals"]["x"]["n"] == 18
     # no value of y is within the time of the load
-    assert found.lost == {"measured_implausible": 1, "measured_outside_the_load": 11}
-    write_report(found, tmp_path / "out")
+    assert analysis.lost == {"measured_implausible": 1, "measured_outside_the_load": 11}
+    write_report(analysis, tmp_path / "out")
     assert "outside the time of the load" in (tmp_path / "out" / "report.html").read_text()
     pose.write_text("t,x,y,theta\n" + "".join(f"{t + 1e6},{0},{y},{theta}\n" for t, (_, y, theta) in poses))
-    found = analyse(tmp_path, scene=PAPER)
-    assert found.lost == {"measured_outside_the_load": 120} and found.lossy and found.facts()["signals"] == {}
+    analysis = analyse(tmp_path, scene=PAPER)
+    assert analysis.lost == {"measured_outside_the_load": 120} and analysis.lossy and analysis.facts()["signals"] == {}
 
 
 def test_other_scenes_are_predicted_in_the_same_pass(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", motion(), StoragePlugin.MCAP)
     words = ["analyse", bag, "--scene", "paper", "--with", BEST_FIT, "--map", tmp_path / "map.yaml"]
-    done = plow_twin(*words, "--out", tmp_path / "out", "--json")
-    assert done.returncode == 0, done.stderr
-    facts = json.loads(done.stdout)
+    completed = plow_twin(*words, "--out", tmp_path / "out", "--json")
+    assert completed.returncode == 0, completed.stderr
+    facts = json.loads(completed.stdout)
     assert set(facts["signals"]["x"]) >= {"n", "bias", "rms", "correlation", "lag_s"}
     assert facts["with"][0]["scene"] == str(BEST_FIT)
     assert facts["with"][0]["signals"]["x"]["rms"] != facts["signals"]["x"]["rms"]
@@ -123,17 +123,21 @@ def test_other_scenes_are_predicted_in_the_same_pass(tmp_path: Path) -> None:
 
 def test_a_run_of_plow_twin_is_analysed_from_its_journal(tmp_path: Path) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(1000)), frame_every=10**9)
-    found = analyse(run.folder)
-    assert found.input == {"samples_used": 1000} and not found.lossy and not found.comparisons(found.predictions[0])
-    assert found.predictions[0].loads.duration_s == pytest.approx(0.999)
+    analysis = analyse(run.folder)
+    assert (
+        analysis.input == {"samples_used": 1000}
+        and not analysis.lossy
+        and not analysis.comparisons(analysis.predictions[0])
+    )
+    assert analysis.predictions[0].loads.duration_s == pytest.approx(0.999)
 
 
 def test_poses_in_the_journal_are_measurements(tmp_path: Path) -> None:
     entries: list[Entry] = [paper_sample(index) for index in range(500)]
     entries[20::21] = [Pose(BASE_NS + index * STEP_NS, (1e-3, 2e-3, 3e-3)) for index in range(20, 500, 21)]
     run = record_run(tmp_path / "run", entries)
-    found = analyse(run.folder)
-    assert {name: one.n for name, one in found.comparisons(found.predictions[0]).items()} == dict.fromkeys(
+    analysis = analyse(run.folder)
+    assert {name: one.n for name, one in analysis.comparisons(analysis.predictions[0]).items()} == dict.fromkeys(
         ("x", "y", "theta"), len(range(20, 500, 21))
     )
 
@@ -171,11 +175,11 @@ def test_late_samples_of_a_run_are_inserted_at_their_stamps(tmp_path: Path) -> N
     samples = [*map(paper_sample, range(1000))]
     entries: list[Entry] = sorted(samples, key=lambda one: (n := one.stamp_ns - BASE_NS) + 5.5 * STEP_NS * (n % 7 == 3))
     entries[500:500] = [Pose(BASE_NS, (0.0, 0.0, 0.0))] * 3
-    found = analyse(record_run(tmp_path / "run", entries, frame_every=10**9, rollback_span_s=1.0).folder)
-    assert found.input == {"samples_used": 1000} and not found.lost
+    analysis = analyse(record_run(tmp_path / "run", entries, frame_every=10**9, rollback_span_s=1.0).folder)
+    assert analysis.input == {"samples_used": 1000} and not analysis.lost
     twin = Twin(load_scene(PAPER), excitation="sampled")
     series = twin.advance_samples(1e-3 * np.arange(1000), np.array([sample.wrench for sample in samples]))
-    assert found.predictions[0].loads.impulse == pytest.approx(series.impulse.sum(axis=0), rel=1e-9)
+    assert analysis.predictions[0].loads.impulse == pytest.approx(series.impulse.sum(axis=0), rel=1e-9)
 
 
 def test_a_measured_gap_is_compared_with_the_distance_to_the_wall(tmp_path: Path) -> None:
@@ -185,8 +189,8 @@ def test_a_measured_gap_is_compared_with_the_distance_to_the_wall(tmp_path: Path
     gap = np.column_stack([load[:, 0], 1e-3 - penetration[:, pair]])  # the gap is too large by 1 mm
     for name, rows, header in (("load", load, "t,fx,fy,m"), ("gaps", gap, "t,top_right_right")):
         np.savetxt(tmp_path / f"{name}.csv", rows, delimiter=",", header=header, comments="")
-    found = analyse(tmp_path, scene=PAPER)
-    signal = found.comparisons(found.predictions[0])["gap_top_right_right"]
+    analysis = analyse(tmp_path, scene=PAPER)
+    signal = analysis.comparisons(analysis.predictions[0])["gap_top_right_right"]
     assert signal.bias == pytest.approx(-1e-3, abs=1e-6) and signal.correlation == pytest.approx(1.0, abs=1e-6)
 
 
@@ -197,11 +201,11 @@ def test_messages_beside_a_run_that_do_not_fit_are_counted_by_topic(tmp_path: Pa
         connection = writer.add_connection("/pose", "geometry_msgs/msg/PoseStamped", typestore=STORE)
         for number, (_, data) in enumerate(messages):
             writer.write(connection, BASE_NS + number * 10**7, data)
-    found = analyse(run.folder)
-    assert found.lost == {"unfit, head_pose: /pose has stamps of 0": 1}
+    analysis = analyse(run.folder)
+    assert analysis.lost == {"unfit, head_pose: /pose has stamps of 0": 1}
     (mapping := tmp_path / "map.yaml").write_text("head_pose: {topic: /pose, fields: {x: pose.x}}")
-    found = analyse(run.folder, mapping=mapping)
-    assert found.lost == {"unfit, head_pose: /pose has no number at 'pose.x' for x": 10} and found.lossy
+    analysis = analyse(run.folder, mapping=mapping)
+    assert analysis.lost == {"unfit, head_pose: /pose has no number at 'pose.x' for x": 10} and analysis.lossy
 
 
 def test_a_partial_recording_beside_a_run_is_read_as_far_as_it_goes_and_its_loss_counted(tmp_path: Path) -> None:
@@ -219,23 +223,26 @@ def test_a_partial_recording_beside_a_run_is_read_as_far_as_it_goes_and_its_loss
     writer.lost["/pose"] = 7  # a loss that the recorder has counted, for example on a full disk
     writer.close()
     counted = {"truncated_files": 1, "damaged_files": 1, "/pose": 7}
-    found = analyse(run.folder)
-    assert found.lost == counted and found.comparisons(found.predictions[0])["x"].n == 90
+    analysis = analyse(run.folder)
+    assert analysis.lost == counted and analysis.comparisons(analysis.predictions[0])["x"].n == 90
     assert read_recording(run.folder).lost == counted
     writer.path.write_bytes(writer.path.read_bytes()[:8000])
-    found = analyse(run.folder)
-    assert found.lost == {**counted, "truncated_files": 2} and 10 < found.comparisons(found.predictions[0])["x"].n < 90
+    analysis = analyse(run.folder)
+    assert (
+        analysis.lost == {**counted, "truncated_files": 2}
+        and 10 < analysis.comparisons(analysis.predictions[0])["x"].n < 90
+    )
 
 
 def test_a_unit_of_stamps_that_would_be_left_out_is_refused(tmp_path: Path) -> None:
     (tmp_path / "load.csv").write_text("zeit,fx,fy,m\n" + "".join(f"{t},0,0,0\n" for t in range(100)))
     mapping = tmp_path / "map.yaml"
-    for stamp, said in (
+    for stamp, message in (
         ("", "with the name of its column: the columns zeit, fx, fy, m have none of"),
         ("stamp: log, ", "none"),
     ):
         mapping.write_text(f"excitation: {{topic: load, {stamp}stamp_unit: ms}}")
-        with pytest.raises(RecordingError, match=f"excitation.stamp_unit: got 'ms', expected .*{said}"):
+        with pytest.raises(RecordingError, match=f"excitation.stamp_unit: got 'ms', expected .*{message}"):
             analyse(tmp_path, scene=PAPER, mapping=mapping)
     mapping.write_text("excitation: {topic: load, stamp: zeit, stamp_unit: ms}")
     assert analyse(tmp_path, scene=PAPER, mapping=mapping).predictions[0].loads.duration_s == pytest.approx(0.099)
@@ -313,19 +320,19 @@ def test_the_lag_is_found_at_any_rate_of_the_sensor(rate_hz: int, times_each: in
         return np.asarray(np.sin(2.0 * at) + 0.2 * np.abs(np.sin(7.0 * at)) + 0.3 * at)
 
     at = np.repeat(np.arange(0.0, 3.0, 1.0 / rate_hz), times_each)
-    found = compare(t, signal(t), at, signal(at - lag_s))
-    assert found is not None and found.lag_s == pytest.approx(lag_s, abs=2e-4)
-    assert found.rms_aligned == pytest.approx(0.0, abs=1e-3)
+    comparison = compare(t, signal(t), at, signal(at - lag_s))
+    assert comparison is not None and comparison.lag_s == pytest.approx(lag_s, abs=2e-4)
+    assert comparison.rms_aligned == pytest.approx(0.0, abs=1e-3)
 
 
 def test_lag_and_correlation_stay_within_their_bounds() -> None:
     t = np.arange(0.0, 40.0, 0.01)
     predicted = np.sin(2.0 * np.pi * t / 2.06)
     for factor in (-1.0, 1.1, 1.3):
-        found = compare(t, predicted, t[::2], factor * predicted[::2])
-        assert found is not None and found.lag_s is not None and found.correlation is not None
-        assert abs(found.lag_s) <= LARGEST_LAG_S and abs(found.correlation) <= 1.0
-        assert found.coherence is not None and found.coherence <= 1.0
+        comparison = compare(t, predicted, t[::2], factor * predicted[::2])
+        assert comparison is not None and comparison.lag_s is not None and comparison.correlation is not None
+        assert abs(comparison.lag_s) <= LARGEST_LAG_S and abs(comparison.correlation) <= 1.0
+        assert comparison.coherence is not None and comparison.coherence <= 1.0
 
 
 def test_duty_is_a_share_of_time_at_any_sampling_rate(tmp_path: Path) -> None:
@@ -429,8 +436,8 @@ def test_speeds_act_at_the_stamps_that_the_mapping_reads(
     rows = [f"{first + ',' if first else ''}{(t + clock) * scale},{speed}\n" for t, speed in speeds]
     (tmp_path / "travel.csv").write_text(header + "\n" + "".join(rows))
     (tmp_path / "map.yaml").write_text(f"excitation: {{topic: load}}\ntravel: {{topic: travel, {stamp}}}\n")
-    found = analyse(tmp_path, scene=PAPER, mapping=tmp_path / "map.yaml")
-    passes = [(item.start_s, item.end_s, item.start_m, item.end_m) for item in found.predictions[0].loads.passes]
+    analysis = analyse(tmp_path, scene=PAPER, mapping=tmp_path / "map.yaml")
+    passes = [(item.start_s, item.end_s, item.start_m, item.end_m) for item in analysis.predictions[0].loads.passes]
     expected = [(0.0, 3.0, 0.0, 3.0), (3.0, 5.0, 3.0, 1.0), (5.0, 8.0, 1.0, 7.0)]
     assert len(passes) == 3
     for one, known in zip(passes, expected, strict=True):
@@ -447,15 +454,15 @@ def test_late_repeated_and_non_finite_samples_are_counted_as_in_a_live_run(tmp_p
         connection = writer.add_connection("/excitation", "geometry_msgs/msg/WrenchStamped", typestore=STORE)
         for index, (stamp, wrench) in enumerate(arrivals):
             writer.write(connection, BASE_NS + index * STEP_NS, wrench_message(stamp, wrench))
-    found = analyse(tmp_path / "bag", scene=PAPER)
-    assert found.input == {
+    analysis = analyse(tmp_path / "bag", scene=PAPER)
+    assert analysis.input == {
         "samples_in": 201,
         "samples_used": 198,
         "dropped_non_finite": 1,
         "dropped_duplicate": 1,
         "dropped_out_of_order": 1,
     }
-    assert found.lossy
+    assert analysis.lossy
 
 
 def mutate(data: bytes, rng: random.Random) -> bytes:

@@ -64,8 +64,8 @@ def from_recording(
     return calibrate(space(), objective, seed=7, starts=starts, search=search), objective
 
 
-def errors(found: Calibration) -> list[float]:
-    return [max(abs(start.values[path] / true - 1.0) for path, true in TRUTH.items()) for start in found.starts]
+def errors(calibration: Calibration) -> list[float]:
+    return [max(abs(start.values[path] / true - 1.0) for path, true in TRUTH.items()) for start in calibration.starts]
 
 
 def test_known_parameters_are_recovered_from_every_random_start() -> None:
@@ -126,9 +126,13 @@ def figures(seconds: float) -> TargetSet:
 
 def test_known_parameters_are_recovered_from_published_figures() -> None:
     objective = TargetObjective(preset("paper"), figures(3.0))
-    found = calibrate(space(), objective, seed=3, starts=1, search=Search(screen=200, population=24, generations=30))
-    assert min(errors(found)) < 1e-5
-    assert found.best.objective < 1e-6 and all(abs(r) < 1e-3 for r in objective.unweighted(found.best.values))
+    calibration = calibrate(
+        space(), objective, seed=3, starts=1, search=Search(screen=200, population=24, generations=30)
+    )
+    assert min(errors(calibration)) < 1e-5
+    assert calibration.best.objective < 1e-6 and all(
+        abs(r) < 1e-3 for r in objective.unweighted(calibration.best.values)
+    )
 
 
 def test_the_command_fits_a_recording_and_marks_the_fitted_numbers(
@@ -188,8 +192,10 @@ def test_a_recording_of_the_node_provides_its_load(tmp_path: Path) -> None:
     scene = replace(preset("paper"), loads=(poses.load,))
     objective = RecordingObjective(scene, poses)
     unknowns = Space((parse_unknown("contact.stiffness=3e6:3e7:log", scene),))
-    found = calibrate(unknowns, objective, seed=1, starts=1, search=Search(screen=20, population=6, generations=4))
-    assert found.best.values["contact.stiffness"] == pytest.approx(preset("paper").contact.stiffness, rel=1e-4)
+    calibration = calibrate(
+        unknowns, objective, seed=1, starts=1, search=Search(screen=20, population=6, generations=4)
+    )
+    assert calibration.best.values["contact.stiffness"] == pytest.approx(preset("paper").contact.stiffness, rel=1e-4)
 
 
 def test_targets_are_judged_by_their_rules(tmp_path: Path) -> None:

@@ -107,8 +107,8 @@ def test_windows_with_a_stretch_without_samples_are_left_out_and_named(runs: tup
         begins = (windows.start_ns - BASE_NS) // 10**9
         left_out = {first // 1000, end // 1000}
         assert set(range(SECONDS)) - set(begins.tolist()) == left_out and windows.silent == len(left_out)
-        found = compare([("monday", windows_of(read_recording(runs[0].folder), 1.0)), ("tuesday", windows)])
-        assert f"tuesday: {windows.silent} windows with a stretch without samples were left out" in found.notes
+        comparison = compare([("monday", windows_of(read_recording(runs[0].folder), 1.0)), ("tuesday", windows)])
+        assert f"tuesday: {windows.silent} windows with a stretch without samples were left out" in comparison.notes
     with pytest.raises(RecordingError, match="got a silence in each window"):
         samples = (paper_sample(1000 * second + index) for second in range(SECONDS) for index in range(10))
         windows_of(read_recording(record_run(tmp_path / "bursts", samples).folder), 1.0)
@@ -301,9 +301,9 @@ def test_overlapping_runs_other_rates_and_other_scenes_are_named(runs: tuple[Run
     monday, tuesday = (windows_of(read_recording(run.folder), 0.5) for run in runs)
     later = replace(monday, start_ns=monday.start_ns + 86_400 * 10**9, rate_hz=monday.rate_hz / 2)
     named = {name: (name, name) for name in ("a", "b", "c")}
-    found = compare([("a", monday), ("b", tuesday), ("c", later)], by_time("day"), scenes=named)
-    assert [len(group.start_ns) for group in found.groups.values()] == [2 * SECONDS, 2 * SECONDS]
-    twice, rates, scenes = found.notes
+    comparison = compare([("a", monday), ("b", tuesday), ("c", later)], by_time("day"), scenes=named)
+    assert [len(group.start_ns) for group in comparison.groups.values()] == [2 * SECONDS, 2 * SECONDS]
+    twice, rates, scenes = comparison.notes
     assert twice == "b: 16 of 16 windows in 2027-01-15 left out: a covers their time"
     assert rates.endswith("them: a 1000 Hz, b 1000 Hz, c 500 Hz") and scenes.endswith("its description: a a, b b, c c")
 
@@ -313,7 +313,7 @@ def test_names_of_pads_are_complete_in_eighty_columns(runs: tuple[Run, Run], mon
     monkeypatch.setattr(compare_verb, "output_console", lambda: PlainConsole(file=text, width=80))
     shares = dict(zip(QUANTITIES, (-0.999, 0.9994, 1.0, 12.34, -1.0, -1e-17), strict=True))
     cells = {name: Change(share, -1.0, 1.0, 0.0, share, -1.0, 1.0, 0.0) for name, share in shares.items()}
-    found = Comparison({"a": windows, "b": windows}, {}, {"b": dict.fromkeys(PAIR_NAMES, cells)}, {"b": {}})
-    compare_verb._show(found)
+    comparison = Comparison({"a": windows, "b": windows}, {}, {"b": dict.fromkeys(PAIR_NAMES, cells)}, {"b": {}})
+    compare_verb._show(comparison)
     row = r"│ bottom_right_bottom │ +-99.9M │ +\+99.9M │ +\+100M │ +\+1234M │ +-100M │ +\+0.0M │"
     assert re.search(row, text.getvalue()) and "…" not in text.getvalue()

@@ -131,11 +131,11 @@ def test_stamps_of_any_size_are_counted_and_harmless(tmp_path: Path) -> None:
     (tmp_path / "map.yaml").write_text(MAP.split("\nhead_pose")[0].replace("1000", "1"))
     schema = STORE.generate_msgdef(TYPE, ros_version=2)[0].encode()
     file = mcap(tmp_path / "odd.mcap", "cdr", (TYPE, "ros2msg", schema), messages)
-    found = analyse(file, scene=PAPER, mapping=tmp_path / "map.yaml")
-    dropped = sum(count for name, count in found.input.items() if name.startswith("dropped_"))
-    assert found.input["samples_in"] == COUNT + len(odd) == found.input["samples_used"] + dropped
-    assert found.input["dropped_stray"] == 1 and "jump_forward" not in found.input
-    assert found.lossy and found.predictions[0].loads.largest.max() < 1e6
+    analysis = analyse(file, scene=PAPER, mapping=tmp_path / "map.yaml")
+    dropped = sum(count for name, count in analysis.input.items() if name.startswith("dropped_"))
+    assert analysis.input["samples_in"] == COUNT + len(odd) == analysis.input["samples_used"] + dropped
+    assert analysis.input["dropped_stray"] == 1 and "jump_forward" not in analysis.input
+    assert analysis.lossy and analysis.predictions[0].loads.largest.max() < 1e6
 
 
 def sheet(
@@ -150,9 +150,9 @@ def sheet(
 
 
 def test_a_spreadsheet_s_csv_gives_the_numbers_of_a_plain_one(tmp_path: Path) -> None:
-    def peaks(found: Analysis) -> list[float]:
-        assert found.input == {"samples_in": COUNT, "samples_used": COUNT}
-        return list(found.predictions[0].loads.largest)
+    def peaks(analysis: Analysis) -> list[float]:
+        assert analysis.input == {"samples_in": COUNT, "samples_used": COUNT}
+        return list(analysis.predictions[0].loads.largest)
 
     plain = peaks(analyse(sheet(tmp_path / "load.csv", ",", comma=False, mark=False), scene=PAPER))
     assert max(plain) > 0.0
@@ -191,8 +191,8 @@ def test_a_mapping_without_a_field_or_stamp_is_named(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=f"malformed {COUNT}; excitation: {told}"):
         analyse(file, scene=PAPER, mapping=chosen)
     chosen.write_text(f"excitation: {{topic: {topic}}}\nhead_pose: {{topic: {topic}, fields: {{x: pose.x}}}}")
-    found = analyse(file, scene=PAPER, mapping=chosen)
-    assert found.losses == {f"unfit, head_pose: {topic} has no number at 'pose.x' for x": COUNT}
+    analysis = analyse(file, scene=PAPER, mapping=chosen)
+    assert analysis.losses == {f"unfit, head_pose: {topic} has no number at 'pose.x' for x": COUNT}
     with pytest.raises(RecordingError, match=f"got no measured pose, expected some; head_pose: {topic} has no number"):
         read_recording(file, Path(PAPER), chosen)
 
@@ -207,31 +207,31 @@ def test_the_estimate_reads_csv_as_the_analysis_does(tmp_path: Path) -> None:
     for delimiter, comma, mark in ((",", False, True), (";", True, True), ("\t", True, False)):
         sheet(tmp_path / "load.csv", delimiter, comma, mark)
         sheet(tmp_path / "pose.csv", delimiter, comma, mark, header=("time", *names[1:]))
-        found = read_measured(tmp_path, scene)
-        assert found.unreadable == 0
-        np.testing.assert_array_equal(found.load, plain.load)
-        np.testing.assert_array_equal(found.poses, plain.poses)
+        measured = read_measured(tmp_path, scene)
+        assert measured.unreadable == 0
+        np.testing.assert_array_equal(measured.load, plain.load)
+        np.testing.assert_array_equal(measured.poses, plain.poses)
     for name in ("load", "pose"):
         header, *rows = (tmp_path / f"{name}.csv").read_text().replace(",", ".").splitlines()
         dated = [
             f"2026-01-02T03:04:{5 + float(row.split(chr(9))[0]):09.6f}Z\t{row.partition(chr(9))[2]}" for row in rows
         ]
         (tmp_path / f"{name}.csv").write_text("\n".join([header, *dated]))
-    found = read_measured(tmp_path, scene)
-    np.testing.assert_allclose(found.load, plain.load, rtol=0.0, atol=1e-6)
-    np.testing.assert_allclose(found.poses, plain.poses, rtol=0.0, atol=1e-6)
+    measured = read_measured(tmp_path, scene)
+    np.testing.assert_allclose(measured.load, plain.load, rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(measured.poses, plain.poses, rtol=0.0, atol=1e-6)
     (tmp_path / "gaps.csv").write_text("t,left,right\n0,1,2\n")
     with pytest.raises(RecordingError, match="got the columns t, left, right, expected t and some of top_left_top"):
         read_measured(tmp_path, scene)
 
 
 def test_a_full_disk_is_named_with_the_file_being_written(tmp_path: Path) -> None:
-    found = analyse(sheet(tmp_path / "load.csv", ",", comma=False, mark=False), scene=PAPER)
+    analysis = analyse(sheet(tmp_path / "load.csv", ",", comma=False, mark=False), scene=PAPER)
     out = tmp_path / "out"
     out.mkdir()
     (out / "analysis.json").symlink_to("/dev/full")
     with pytest.raises(OSError, match="No space left on device") as error:
-        write_report(found, out)
+        write_report(analysis, out)
     assert error.value.filename == str(out / "analysis.json")
 
 
@@ -246,11 +246,11 @@ def test_columns_with_any_name_dates_and_mixed_rows_are_read(tmp_path: Path) -> 
         "excitation: {topic: all, fields: {fx: 'Fx, N', fy: 2, m: 'M;Nm'}, stamp: when}\n"
         "head_pose: {topic: all, fields: {x: x}, unit: {x: mm}, stamp: when}\n"
     )
-    found = analyse(tmp_path / "all.csv", scene=PAPER, mapping=tmp_path / "map.yaml")
+    analysis = analyse(tmp_path / "all.csv", scene=PAPER, mapping=tmp_path / "map.yaml")
     plain = analyse(sheet(tmp_path / "load.csv", ",", comma=False, mark=False), scene=PAPER)
-    assert found.input == plain.input == {"samples_in": COUNT, "samples_used": COUNT} and not found.lossy
-    np.testing.assert_array_equal(found.predictions[0].loads.largest, plain.predictions[0].loads.largest)
-    stamps, rows = found.measured.signals["x"].series()
+    assert analysis.input == plain.input == {"samples_in": COUNT, "samples_used": COUNT} and not analysis.lossy
+    np.testing.assert_array_equal(analysis.predictions[0].loads.largest, plain.predictions[0].loads.largest)
+    stamps, rows = analysis.measured.signals["x"].series()
     assert (stamps[0], len(stamps), set(rows[:, 0])) == (1_767_323_045_000_000_000, COUNT, {0.25e-3})
 
 
@@ -292,9 +292,9 @@ def test_the_other_parts_of_a_damaged_bag_are_used(kind: StoragePlugin, tmp_path
     assert (plain.input["samples_used"], plain.lost, len(plain.predictions[0].spans)) == (COUNT, {}, 1)
     parts[1].write_bytes(b"no recording at all")
     for reason in ("damaged_files", "missing_parts"):
-        found = analyse(tmp_path / "bag", scene=PAPER, out=tmp_path / reason)
-        assert (found.input["samples_used"], found.lost) == (2 * COUNT // 3, {reason: 1})
-        assert list(found.predictions[0].spans.values()) == [
+        analysis = analyse(tmp_path / "bag", scene=PAPER, out=tmp_path / reason)
+        assert (analysis.input["samples_used"], analysis.lost) == (2 * COUNT // 3, {reason: 1})
+        assert list(analysis.predictions[0].spans.values()) == [
             tuple(BASE_NS + index * STEP_NS for index in ends) for ends in ((0, 99), (200, 299))
         ]
         parts[1].unlink(missing_ok=True)
@@ -318,8 +318,8 @@ def test_a_type_that_only_the_bag_defines_is_read(kind: StoragePlugin, tmp_path:
     (tmp_path / "map.yaml").write_text(
         "excitation: {topic: /load, fields: {fx: fx, fy: 'f[0]', m: 'f[1]'}, stamp: log}\n"
     )
-    found = analyse(tmp_path / "bag", scene=PAPER, mapping=tmp_path / "map.yaml")
-    assert found.input == {"samples_in": 10, "samples_used": 10} and not found.lossy
+    analysis = analyse(tmp_path / "bag", scene=PAPER, mapping=tmp_path / "map.yaml")
+    assert analysis.input == {"samples_in": 10, "samples_used": 10} and not analysis.lossy
 
 
 def test_a_bag_of_another_program_is_drawn_by_its_mapping(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -344,5 +344,5 @@ def test_a_bag_of_another_program_is_drawn_by_its_mapping(tmp_path: Path, monkey
 
 def analyse_force(folder: Path) -> float:
     """Return the largest force [N] that an analysis of the bag finds."""
-    found = analyse(folder / "bag", scene=PAPER, mapping=folder / "map.yaml")
-    return max(found.facts()["loads"]["largest_force_n"].values())
+    analysis = analyse(folder / "bag", scene=PAPER, mapping=folder / "map.yaml")
+    return max(analysis.facts()["loads"]["largest_force_n"].values())

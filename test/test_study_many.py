@@ -99,9 +99,9 @@ def test_an_interrupt_ends_the_call_and_its_workers_at_once(number: signal.Signa
             os.killpg(process.pid, number)  # a terminal sends Ctrl-C to the whole process group
         else:
             process.send_signal(number)
-        said = process.communicate(timeout=20)[1]
+        output = process.communicate(timeout=20)[1]
     if number == signal.SIGINT:
-        assert process.returncode == 1 and "interrupted" in said and "Traceback" not in said
+        assert process.returncode == 1 and "interrupted" in output and "Traceback" not in output
     assert len(workers) == 2
     until(lambda: not any(map(is_running, workers)), "the end of the workers")
 
@@ -120,9 +120,9 @@ def test_the_other_tasks_continue_after_the_early_death_of_a_worker(
         return []
 
     monkeypatch.setattr(many, "_round", one_dies)
-    found = run_many([Task(Path(str(n)), None, None, (), None) for n in range(5)], workers=2)
+    results = run_many([Task(Path(str(n)), None, None, (), None) for n in range(5)], workers=2)
     assert rounds == [[0, 1, 2, 3, 4], [0], [1], [2, 3, 4]]
-    assert ["error" in facts for facts in found] == [False, True, False, False, False]
+    assert ["error" in facts for facts in results] == [False, True, False, False, False]
 
 
 @pytest.mark.stress
@@ -131,8 +131,8 @@ def test_a_cluster_gives_the_same_results(runs: Path, tmp_path: Path) -> None:
 
     some = tasks(runs, tmp_path / "out")[:2]
     with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
-        found = run_many(some, workers=1, dask=cluster.scheduler_address)
-    assert [facts["input"]["samples_used"] for facts in found] == [2000, 2001]
+        results = run_many(some, workers=1, dask=cluster.scheduler_address)
+    assert [facts["input"]["samples_used"] for facts in results] == [2000, 2001]
     assert all(task.stored() is not None for task in some)
 
 

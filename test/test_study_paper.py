@@ -61,8 +61,10 @@ def test_the_command_writes_a_report_a_table_and_the_run(tmp_path: Path, capsys:
         "--out",
         str(out),
     ]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=110, stdin=subprocess.DEVNULL, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
+    completed = subprocess.run(
+        command, capture_output=True, text=True, timeout=110, stdin=subprocess.DEVNULL, check=False
+    )
+    assert (completed.returncode, completed.stderr) == (0, "")
 
     html = (out / "report.html").read_text()
     images = re.findall(r'src="data:image/png;base64,([^"]+)"', html)
@@ -80,7 +82,7 @@ def test_the_command_writes_a_report_a_table_and_the_run(tmp_path: Path, capsys:
         assert entry["criterion"] and entry["inputs"] and entry["source"] and entry["published_mark"] == "given"
         assert entry["what"].replace("'", "&#39;") in html
     assert sum(document["verdicts"].values()) == len(table)
-    assert f"agrees? yes: {document['verdicts']['yes']}, no: {document['verdicts']['no']}" in done.stdout
+    assert f"agrees? yes: {document['verdicts']['yes']}, no: {document['verdicts']['no']}" in completed.stdout
 
     assert (out / "run.rrd").read_bytes()[:4] == b"RRF2"
     reader = RunReader(out / "run")

@@ -140,8 +140,8 @@ def test_failed_members_are_listed_and_invalid_arguments_refused(
     assert figures[0].get_suptitle().startswith("Sweep of paper: 2 s each, drawn 20")
     assert figures[0].axes[0].get_xlabel() == "contact stiffness [MN/mⁿ]"
     assert figures[0].axes[0].get_ylabel() == "largest force [kN]"
-    said = capsys.readouterr()
-    assert "left the model's range" in said.err and "contact.stiffness: got -1.0" in said.err
+    printed = capsys.readouterr()
+    assert "left the model's range" in printed.err and "contact.stiffness: got -1.0" in printed.err
     stored = (tmp_path / "sweep.parquet").read_bytes()
     table = pq.read_table(tmp_path / "sweep.parquet")
     assert table["status"].to_pylist() == [1, -1, 0, 0]

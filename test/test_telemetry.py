@@ -175,8 +175,8 @@ def test_an_opcua_server_for_other_machines_encrypts_and_admits_trusted_clients(
         found = [_meanwhile(live, connects(*given)) for given in cases]
         assert found == [True, False, False, False]
         live.process.terminate()
-        said = live.process.communicate(timeout=60.0)[1]
-        assert live.process.returncode == 0 and b"Traceback" not in said
+        output = live.process.communicate(timeout=60.0)[1]
+        assert live.process.returncode == 0 and b"Traceback" not in output
     (tmp_path / "trusted" / "bad.pem").write_text("none")
     with pytest.raises(BridgeError, match=r"bad\.pem: got no certificate"):
         asyncio.run(Trusted([tmp_path / "trusted"], []).load())
@@ -245,14 +245,14 @@ def test_points_that_a_silent_or_absurd_database_has_not_confirmed_count_as_lost
         await output.close(0.2)
         return output.state
 
-    for answer, said in (
+    for answer, message in (
         (b"", "no connection yet"),
         (b"HTTP/1.1 500 x\r\nContent-Length: %d\r\n\r\n" % 2**60, "Memory"),
     ):
         with socket.create_server(("127.0.0.1", 0)) as listening:
             threading.Thread(target=_answer, args=(listening, answer), daemon=True).start()
             state = asyncio.run(write(listening.getsockname()[1]))
-        assert (state.sent, state.lost, state.connected) == (0, 2, False) and said in state.trouble
+        assert (state.sent, state.lost, state.connected) == (0, 2, False) and message in state.trouble
 
 
 def _answer(listening: socket.socket, answer: bytes) -> None:

@@ -48,9 +48,9 @@ def test_the_telemetry_of_a_node_sends_its_results_and_ends_cleanly(tmp_path: Pa
 
 def test_a_missing_node_is_named(tmp_path: Path) -> None:
     words = ["telemetry", "--namespace", f"/none_{os.getpid()}", "--wait", "0.5"]
-    for more, code, said in (
+    for more, code, message in (
         (["--mqtt-out", f"mqtt://127.0.0.1:{_free_port()}/face"], 2, "a running node within 0.5 s"),
         ([], 2, "expected --mqtt-out, --influx or --opcua"),
     ):
         process = Process("plow_twin", [*words, *more], tmp_path / f"{len(more)}.log")
-        assert process.wait() == code and said in process.output()
+        assert process.wait() == code and message in process.output()

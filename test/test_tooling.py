@@ -88,10 +88,10 @@ def test_a_hanging_test_is_named_and_ends_the_run(tmp_path: Path) -> None:
     options += " -o faulthandler_timeout=1"
     venv = Path(sys.prefix)
     command = ["make", f"--old-file={venv}/.installed", "test", f"VENV={venv}", f"PYTEST_ARGS={options}"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert done.returncode != 0 and "1 failed, 1 passed" in done.stdout
-    assert re.search("crashed while running '.*test_that_hangs'", done.stdout)
-    assert "in test_that_hangs" in done.stderr  # the output names the place where the test hangs
+    completed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert completed.returncode != 0 and "1 failed, 1 passed" in completed.stdout
+    assert re.search("crashed while running '.*test_that_hangs'", completed.stdout)
+    assert "in test_that_hangs" in completed.stderr  # the output names the place where the test hangs
 
 
 #: Source of a kernel.
@@ -120,9 +120,9 @@ def test_the_processes_of_a_suite_compile_a_kernel_once(tmp_path: Path) -> None:
         (folder / name).write_text(MEETING)
     environment = {name: text for name, text in os.environ.items() if not name.startswith("PYTEST_")}
     command = [sys.executable, "-m", "pytest", "-n", "2", "--dist", "loadfile", "--compiles", "test"]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout
-    assert re.search(r" 1 times  doubling\.double", done.stdout), done.stdout
+    completed = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert completed.returncode == 0, completed.stdout
+    assert re.search(r" 1 times  doubling\.double", completed.stdout), completed.stdout
 
 
 def test_the_test_files_that_run_first_exist() -> None:

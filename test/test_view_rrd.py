@@ -386,8 +386,8 @@ def test_a_picture_needs_no_viewer(run: Run, tmp_path: Path) -> None:
         "from plow_twin.cli import main; main(['view', sys.argv[1], '--png', sys.argv[2], '--quiet'])"
     )
     command = [sys.executable, "-c", code, str(run.folder), str(tmp_path / "run.png")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
-    assert done.returncode == 0, done.stderr
+    completed = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    assert completed.returncode == 0, completed.stderr
     assert (tmp_path / "run.png").read_bytes()[:4] == b"\x89PNG" and (tmp_path / "run.png").stat().st_size > 50_000
 
 

@@ -112,23 +112,23 @@ def _label(by: str, shifts: str, zone: str) -> Any:
         raise click.BadParameter(f"got {zone!r}, expected a zone like Europe/Berlin", param_hint="--zone") from error
 
 
-def _show(found: Comparison) -> None:
+def _show(comparison: Comparison) -> None:
     console = output_console()
     groups = table("Groups", "group", "windows", "load, RMS [kN]", "horizontal [mm]", "vertical [mm]")
-    for name, windows in found.groups.items():
+    for name, windows in comparison.groups.items():
         clearance = 1e3 * windows.clearance.mean(axis=0)
         numbers = (1e-3 * windows.load[:, 0].mean(), *clearance)
         groups.add_row(name, str(len(windows.start_ns)), *(f"{number:.3f}" for number in numbers))
     console.print(groups)
-    first = next(iter(found.groups))
-    for name, by_pair in found.changes.items():
+    first = next(iter(comparison.groups))
+    for name, by_pair in comparison.changes.items():
         names = {"dissipation": "energy", "in_contact": "in contact"}
         quantities = [names.get(quantity, quantity) for quantity in next(iter(by_pair.values()))]
         view = table(f"{name} compared with {first}: change of the means [%]", "pad", *quantities)
         for pair, by_quantity in by_pair.items():
             view.add_row(pair, *map(_text, by_quantity.values()))
         console.print(view)
-        changes = (f"{axis} {_text(change)}" for axis, change in found.clearance_changes[name].items())
+        changes = (f"{axis} {_text(change)}" for axis, change in comparison.clearance_changes[name].items())
         console.print(f"clearance [%]: {', '.join(changes)}", highlight=False)
     console.print(_KEY, highlight=False)
 

@@ -166,10 +166,10 @@ def _unused(path: Path, as_json: bool) -> int:
     table = csv.writer(sys.stdout, lineterminator="\n")
     if not as_json:
         table.writerow(("input", "sender", "reason", "count", "stamp_ns", "values"))
-    for found in unused_messages(path):
+    for unused in unused_messages(path):
         if as_json:
-            values = [value if math.isfinite(value) else repr(value) for value in found["values"]]
-            click.echo(json.dumps(found | {"values": values}))
+            values = [value if math.isfinite(value) else repr(value) for value in unused["values"]]
+            click.echo(json.dumps(unused | {"values": values}))
         else:
-            table.writerow((found | {"values": " ".join(map(repr, found["values"]))}).values())
+            table.writerow((unused | {"values": " ".join(map(repr, unused["values"]))}).values())
     return DONE

@@ -201,12 +201,12 @@ def balance_of(balance: EnergyBalance) -> dict[str, Any]:
     return {**plain, "relative_imbalance": balance.relative_imbalance}
 
 
-def _trust_of(found: Sensitivity) -> dict[str, Any]:
+def _trust_of(sensitivity: Sensitivity) -> dict[str, Any]:
     return {
-        "trusted": found.trusted,
-        "growth": float(found.growth.max()),
-        "lyapunov_exponent_1_s": found.exponent,
-        "good_to_1_percent_until_s": found.good_until(1e-2),
+        "trusted": sensitivity.trusted,
+        "growth": float(sensitivity.growth.max()),
+        "lyapunov_exponent_1_s": sensitivity.exponent,
+        "good_to_1_percent_until_s": sensitivity.good_until(1e-2),
     }
 
 

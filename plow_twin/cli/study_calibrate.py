@@ -213,14 +213,16 @@ def _show(fit: Fit, space: Space, out: Path) -> None:
     from plow_twin.study.calibration.uniqueness import near_optimal_ends
 
     console = output_console()
-    found = fit.calibration
+    calibration = fit.calibration
     before = "" if fit.before is None else f" (before the fit: {fit.before:.4g})"
     shown = table(
-        f"best of {len(found.starts)} starts, objective {found.best.objective:.4g}{before}", "unknown", "fitted"
+        f"best of {len(calibration.starts)} starts, objective {calibration.best.objective:.4g}{before}",
+        "unknown",
+        "fitted",
     )
     shown.add_column("near-optimal", justify="right")
     for unknown in space.unknowns:
-        value = found.best.values[unknown.path]
+        value = calibration.best.values[unknown.path]
         low_high = near_optimal_ends(fit.clusters, unknown.path)
         spread = "" if low_high is None else f"{low_high[0]:.5g} .. {low_high[1]:.5g}"
         shown.add_row(unknown.path, value if isinstance(value, str) else f"{value:.6g}", spread)
@@ -229,12 +231,12 @@ def _show(fit: Fit, space: Space, out: Path) -> None:
         _show_targets(console, fit)
     singular = ", ".join(f"{value:.3g}" for value in fit.identifiability.singular_values)
     console.print(f"singular values of the Jacobian over the ranges: {singular}", highlight=False, soft_wrap=True)
-    objectives = ", ".join(f"{start.objective:.4g}" for start in found.starts)
+    objectives = ", ".join(f"{start.objective:.4g}" for start in calibration.starts)
     console.print(f"objective of each start: {objectives}", highlight=False, soft_wrap=True)
     sizes = ", ".join(f"{one.objective:.4g} ({one.members})" for one in fit.clusters[:8])
     console.print(
         f"clusters of near-optimal points: {len(fit.clusters)}, objective (points): {sizes}\n"
-        f"{found.runs} runs; {out / 'fit.yaml'}, {out / 'calibration.json'}",
+        f"{calibration.runs} runs; {out / 'fit.yaml'}, {out / 'calibration.json'}",
         highlight=False,
         soft_wrap=True,
     )

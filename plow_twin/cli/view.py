@@ -154,12 +154,12 @@ def _made_run(
     with TemporaryDirectory() as folder:
         place = Path(folder) / recording.resolve().name
         with busy("computing", quiet):
-            found = analyse(recording, scene=Path(scene) if scene else None, mapping=mapping, units=units, out=place)
-        if found.kind != "other":
+            analysis = analyse(recording, scene=Path(scene) if scene else None, mapping=mapping, units=units, out=place)
+        if analysis.kind != "other":
             raise click.UsageError("--scene, --map, --unit: got a run of plow_twin, expected another recording")
-        if found.lost:
-            say_lost(recording, found.lost)
-        yield place / "run", found.lossy
+        if analysis.lost:
+            say_lost(recording, analysis.lost)
+        yield place / "run", analysis.lossy
 
 
 def _scenes(files: tuple[str, ...]) -> dict[str, Scene]:

@@ -81,8 +81,8 @@ def _forces(scene: Scene, result: Estimate, load: Load, asked: Requests) -> dict
         raise ForcesError("load: got the same value throughout, expected a measured load")
     period = load.period()
     settle, end = _SETTLE_PERIODS * period, float(load.t[-1])
-    felt = followed(load.between(end - asked.span_s - settle, end), period)
-    return forces_of(scene, result, felt, asked.members, settle, over_time=False).as_dict()
+    measured_load = followed(load.between(end - asked.span_s - settle, end), period)
+    return forces_of(scene, result, measured_load, asked.members, settle, over_time=False).as_dict()
 
 
 def followed(load: Load, period: float) -> Load:
@@ -110,8 +110,8 @@ def forecast_from(scene: Scene, result: Estimate, load: Load, plan: Plan) -> dic
 def under_load(scene: Scene, result: Estimate, load: Load) -> Scene:
     """Return the scene under the load of a window times the estimated gains, if it has enough load periods."""
     gains = [1.0 if gain is None else gain.mean for gain in (result.gain_fx, result.gain_fy, result.gain_m)]
-    felt = load.thinned() if result.load_harmonics is None else result.load_harmonics.added(load.thinned())
-    seen = replace(scene, loads=(Table("window", felt.t - felt.t[0], felt.wrench * gains),))
+    measured_load = load.thinned() if result.load_harmonics is None else result.load_harmonics.added(load.thinned())
+    seen = replace(scene, loads=(Table("window", measured_load.t - measured_load.t[0], measured_load.wrench * gains),))
     try:
         period_of(seen)
     except LifeError:

@@ -111,11 +111,11 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> E
             f"{2 * _FLIGHT_ROWS[0]} with some noise in each component"
         )
         return replace(known, horizontal_state=unseen, vertical_state=unseen, reasons=(why,))
-    found, contacts = impacts(scene, load, poses, level)
-    why = _unfit(found, contacts)
+    impacts_found, contacts = impacts(scene, load, poses, level)
+    why = _unfit(impacts_found, contacts)
     if why:
         return replace(known, horizontal_state=unseen, vertical_state=unseen, reasons=(why,))
-    met, reasons = _on_walls(scene, [one for one in found if one.gained < tuning.GAINED], known)
+    met, reasons = _on_walls(scene, [one for one in impacts_found if one.gained < tuning.GAINED], known)
     value, deviation = _solve(scene, met, known, level)
     clearances, states = [], []
     bias: list[Interval | None] = [Interval.normal(*pair) for pair in zip(value[_BIAS], deviation[_BIAS], strict=True)]
@@ -153,13 +153,13 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> E
     )
 
 
-def _unfit(found: list[Impact], contacts: int) -> str:
-    gained = sum(one.gained >= tuning.GAINED for one in found)
-    if gained > tuning.IMPACT_SHARE * len(found):
-        return f"{gained} of {len(found)} impacts add energy: the poses are too far apart in time"
-    if len(found) < tuning.IMPACT_SHARE * contacts:
+def _unfit(impacts: list[Impact], contacts: int) -> str:
+    gained = sum(one.gained >= tuning.GAINED for one in impacts)
+    if gained > tuning.IMPACT_SHARE * len(impacts):
+        return f"{gained} of {len(impacts)} impacts add energy: the poses are too far apart in time"
+    if len(impacts) < tuning.IMPACT_SHARE * contacts:
         return (
-            f"{len(found)} of {contacts} contacts are impacts between two flights, expected at least "
+            f"{len(impacts)} of {contacts} contacts are impacts between two flights, expected at least "
             f"{tuning.IMPACT_SHARE:.0%}: the contact lasts longer than two poses, or the block hardly flies"
         )
     return ""

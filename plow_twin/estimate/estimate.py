@@ -213,9 +213,9 @@ def _from_motion(
             unknowns, poses, lost, "the head rests under a load that changes: the head or its sensor is stuck"
         ), ()
     period = _period(load, poses)
-    felt, broad = thinned(load, period)
-    drift = tuning.LEFT_OPEN * np.array(felt.unknown) / np.asarray(inertias(scene)) ** 2 if broad else None
-    forward = Forward(scene, felt)
+    measured_load, broad = thinned(load, period)
+    drift = tuning.LEFT_OPEN * np.array(measured_load.unknown) / np.asarray(inertias(scene)) ** 2 if broad else None
+    forward = Forward(scene, measured_load)
     if guess:
         numbers = np.array(guess)
         shared, noise, differences = np.split(numbers, [SIZE, SIZE + 3])
@@ -226,7 +226,7 @@ def _from_motion(
         if near and verdict and not fails(near[1], verdict):
             near, verdict = _with_differences(near, verdict, period)
             return summarise(*near, verdict, lost, forces), _next_guess(*near)
-        forward = Forward(scene, felt)
+        forward = Forward(scene, measured_load)
     bias = bias_of_hard(unknowns, poses)
     if bias.any():
         result, following = _searched(forward, unknowns, poses.moved(-bias), period, drift, lost, forces)
@@ -258,17 +258,17 @@ def _from_some_components(
 ) -> Estimate:
     """Return the estimate from poses in which one or two components were never measured."""
     period = _period(load, poses)
-    felt, _ = thinned(load, period)
+    measured_load, _ = thinned(load, period)
     share, time = tuning.UNMEASURED_LOAD
     drift = 2.0 * time * (share * load.wrench.std(axis=0) / np.asarray(inertias(unknowns.scene))) ** 2
-    found = fit_some_components(Forward(unknowns.scene, felt), unknowns, poses, period, drift)
+    found = fit_some_components(Forward(unknowns.scene, measured_load), unknowns, poses, period, drift)
     if found is not None:
         result = summarise(*found, judge(*found, period), lost)
         if _known(result):
             return replace(result, reasons=(*lacking, *result.reasons))
     if poses.measured[:2].all():
         nothing = replace(prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost), reasons=lacking)
-        return under_uncertain_load(nothing, unknowns, felt, poses, period)
+        return under_uncertain_load(nothing, unknowns, measured_load, poses, period)
     return not_observable(unknowns, poses, lost, lacking)
 
 
@@ -328,7 +328,7 @@ def _period(load: Load, poses: Poses) -> float:
 def under_uncertain_load(
     result: Estimate,
     unknowns: Unknowns,
-    felt: Load | None,
+    measured_load: Load | None,
     poses: Poses,
     period: float,
     fitted: tuple[Problem, Fit] | None = None,
@@ -338,9 +338,9 @@ def under_uncertain_load(
     The values come from a comparison with motions under uncertain loads. `fitted` is a fit that failed a check. Its
     clearances are combined with those of the comparison where they agree.
     """
-    if _known(result) or (felt is not None and felt.interval() > tuning.COARSEST):
+    if _known(result) or (measured_load is not None and measured_load.interval() > tuning.COARSEST):
         return result
-    found, work = compare_under_uncertain_load(felt, unknowns, poses, period)
+    found, work = compare_under_uncertain_load(measured_load, unknowns, poses, period)
     figures = result.figures | {"work": result.figures.get("work", 0.0) + float(work)}
     if found is None or found.distance > tuning.MOST_DISTANCE or found.ln_depth[0] < math.log(tuning.FITTED):
         return replace(result, figures=figures)

@@ -233,10 +233,10 @@ class Follower:
 
     def like(self, scene: Scene) -> Follower:
         """Return a follower of a scene with the settings and the counters of this follower."""
-        found = Follower(scene, self._members, tol=self.tol, seed=self._seed)
-        found.every_row, found.defers = self.every_row, self.defers
-        found.poses = self.poses
-        return found
+        follower = Follower(scene, self._members, tol=self.tol, seed=self._seed)
+        follower.every_row, follower.defers = self.every_row, self.defers
+        follower.poses = self.poses
+        return follower
 
     def warm_up(self) -> float:
         """Compile the kernels, or load them from the cache on disk; return the elapsed time in s."""
@@ -468,20 +468,20 @@ class Follower:
         if not isinstance(measured, str):
             self._use_pose(measured[0], np.array(measured[1:]))
             return
-        found = Estimate.from_dict(json.loads(measured))
-        if State.WITHDRAWN in (found.horizontal_state, found.vertical_state):
+        result = Estimate.from_dict(json.loads(measured))
+        if State.WITHDRAWN in (result.horizontal_state, result.vertical_state):
             if self.estimate is not None:
                 self._begin_anew("")
-        elif self._is_replaced_by(found):
+        elif self._is_replaced_by(result):
             self._begin_anew(measured)
 
-    def _is_replaced_by(self, found: Estimate) -> bool:
-        new = (found.horizontal_state, found.vertical_state)
+    def _is_replaced_by(self, estimate: Estimate) -> bool:
+        new = (estimate.horizontal_state, estimate.vertical_state)
         before = self.estimate
         if before is None:
             return any(state.known for state in new)
         pairs = tuple(zip((before.horizontal_state, before.vertical_state), new, strict=True))
-        if self.time - self._since < tuning.NEW_MOTION * (found.t_end - found.t_start) and any(
+        if self.time - self._since < tuning.NEW_MOTION * (estimate.t_end - estimate.t_start) and any(
             own is State.ESTIMATED and other is State.ROUGH for own, other in pairs
         ):
             return False
@@ -643,11 +643,11 @@ def prior(scene: Scene) -> Estimate:
     return known if units == Units() else units.in_si(known, scene)
 
 
-def _whole(found: Estimate, known: Estimate) -> Estimate:
+def _whole(estimate: Estimate, known: Estimate) -> Estimate:
     return replace(
-        found,
-        damping=found.damping or known.damping,
-        gain_fx=found.gain_fx or known.gain_fx,
-        gain_fy=found.gain_fy or known.gain_fy,
-        gain_m=found.gain_m or known.gain_m,
+        estimate,
+        damping=estimate.damping or known.damping,
+        gain_fx=estimate.gain_fx or known.gain_fx,
+        gain_fy=estimate.gain_fy or known.gain_fy,
+        gain_m=estimate.gain_m or known.gain_m,
     )

@@ -185,10 +185,12 @@ class _Steps:
         self._gaps_added = last
 
     def _estimate(self, window: Window) -> None:
-        found, following = estimate_window(self._scene, window.load, window.pose, window.lost, self._guess, window.gaps)
+        result, following = estimate_window(
+            self._scene, window.load, window.pose, window.lost, self._guess, window.gaps
+        )
         bounds, before = (window.start_ns, window.end_ns, window.samples, window.poses), self._follower.drawn
-        self._session.apply(Estimated(*bounds, self._guess, (0.0,) * 6, json.dumps(found.as_dict())))
-        self.taken_over.append(TakenOver(self._follower.time, found, self._follower.drawn != before))
+        self._session.apply(Estimated(*bounds, self._guess, (0.0,) * 6, json.dumps(result.as_dict())))
+        self.taken_over.append(TakenOver(self._follower.time, result, self._follower.drawn != before))
         self._guess = following
 
 

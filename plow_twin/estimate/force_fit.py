@@ -142,14 +142,14 @@ class _Joint:
 
     def solve(self) -> JointFit:
         found, cells = self._found, self._cells
-        felt = self._feeling.at(found.shared, found.point.states, cells.delay)
-        assert felt is not None  # `cells_of` has already simulated this motion
-        near = np.isfinite(cells.force) & (felt.penetration > -2.0 * tuning.HEAD_ROOM)
+        measured_force = self._feeling.at(found.shared, found.point.states, cells.delay)
+        assert measured_force is not None  # `cells_of` has already simulated this motion
+        near = np.isfinite(cells.force) & (measured_force.penetration > -2.0 * tuning.HEAD_ROOM)
         near[:, np.setdiff1d(np.arange(near.shape[1]), cells.pairs)] = False
         self._row, self._pair = np.nonzero(near)
-        self._cell, self._swing = np.searchsorted(cells.pairs, self._pair), felt.swing[self._row]
+        self._cell, self._swing = np.searchsorted(cells.pairs, self._pair), measured_force.swing[self._row]
         self._measured, self._jitter = cells.force[near], np.zeros(len(self._row))
-        self._weigh(felt.force[near])
+        self._weigh(measured_force.force[near])
         at = self._evaluated(_Place(found.shared, found.point.states, cells.delay, np.zeros(len(cells.pairs))))
         if at is None:
             return not_used("the model cannot be run")
@@ -181,8 +181,12 @@ class _Joint:
         )
 
     def _force(self, place: _Place) -> Array | None:
-        felt = self._feeling.at(place.shared, place.states, place.delay)
-        return None if felt is None else np.exp(place.gain[self._cell]) * felt.force[self._row, self._pair]
+        measured_force = self._feeling.at(place.shared, place.states, place.delay)
+        return (
+            None
+            if measured_force is None
+            else np.exp(place.gain[self._cell]) * measured_force.force[self._row, self._pair]
+        )
 
     def _evaluated(self, place: _Place) -> _At | None:
         point, force = self._problem.evaluate(place.shared, place.states), self._force(place)

@@ -105,15 +105,17 @@ class ForceEnsemble:
     """
 
     def __init__(
-        self, scene: Scene, found: Estimate, members: int = MEMBERS, *, seed: int = 0, start: float = 0.0
+        self, scene: Scene, estimate: Estimate, members: int = MEMBERS, *, seed: int = 0, start: float = 0.0
     ) -> None:
-        if State.WITHDRAWN in (found.horizontal_state, found.vertical_state):
-            raise ForcesError(f"estimate: got a withdrawn estimate ({'; '.join(found.reasons)}), expected a valid one")
+        if State.WITHDRAWN in (estimate.horizontal_state, estimate.vertical_state):
+            raise ForcesError(
+                f"estimate: got a withdrawn estimate ({'; '.join(estimate.reasons)}), expected a valid one"
+            )
         if members < FEWEST:
             raise ForcesError(f"members: got {members}, expected at least {FEWEST}")
         rng = np.random.default_rng(seed)
-        scenes, self._gain = draw_scenes(scene, found, members, rng)
-        self._lacking = found.load_harmonics, amplitudes_of(found, members, rng)
+        scenes, self._gain = draw_scenes(scene, estimate, members, rng)
+        self._lacking = estimate.load_harmonics, amplitudes_of(estimate, members, rng)
         self._twins = TwinBatch(scenes, tol=tuning.TOLERANCE, start=start)
         self._good = np.ones(members, dtype=bool)
 
@@ -166,13 +168,13 @@ def quantiles(values: Array) -> Array:
 
 
 def forces_of(
-    scene: Scene, found: Estimate, load: Load, members: int, settle_s: float, *, over_time: bool = True
+    scene: Scene, estimate: Estimate, load: Load, members: int, settle_s: float, *, over_time: bool = True
 ) -> Forces:
     """Return the forces under a load, beginning `settle_s` [s] after the first sample of the load.
 
     After `settle_s`, the initial states of the members must have no influence on the forces.
     """
-    ensemble = ForceEnsemble(scene, found, members, start=float(load.t[0]))
+    ensemble = ForceEnsemble(scene, estimate, members, start=float(load.t[0]))
     load = load.with_knot(float(load.t[0]) + settle_s)
     first = int(np.searchsorted(load.t, load.t[0] + settle_s, side="right"))
     if first >= len(load.t):
@@ -182,25 +184,25 @@ def forces_of(
     return ensemble.advance(load.t[first:], load.wrench[first:], over_time=over_time)
 
 
-def draw_scenes(scene: Scene, found: Estimate, members: int, rng: np.random.Generator) -> tuple[list[Scene], Array]:
+def draw_scenes(scene: Scene, estimate: Estimate, members: int, rng: np.random.Generator) -> tuple[list[Scene], Array]:
     """Return m scenes drawn from an estimate, and the drawn gains of their loads, shape (m, 3)."""
     white = rng.standard_normal((members, len(CORRELATED)))
-    if found.correlation is not None:
-        white = white @ np.linalg.cholesky(np.array(found.correlation) + 1e-9 * np.eye(len(CORRELATED))).T
+    if estimate.correlation is not None:
+        white = white @ np.linalg.cholesky(np.array(estimate.correlation) + 1e-9 * np.eye(len(CORRELATED))).T
     horizontal, vertical = (
         np.maximum(_normal(value, white[:, index]), _LEAST_SHARE * value.mean)
-        for index, value in enumerate(found.in_scene_frame())
+        for index, value in enumerate(estimate.in_scene_frame())
     )
-    stiffness = np.exp(_normal(_logarithm(found.stiffness), -white[:, SOFTNESS]))
+    stiffness = np.exp(_normal(_logarithm(estimate.stiffness), -white[:, SOFTNESS]))
     restitution = scene.contact.restitution is not None
     damping: Array | None = None
-    if found.damping is not None:
-        value = found.damping if restitution else _logarithm(found.damping)
+    if estimate.damping is not None:
+        value = estimate.damping if restitution else _logarithm(estimate.damping)
         damping = _normal(value, white[:, DAMPING])
         damping = np.clip(damping, 1e-3, 0.999) if restitution else np.exp(damping)
     gains = [
         np.ones(members) if value is None else _normal(value, white[:, GAIN.start + index])
-        for index, value in enumerate((found.gain_fx, found.gain_fy, found.gain_m))
+        for index, value in enumerate((estimate.gain_fx, estimate.gain_fy, estimate.gain_m))
     ]
     numbers = {
         "clearance": {"horizontal_m": horizontal, "vertical_m": vertical},
@@ -209,19 +211,19 @@ def draw_scenes(scene: Scene, found: Estimate, members: int, rng: np.random.Gene
     return variants([scene] * members, numbers, loads=(), wear=None), np.stack(gains, axis=1)
 
 
-def draw_biases(found: Estimate, members: int, rng: np.random.Generator) -> Array:
+def draw_biases(estimate: Estimate, members: int, rng: np.random.Generator) -> Array:
     """Return biases of the sensor drawn from an estimate, shape (m, 3); the first member has the mean biases."""
     drawn = np.zeros((members, 3))
-    for index, value in enumerate((found.bias_x, found.bias_y, found.bias_theta)):
+    for index, value in enumerate((estimate.bias_x, estimate.bias_y, estimate.bias_theta)):
         if value is not None:
             drawn[:, index] = value.mean
             drawn[1:, index] = _normal(value, rng.standard_normal(members - 1))
     return drawn
 
 
-def amplitudes_of(found: Estimate, members: int, rng: np.random.Generator) -> Array:
+def amplitudes_of(estimate: Estimate, members: int, rng: np.random.Generator) -> Array:
     """Return amplitudes of the load's harmonics drawn from an estimate, shape (m, k, 3); the first has the means."""
-    harmonics = found.load_harmonics
+    harmonics = estimate.load_harmonics
     return np.zeros((members, 0, 3)) if harmonics is None else harmonics.drawn(members, rng)
 
 

@@ -29,14 +29,14 @@ _LONGER = 2.0
 
 
 def with_harmonics(
-    problem: Problem, found: Fit, felt: Load, period: float
+    problem: Problem, found: Fit, measured_load: Load, period: float
 ) -> tuple[tuple[Problem, Fit], Verdict] | None:
-    """Return a fit that includes harmonics of the measured load `felt`, and its verdict.
+    """Return a fit that includes harmonics of the measured load `measured_load`, and its verdict.
 
     The result is None if the load is not periodic, if swings are linked, if the motion cannot be simulated, or if a
     check fails after any stage.
     """
-    harmonics, poses = Harmonics.of(felt), problem.window.poses
+    harmonics, poses = Harmonics.of(measured_load), problem.window.poses
     if harmonics is None or len(problem.link):
         return None
     near = near_horizon(poses, period)
@@ -44,7 +44,7 @@ def with_harmonics(
         stage = Problem(problem.forward, problem.unknowns, problem.window, horizon=horizon)
         states = better_states(stage, found.shared, found.point.states)
         begun = fit(stage, found.shared, states, found.noise, _ITERATIONS)
-        ended = None if begun is None else _alternated(stage, begun, felt, harmonics)
+        ended = None if begun is None else _alternated(stage, begun, measured_load, harmonics)
         if ended is None:
             return None
         problem, found, harmonics = ended
@@ -56,7 +56,7 @@ def with_harmonics(
 
 
 def _alternated(
-    problem: Problem, found: Fit, felt: Load, harmonics: Harmonics
+    problem: Problem, found: Fit, measured_load: Load, harmonics: Harmonics
 ) -> tuple[Problem, Fit, Harmonics] | None:
     """Return a fit with harmonics, by linearised steps and fits from `harmonics`; None if a simulation fails."""
     best, in_vain = found.loss, 0
@@ -72,8 +72,8 @@ def _alternated(
             break
         harmonics = harmonics.moved(np.clip(change, -tuning.LACKING, tuning.LACKING), np.diag(covariance))
         problem = Problem(
-            problem.forward.under(harmonics.added(felt)), problem.unknowns, problem.window, horizon=problem.horizon,
-            differences=problem.differences, harmonics=harmonics,
+            problem.forward.under(harmonics.added(measured_load)), problem.unknowns, problem.window,
+            horizon=problem.horizon, differences=problem.differences, harmonics=harmonics,
         )  # fmt: skip
         most = problem.deviation, problem.start_spread
         shared, states = (np.clip(one, -bound, bound) for one, bound in zip((shared, states), most, strict=True))

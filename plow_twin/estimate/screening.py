@@ -91,5 +91,5 @@ def thinned(load: Load, period: float) -> tuple[Load, bool]:
         if len(thin.t) <= most:
             break
     broad = len(thin.t) > most
-    felt = load.averaged(tuning.KNOTS[1] * int(most)) if len(thin.t) > tuning.KNOTS[1] * most else thin
-    return replace(felt, unknown=load.unknown), broad or load.rare
+    measured_load = load.averaged(tuning.KNOTS[1] * int(most)) if len(thin.t) > tuning.KNOTS[1] * most else thin
+    return replace(measured_load, unknown=load.unknown), broad or load.rare

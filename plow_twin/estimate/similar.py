@@ -116,7 +116,7 @@ class Units:
             return None
         return replace(forces, t=forces.t / self.time, force=forces.force / self.force)
 
-    def in_si(self, found: Estimate, scene: Scene) -> Estimate:
+    def in_si(self, estimate: Estimate, scene: Scene) -> Estimate:
         """Return an estimate converted from these units to SI; `scene` is the scene in SI units."""
         contact = scene.contact
         length, time = self.length, self.time
@@ -128,7 +128,7 @@ class Units:
         }
         unit["stiffness"] = self.force / length**contact.exponent
         unit["damping"] = 1.0 if contact.damping is None else self._damping(contact)
-        converted: dict[str, Any] = {name: value.times(unit[name]) for name, value in found.values().items()}
+        converted: dict[str, Any] = {name: value.times(unit[name]) for name, value in estimate.values().items()}
 
         def unit_of(name: str) -> float:
             if name == "filter":
@@ -142,25 +142,27 @@ class Units:
             "have the paper's size",
         )
         return replace(
-            found,
-            t_start=found.t_start * time,
-            t_end=found.t_end * time,
+            estimate,
+            t_start=estimate.t_start * time,
+            t_end=estimate.t_end * time,
             **converted,
-            noise=None if found.noise is None else (found.noise[0] * length, found.noise[1] * length, found.noise[2]),
+            noise=None
+            if estimate.noise is None
+            else (estimate.noise[0] * length, estimate.noise[1] * length, estimate.noise[2]),
             differs={
                 name: (share, by * unit_of(name), deviation * unit_of(name))
-                for name, (share, by, deviation) in found.differs.items()
+                for name, (share, by, deviation) in estimate.differs.items()
             },
-            groups={name: (value.times(length), state) for name, (value, state) in found.groups.items()},
+            groups={name: (value.times(length), state) for name, (value, state) in estimate.groups.items()},
             forces_measured=None
-            if found.forces_measured is None
-            else found.forces_measured.in_units(self.force, self.time),
-            reasons=found.reasons + scale if found.reasons else (),
-            load_harmonics=found.load_harmonics and found.load_harmonics.in_units(self.force, length, time),
+            if estimate.forces_measured is None
+            else estimate.forces_measured.in_units(self.force, self.time),
+            reasons=estimate.reasons + scale if estimate.reasons else (),
+            load_harmonics=estimate.load_harmonics and estimate.load_harmonics.in_units(self.force, length, time),
             apparent=None
-            if found.apparent is None
-            else (found.apparent[0].times(length), found.apparent[1].times(length)),
-            motion=None if found.motion is None else found.motion.in_units(length, time),
+            if estimate.apparent is None
+            else (estimate.apparent[0].times(length), estimate.apparent[1].times(length)),
+            motion=None if estimate.motion is None else estimate.motion.in_units(length, time),
         )
 
     def _damping(self, contact: Contact) -> float:

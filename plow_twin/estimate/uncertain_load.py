@@ -100,7 +100,7 @@ class _Comparison:
 
 
 def compare_under_uncertain_load(
-    felt: Load | None, unknowns: Unknowns, poses: Poses, period: float, seed: int = 0
+    measured_load: Load | None, unknowns: Unknowns, poses: Poses, period: float, seed: int = 0
 ) -> tuple[Compared | None, int]:
     """Return the comparison of the measured motion with motions under random load errors, and its work.
 
@@ -126,12 +126,12 @@ def compare_under_uncertain_load(
     """
     rng = np.random.default_rng(seed)
     seen = MotionFeatures(unknowns, poses, period)
-    if felt is None:
+    if measured_load is None:
         by = _without_load(seen, unknowns, poses, period)
     elif poses.measured[2]:
-        by = _with_angle(seen, felt, unknowns, poses)
+        by = _with_angle(seen, measured_load, unknowns, poses)
     else:
-        by = _without_angle(seen, felt, unknowns, poses)
+        by = _without_angle(seen, measured_load, unknowns, poses)
     spread, measured = by.spread, by.features(seen.q)
     rows: list[Array] = []
     targets: list[Array] = []
@@ -200,10 +200,10 @@ def _without_load(seen: MotionFeatures, unknowns: Unknowns, poses: Poses, period
     return _Comparison(features, spread, _moved(seen, poses), tuning.UNCERTAIN_DRAWS[1], unexplained, load)
 
 
-def _with_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Poses) -> _Comparison:
+def _with_angle(seen: MotionFeatures, measured_load: Load, unknowns: Unknowns, poses: Poses) -> _Comparison:
     """Return the comparison by the weak form of the equations of motion, which needs load and theta."""
     about, softness, damping = tuning.UNCERTAIN_SPREAD
-    equations = EquationError(unknowns, felt, poses.t)
+    equations = EquationError(unknowns, measured_load, poses.t)
     first = equations.search(seen.q, range_of_motion(unknowns.scene, poses)[0])
     level = noise_level(seen.q)
     noise = math.hypot(max(level[0], level[1]), level[2] * geometry.half_diagonal(unknowns.scene))
@@ -218,10 +218,10 @@ def _with_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Pos
     )
     touched = np.asarray((times.reshape(2, 2) > tuning.TOUCHED).all(axis=1))
     draws = tuning.UNCERTAIN_DRAWS[0]
-    return _Comparison(features, spread, touched, draws, tuning.CORRECTED, lambda clearance, numbers: felt)
+    return _Comparison(features, spread, touched, draws, tuning.CORRECTED, lambda clearance, numbers: measured_load)
 
 
-def _without_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: Poses) -> _Comparison:
+def _without_angle(seen: MotionFeatures, measured_load: Load, unknowns: Unknowns, poses: Poses) -> _Comparison:
     """Return the comparison by reaches, for a theta that was not measured."""
     nominal, deviations = unknowns.nominal(), unknowns.deviations()
 
@@ -233,7 +233,7 @@ def _without_angle(seen: MotionFeatures, felt: Load, unknowns: Unknowns, poses: 
     damping = (_damping(unknowns), tuning.UNCERTAIN_SPREAD[2])
     spread = _Spread(nominal[:2], float(deviations[:2].max()) / 2.0, depth, damping, _middle(tuning.LOAD_ERRORS))
     moved, draws = _moved(seen, poses), tuning.UNCERTAIN_DRAWS[1]
-    return _Comparison(features, spread, moved, draws, (0.0, 0.0), lambda clearance, numbers: felt)
+    return _Comparison(features, spread, moved, draws, (0.0, 0.0), lambda clearance, numbers: measured_load)
 
 
 def _moved(seen: MotionFeatures, poses: Poses) -> NDArray[np.bool_]:

@@ -22,11 +22,11 @@ _MOST_POINTS: Final = 4000
 LEFT_OUT: Final = "left out: no recording"
 
 
-def write_report(found: Analysis, out: Path) -> None:
+def write_report(analysis: Analysis, out: Path) -> None:
     """Write all files of an analysis into the folder `out`."""
     with naming(out):
         out.mkdir(parents=True, exist_ok=True)
-        facts = found.facts()
+        facts = analysis.facts()
         write_json(out / "analysis.json", facts)
         context = {
             "facts": facts,
@@ -34,12 +34,12 @@ def write_report(found: Analysis, out: Path) -> None:
             "pairs": PAIR_NAMES,
             "unit": signal_unit,
             "number": lambda value: "" if value is None else f"{value:.4g}",
-            "picture": _picture(found),
+            "picture": _picture(analysis),
         }
         write_html(out / "report.html", "analysis.html.j2", context)
-        for number, prediction in enumerate(found.predictions):
+        for number, prediction in enumerate(analysis.predictions):
             _write_tables(prediction, out, f"_{number}" if number else "")
-        _write_measured(found, out)
+        _write_measured(analysis, out)
 
 
 def _write_tables(prediction: Prediction, out: Path, suffix: str) -> None:
@@ -63,10 +63,10 @@ def _write_tables(prediction: Prediction, out: Path, suffix: str) -> None:
         _write_table({**where, **worn}, out / f"slide_wear{suffix}.parquet")
 
 
-def _write_measured(found: Analysis, out: Path) -> None:
+def _write_measured(analysis: Analysis, out: Path) -> None:
     import pyarrow as pa
 
-    series = {name: signal.series() for name, signal in found.measured.signals.items()}
+    series = {name: signal.series() for name, signal in analysis.measured.signals.items()}
     if not series:
         return
     places = np.repeat(np.arange(len(series), dtype=np.int32), [len(stamps) for stamps, _ in series.values()])
@@ -86,13 +86,13 @@ def _write_table(columns: Mapping[str, Any], path: Path) -> None:
         parquet.write_table(pa.table(columns), stream)
 
 
-def _picture(found: Analysis) -> str:
+def _picture(analysis: Analysis) -> str:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 9), layout="constrained")
     axes = figure.subplots(4, 1, sharex=True)
     start = None
-    for number, prediction in enumerate(found.predictions):
+    for number, prediction in enumerate(analysis.predictions):
         stamps, columns = prediction.series()
         if not len(stamps):
             continue
@@ -106,8 +106,8 @@ def _picture(found: Analysis) -> str:
         force = np.max([columns[f"force_{pair}"][:count] for pair in PAIR_NAMES], axis=0).reshape(-1, thin).max(axis=1)
         axes[3].plot(times[:count:thin], force / 1e3, lw=0.7, label=label)
     for axis, name in zip(axes, ("x", "y", "theta"), strict=False):
-        if name in found.measured.signals and start is not None:
-            stamps, rows = found.measured.signals[name].series()
+        if name in analysis.measured.signals and start is not None:
+            stamps, rows = analysis.measured.signals[name].series()
             at, thin = (stamps - start) * 1e-9, max(1, len(stamps) // _MOST_POINTS)
             axis.plot(at[::thin], 1e3 * rows[::thin, 0], ".", ms=1.5, color="0.3", label="measured")
     for axis, text in zip(axes, ("x [mm]", "y [mm]", "θ [mrad]", "largest force [kN]"), strict=True):
@@ -117,8 +117,8 @@ def _picture(found: Analysis) -> str:
     axes[3].set_xlabel("time since the first stamp [s]")
     axes[3].set_ylim(bottom=0.0)
     date = date_text(start)
-    scene = Path(found.predictions[0].name).name
-    figure.suptitle(f"{found.path.name}, scene {scene}" + (f", {date}" if date else ""))
+    scene = Path(analysis.predictions[0].name).name
+    figure.suptitle(f"{analysis.path.name}, scene {scene}" + (f", {date}" if date else ""))
     return embedded_figure(figure)
 
 

@@ -110,15 +110,16 @@ class Fit:
 
     def plain(self, space: Space, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Return all results as plain data for JSON."""
-        found = self.calibration
+        calibration = self.calibration
         starts = [
             {key: getattr(start, key) for key in ("number", "objective", "before_polish", "runs", "values")}
-            for start in found.starts
+            for start in calibration.starts
         ]
         return {
-            "arguments": dict(arguments), "seed": found.seed, "search": asdict(self.search),
-            "unknowns": [asdict(unknown) for unknown in space.unknowns], "source": self.source, "runs": found.runs,
-            "objective_before": self.before, "objective": found.best.objective, "values": found.best.values,
+            "arguments": dict(arguments), "seed": calibration.seed, "search": asdict(self.search),
+            "unknowns": [asdict(unknown) for unknown in space.unknowns], "source": self.source,
+            "runs": calibration.runs,
+            "objective_before": self.before, "objective": calibration.best.objective, "values": calibration.best.values,
             "targets": [asdict(row) for row in self.targets], "starts": starts,
             "identifiability": asdict(self.identifiability), "clusters": [asdict(one) for one in self.clusters],
             "package_version": package_version(), "build": dict(build_fingerprint()),

@@ -49,10 +49,10 @@ def _value(unknown: Unknown, fit: Fit) -> FittedValue:
 
 
 def _notes(fit: Fit, space: Space) -> list[str]:
-    found = fit.calibration
+    calibration = fit.calibration
     before = "" if fit.before is None else f", before the fit {fit.before:.3g}"
-    lines = [f"starts: {len(found.starts)}, objective of the best {found.best.objective:.3g}{before}"]
-    chosen = {parameter_words(one.path)[0]: found.best.values[one.path] for one in space.unknowns if one.choices}
+    lines = [f"starts: {len(calibration.starts)}, objective of the best {calibration.best.objective:.3g}{before}"]
+    chosen = {parameter_words(one.path)[0]: calibration.best.values[one.path] for one in space.unknowns if one.choices}
     words = [f"{name}: {value if isinstance(value, str) else signed(value, 'g')}" for name, value in chosen.items()]
     return [*lines, ", ".join(words)] if words else lines
 

@@ -58,13 +58,13 @@ def identifiability(space: Space, objective: Objective, point: Array) -> Identif
     )
 
 
-def near_optimal(space: Space, found: Calibration, excess: float) -> list[Cluster]:
+def near_optimal(space: Space, calibration: Calibration, excess: float) -> list[Cluster]:
     """Cluster all points with an objective of at most the smallest objective plus `excess`. The best cluster comes
     first.
     """
-    points = np.concatenate([[start.point for start in found.starts], found.population])
-    values = np.concatenate([[start.objective for start in found.starts], found.population_objective])
-    keep = values <= found.best.objective + excess
+    points = np.concatenate([[start.point for start in calibration.starts], calibration.population])
+    values = np.concatenate([[start.objective for start in calibration.starts], calibration.population_objective])
+    keep = values <= calibration.best.objective + excess
     points = np.array([space.settled(point) for point in points[keep]])
     values = values[keep]
     groups: dict[tuple[float, ...], list[int]] = {}

@@ -144,18 +144,20 @@ def compare(
     if len(parts) < 2:
         got = f"1 group of windows ({next(iter(parts))})" if parts else "0 groups of windows"
         raise RecordingError(f"got {got}, expected two or more")
-    found = Comparison({group: Windows.joined(chosen) for group, chosen in parts.items()}, names)
-    found.scenes = sorted({name for name, _ in scenes.values() if name})
-    found.notes = notes + _rates_apart(runs) + _scenes_apart(scenes)
-    (reference, first), *others = found.groups.items()
-    loads = {group: with_neighbours(windows.load[:, 0], windows.start_ns) for group, windows in found.groups.items()}
+    comparison = Comparison({group: Windows.joined(chosen) for group, chosen in parts.items()}, names)
+    comparison.scenes = sorted({name for name, _ in scenes.values() if name})
+    comparison.notes = notes + _rates_apart(runs) + _scenes_apart(scenes)
+    (reference, first), *others = comparison.groups.items()
+    loads = {
+        group: with_neighbours(windows.load[:, 0], windows.start_ns) for group, windows in comparison.groups.items()
+    }
     random = np.random.default_rng(seed)
     before = Drawn(_cells(first), loads[reference], random)
     for group, windows in others:
         cells = iter(changes(before, Drawn(_cells(windows), loads[group], random)))
-        found.changes[group] = {pair: {quantity: next(cells) for quantity in QUANTITIES} for pair in PAIR_NAMES}
-        found.clearance_changes[group] = {axis: next(cells) for axis in ("horizontal", "vertical")}
-    return found
+        comparison.changes[group] = {pair: {quantity: next(cells) for quantity in QUANTITIES} for pair in PAIR_NAMES}
+        comparison.clearance_changes[group] = {axis: next(cells) for axis in ("horizontal", "vertical")}
+    return comparison
 
 
 def _cells(windows: Windows) -> np.ndarray[Any, Any]:

@@ -101,14 +101,14 @@ def study_paper(
     """
     begin = time.perf_counter()
     require("matplotlib", "jinja2", *(("mcap", "rosbags", "rerun") if recording else ()))
-    found = compare(scene, t_end, workers, lambda share: on_progress(0.2 * share))
+    comparison = compare(scene, t_end, workers, lambda share: on_progress(0.2 * share))
     figures = out / "figures"
     figures.mkdir(parents=True, exist_ok=True)
-    pictures = draw_all(found.runs, name, figures, lambda share: on_progress(0.2 + 0.2 * share))
-    rotation_picture = draw_rotation(found.runs, name, figures)
+    pictures = draw_all(comparison.runs, name, figures, lambda share: on_progress(0.2 + 0.2 * share))
+    rotation_picture = draw_rotation(comparison.runs, name, figures)
     recorded = record(scene, t_end, out / "run", lambda share: on_progress(0.4 + 0.6 * share)) if recording else None
     study = replace(
-        found,
+        comparison,
         name=name,
         pictures=pictures,
         rotation_picture=rotation_picture,
