@@ -79,8 +79,8 @@ def main() -> None:
             Path("mapped/pose.csv").symlink_to(folder / "measured/pose.csv")
             for title, words in {"live --record": (), **COMMANDS}.items():
                 memory, seconds = run(folder, *words) if words else recorded
-                found = {"command": title, "minutes": minutes, "memory_mb": round(memory), "cpu_s": round(seconds, 1)}
-                print(json.dumps(found), flush=True)
+                row = {"command": title, "minutes": minutes, "memory_mb": round(memory), "cpu_s": round(seconds, 1)}
+                print(json.dumps(row), flush=True)
 
 
 if __name__ == "__main__":

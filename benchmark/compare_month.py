@@ -34,9 +34,9 @@ def write_days(folder: Path, days: int, hours: float, rate_hz: float) -> None:
     seconds = stamps * 1e-9
     swing = np.sin(2.0 * seconds) * np.interp(seconds, np.arange(0.0, 2.0 * _SPAN_S, np.pi), _heights())
     wrench = swing[:, None] * np.array([32_000.0, -11_000.0, -45_495.0])
-    found: list[Walked] = []
-    Walker(Session(Twin(scene, excitation="sampled")), found.append).samples(stamps, wrench, stamps)
-    published = Published.joined([part.published for part in found])
+    walked: list[Walked] = []
+    Walker(Session(Twin(scene, excitation="sampled")), walked.append).samples(stamps, wrench, stamps)
+    published = Published.joined([part.published for part in walked])
     header = RunHeader(dump_scene(scene), parameters={"scene": "paper"})
     for day in range(days):
         place = folder / f"day_{day:02}"

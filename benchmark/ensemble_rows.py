@@ -116,8 +116,8 @@ def core_row(rows: Sequence[Row]) -> Row | None:
 
 def batch_row(rows: Sequence[Row]) -> Row | None:
     """Return the row of heyoka in batches at the tolerance that all pairs need, or None."""
-    found = [row for row in rows if row.section == SECTION and row.solver == BATCH and row.error is not None]
-    return next((row for row in found if (row.error or 0.0) <= LISTED), None)
+    matching = [row for row in rows if row.section == SECTION and row.solver == BATCH and row.error is not None]
+    return next((row for row in matching if (row.error or 0.0) <= LISTED), None)
 
 
 def _own_row(

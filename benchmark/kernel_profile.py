@@ -50,9 +50,9 @@ def _write_map() -> None:
         with tempfile.NamedTemporaryFile() as file:
             file.write(code)
             file.flush()
-            found = subprocess.run(["nm", "-S", "--defined-only", file.name], capture_output=True, text=True).stdout
+            symbols = subprocess.run(["nm", "-S", "--defined-only", file.name], capture_output=True, text=True).stdout
         engine = library._codegen._engine._ee
-        for fields in (line.split() for line in found.splitlines()):
+        for fields in (line.split() for line in symbols.splitlines()):
             if len(fields) == 4 and (address := engine.get_function_address(fields[3])):
                 kernel = re.findall(r"\d+([a-z_]+)B\d", fields[3])
                 lines.append(f"{address:x} {int(fields[1], 16):x} {kernel[-1] if kernel else fields[3][-40:]}\n")

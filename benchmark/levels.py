@@ -39,11 +39,11 @@ class Reached:
 
 
 def ladders(rows: Sequence[Row], scene: str, output_s: float, member: Member) -> list[list[Row]]:
-    found: dict[str, list[Row]] = {}
+    by_solver: dict[str, list[Row]] = {}
     for row in rows:
         if row.section == SECTION and row.scene == scene and row.output_s == output_s and member(row.solver):
-            found.setdefault(row.solver, []).append(row)
-    return list(found.values())
+            by_solver.setdefault(row.solver, []).append(row)
+    return list(by_solver.values())
 
 
 def reach(ladder: Sequence[Row], level: float) -> Reached | None:

@@ -206,8 +206,8 @@ def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, fl
 
 
 def quantiles(ages: list[float], without: Any = math.nan) -> dict[str, Any]:
-    found = sorted(ages)
-    return {f"age_p{p}_ms": round(found[len(found) * p // 100], 3) if found else without for p in (50, 99)}
+    ordered = sorted(ages)
+    return {f"age_p{p}_ms": round(ordered[len(ordered) * p // 100], 3) if ordered else without for p in (50, 99)}
 
 
 def environment() -> dict[str, str]:
@@ -224,12 +224,14 @@ def _twin(mode: str, folder: str, namespace: str = "/live_load", given: dict[str
 def estimating(seconds: float, repeats: int) -> None:
     runs: dict[bool, list[dict[str, float]]] = {False: [], True: []}
     for _ in range(repeats):
-        for on, found in runs.items():
-            found.append(_one_estimating(on, seconds))
-            print(json.dumps({"estimate": on, **found[-1]}), flush=True)
+        for on, results in runs.items():
+            results.append(_one_estimating(on, seconds))
+            print(json.dumps({"estimate": on, **results[-1]}), flush=True)
     print("medians", flush=True)
-    for on, found in runs.items():
-        print(json.dumps({"estimate": on} | {key: median(run[key] for run in found) for key in found[0]}), flush=True)
+    for on, results in runs.items():
+        print(
+            json.dumps({"estimate": on} | {key: median(run[key] for run in results) for key in results[0]}), flush=True
+        )
 
 
 def _one_estimating(on: bool, seconds: float) -> dict[str, float]:
@@ -275,13 +277,13 @@ def compare(seconds: float, repeats: int) -> None:
                 path = f"{folder}/{number}_{repeat}" if case.recorded else ""
                 answerer = [sys.executable, __file__, "--role", case.mode]
                 command = answerer if case in (ECHO, RAW_ECHO) else _twin(case.mode, path)
-                found = measure(command, case.rate_hz, seconds)
-                print(json.dumps(case._asdict() | found), flush=True)
-                if found["messages"]:  # a case without an answer is reported below
-                    runs[case].append(found)
+                measured = measure(command, case.rate_hz, seconds)
+                print(json.dumps(case._asdict() | measured), flush=True)
+                if measured["messages"]:  # a case without an answer is reported below
+                    runs[case].append(measured)
     if not all(runs.values()):
         sys.exit("a case was never answered: no medians")
-    rows = {case: {key: median(run[key] for run in found) for key in found[0]} for case, found in runs.items()}
+    rows = {case: {key: median(run[key] for run in results) for key in results[0]} for case, results in runs.items()}
     print("medians", flush=True)
     for case, row in rows.items():
         print(json.dumps(case._asdict() | row), flush=True)

@@ -90,16 +90,16 @@ def one_life(seed: int) -> list[dict[str, Any]]:
         known = coefficient(scene, history)
         now = with_clearances(scene, float(known.clearance[0]), float(known.clearance[1]), known.depth)
         plan = Plan(*limits(scene), horizon_h=50.0 * hours, draws=2000, seed=seed)
-        found = np.sort(forecast(now, plan, (float(known.deviation[0]), float(known.deviation[1])), known).hours)
+        ordered = np.sort(forecast(now, plan, (float(known.deviation[0]), float(known.deviation[1])), known).hours)
         left = (1.0 - share) * hours
-        median, low, high, low_90, high_90 = np.quantile(found, [0.5, *_INNER, *_INNER_90])
-        spread = np.abs(found - found[rng.permutation(len(found))]).mean()
+        median, low, high, low_90, high_90 = np.quantile(ordered, [0.5, *_INNER, *_INNER_90])
+        spread = np.abs(ordered - ordered[rng.permutation(len(ordered))]).mean()
         rows.append(
             {
                 "seed": seed, "share": share, "life_h": hours, "error": float(median / left - 1.0),
                 "inside_80": bool(low <= left <= high), "width": float((high - low) / left),
                 "inside_90": bool(low_90 <= left <= high_90), "width_90": float((high_90 - low_90) / left),
-                "crps": float((np.abs(found - left).mean() - 0.5 * spread) / hours),
+                "crps": float((np.abs(ordered - left).mean() - 0.5 * spread) / hours),
                 "coefficient_ratio": float(known.interval().mean / k_s),
                 "coefficient_p95_ratio": float(known.interval().p95 / k_s),
             }

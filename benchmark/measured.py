@@ -70,9 +70,9 @@ class Impacts:
             self.before, self.after = data["before"], data["after"]
         self.half = np.random.default_rng(1).permutation(len(self.before)) % 2
 
-    def missed(self, found: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    def missed(self, predicted: np.ndarray, chosen: np.ndarray) -> np.ndarray:
         """Return the norm of the velocity error [m/s]. Angular velocities are multiplied by the radius of gyration."""
-        return np.asarray(np.linalg.norm((found - self.after[chosen])[:, 3:] * [1.0, 1.0, GYRATION], axis=1))
+        return np.asarray(np.linalg.norm((predicted - self.after[chosen])[:, 3:] * [1.0, 1.0, GYRATION], axis=1))
 
     def fit(self, start: EllipseContact, names: tuple[str, ...], chosen: np.ndarray) -> EllipseContact:
         """Fit the named parameters to the chosen impacts. The fit minimises the root mean square of the errors."""
@@ -84,10 +84,18 @@ class Impacts:
             return replace(start, **numbers)
 
         def cost(values: np.ndarray) -> float:
-            found = contact(values)
-            if min(found.restitution, found.friction, found.slip_speed, found.stick_stiffness) < 0.0:
+            contact_found = contact(values)
+            if (
+                min(
+                    contact_found.restitution,
+                    contact_found.friction,
+                    contact_found.slip_speed,
+                    contact_found.stick_stiffness,
+                )
+                < 0.0
+            ):
                 return 9.0
-            return float((self.missed(impact(self.before[chosen], found), chosen) ** 2).mean())
+            return float((self.missed(impact(self.before[chosen], contact_found), chosen) ** 2).mean())
 
         simplex = np.vstack([first, first + np.diag(steps)])
         options = dict(maxfev=20 * len(names), initial_simplex=simplex, xatol=1e-3, fatol=1e-6)
@@ -113,8 +121,10 @@ class Impacts:
                 return float((self.missed(rigid_impact(self.before[chosen], model, *x), chosen) ** 2).mean())
 
             simplex = np.array([[0.54, 0.18], [0.6, 0.18], [0.54, 0.22]])
-            found = minimize(cost, simplex[0], method="Nelder-Mead", options=dict(initial_simplex=simplex, maxfev=40)).x
-            missed.append(self.missed(rigid_impact(self.before[held], model, *found), held))
+            optimum = minimize(
+                cost, simplex[0], method="Nelder-Mead", options=dict(initial_simplex=simplex, maxfev=40)
+            ).x
+            missed.append(self.missed(rigid_impact(self.before[held], model, *optimum), held))
         return errors(np.concatenate(missed))
 
     def floor(self) -> dict[str, Any]:
@@ -135,14 +145,14 @@ def errors(missed: np.ndarray) -> dict[str, Any]:
 def rigid_impact(before: np.ndarray, model: Any, e: float, mu: float) -> np.ndarray:
     """Return the states after rigid impacts at the lowest point; `model` returns the impulses (p_t, p_n)."""
     arm, up = contact_arms(before[:, 2])
-    inertia, found = GYRATION**2, before.copy()
+    inertia, after = GYRATION**2, before.copy()
     slip, rate = -before[:, 3] - before[:, 5] * up, before[:, 4] + before[:, 5] * arm
     mobility = 1.0 + up**2 / inertia, 1.0 + arm**2 / inertia, -arm * up / inertia
     along, away = model(slip, rate, *mobility, e, abs(mu))
-    found[:, 3] -= along
-    found[:, 4] += away
-    found[:, 5] += (arm * away - up * along) / inertia
-    return found
+    after[:, 3] -= along
+    after[:, 4] += away
+    after[:, 5] += (arm * away - up * along) / inertia
+    return after
 
 
 def routh(slip, rate, tt, nn, tn, e, mu, bit=2e-3, energetic=False):  # type: ignore[no-untyped-def]
@@ -334,12 +344,12 @@ class Square:
 
     def off(self, poses: Iterable[np.ndarray], chosen: np.ndarray, bounces: int) -> np.ndarray:
         """Return the mean distance [m] and angle [rad], shape (k, 2), of poses (k, rows, 3) from the chosen drops."""
-        found = []
+        errors = []
         for n, motion in zip(chosen, poses, strict=True):
             rows, first = self.rows[n, bounces - 1], self.first[n]
             off = motion[:rows] - self.drops.pose[self.usable[n], first : first + rows]
-            found.append((np.hypot(off[:, 0], off[:, 1]).mean(), np.abs(off[:, 2]).mean()))
-        return np.array(found)
+            errors.append((np.hypot(off[:, 0], off[:, 1]).mean(), np.abs(off[:, 2]).mean()))
+        return np.array(errors)
 
     def against_rigid(self) -> dict[str, Any]:
         """Return the errors of rigid and of compliant impacts over one bounce.
@@ -460,7 +470,7 @@ def medians(far: list[np.ndarray]) -> dict[str, Any]:
 
 def of_drops(drops: Drops) -> dict[str, Any]:
     """Return the distances of both blocks over one, two and three bounces, and coverage and score of the bands."""
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     kinds = {
         "rounded corners, falling restitution and friction, marker": (SQUARE, MARKER),
         "sharp corners, constant restitution and friction": (sharp(), Marker()),
@@ -481,14 +491,14 @@ def of_drops(drops: Drops) -> dict[str, Any]:
             scores.append(crps(members[:, given:], pose[given:until]).mean(axis=0))
             for bounce, (first, last) in enumerate(pairwise([given - 1, *lows[1:3]])):
                 inside[bounce].append(holds[first:last].mean(axis=0))
-        found[name] = {
+        results[name] = {
             **medians([square.errors(block, marker, every, bounces) for bounces in (1, 2, 3)]),
             "coverage": [np.round(np.mean(one, axis=0), 3).tolist() for one in inside if one],
             "crps_mm_mm_rad": np.round(np.mean(scores, axis=0) * [1e3, 1e3, 1.0], 2).tolist(),
             "crps_median": np.round(np.median(scores, axis=0) * [1e3, 1e3, 1.0], 2).tolist(),
         }
-        print(name, found[name], flush=True)
-    return found
+        print(name, results[name], flush=True)
+    return results
 
 
 def of_table(drops: Drops) -> dict[str, Any]:

@@ -14,20 +14,20 @@ _FRICTIONS = ("regularised", "spring", "spring and damper")
 
 
 def _part(name: str) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(RESULTS.read_text(encoding="utf-8"))[name]
-    return found
+    results: dict[str, Any] = json.loads(RESULTS.read_text(encoding="utf-8"))[name]
+    return results
 
 
 def measured_laws() -> str:
     """Return the table of RMS and median errors [m/s] of each contact law with each friction model."""
-    found = _part("ellipse")
+    results = _part("ellipse")
 
     def figures(name: str) -> str:
-        return f"{found[name]['rms']:.3f} / {found[name]['median']:.3f}" if name in found else ""
+        return f"{results[name]['rms']:.3f} / {results[name]['median']:.3f}" if name in results else ""
 
-    laws = [name.removesuffix(", regularised") for name in found if name.endswith(", regularised")]
+    laws = [name.removesuffix(", regularised") for name in results if name.endswith(", regularised")]
     rows = [[f"`{law}`" if " " not in law else law, *(figures(f"{law}, {one}") for one in _FRICTIONS)] for law in laws]
-    single = [name for name in found if not name.endswith(_FRICTIONS)]
+    single = [name for name in results if not name.endswith(_FRICTIONS)]
     return table(["RMS / median [m/s]", *_FRICTIONS], rows + [[name, figures(name), "", ""] for name in single])
 
 
@@ -53,26 +53,28 @@ def measured_drops() -> str:
 
 def measured_rigid() -> str:
     """Return the table of errors of rigid and compliant impacts, with and without simultaneous touches."""
-    found = _part("square_rigid")
-    e, mu = found["e, mu"]
+    results = _part("square_rigid")
+    e, mu = results["e, mu"]
     names = {
         "rigid": f"rigid, one corner at a time (Routh, Poisson; e {e:.2f}, mu {mu:.2f} fitted)",
         "compliant": "compliant",
     }
-    rows = [[text, *(f"{mm:.1f} mm" for mm in found[name])] for name, text in names.items()]
-    return table(["over one bounce", "all", f"two corners at once ({found['two_at_once']} drops)", "the others"], rows)
+    rows = [[text, *(f"{mm:.1f} mm" for mm in results[name])] for name, text in names.items()]
+    return table(
+        ["over one bounce", "all", f"two corners at once ({results['two_at_once']} drops)", "the others"], rows
+    )
 
 
 def measured_table() -> str:
-    found = _part("table")
+    results = _part("table")
     rows = {
-        "estimated": f"{found['estimated']} of {found['drops']} drops",
-        "median error": f"{found['median_mm']:.2f} mm",
-        "RMS error": f"{found['rms_mm']:.2f} mm",
-        "half width of the 90 % interval": f"{found['half_width_mm']:.2f} mm",
-        "coverage": f"{found['coverage']:.2f}",
-        "share within 0.5 mm": f"{found['within_half_mm']:.2f}",
-        "share within 0.5 mm or `rough`": f"{found['within_half_mm_or_rough']:.2f}",
+        "estimated": f"{results['estimated']} of {results['drops']} drops",
+        "median error": f"{results['median_mm']:.2f} mm",
+        "RMS error": f"{results['rms_mm']:.2f} mm",
+        "half width of the 90 % interval": f"{results['half_width_mm']:.2f} mm",
+        "coverage": f"{results['coverage']:.2f}",
+        "share within 0.5 mm": f"{results['within_half_mm']:.2f}",
+        "share within 0.5 mm or `rough`": f"{results['within_half_mm_or_rough']:.2f}",
     }
     return "\n".join(f"- {name}: {value}" for name, value in rows.items())
 

@@ -62,7 +62,7 @@ async def serve(port: int, rate_hz: float, seconds: float) -> None:
     good = ua.StatusCode(ua.UInt32(StatusCodes.Good))
     async with server:
         print("ready", flush=True)
-        while not any(found.monitored_item_srv._monitored_items for found in subscriptions.values()):
+        while not any(subscription.monitored_item_srv._monitored_items for subscription in subscriptions.values()):
             await asyncio.sleep(0.05)
         await asyncio.sleep(3.0)
         begin = time.monotonic()
@@ -97,8 +97,8 @@ async def hear(port: int) -> None:
         while len(ages) != heard or heard <= len(NODES):
             heard = len(ages)
             await asyncio.sleep(SILENCE_S)
-    found = ages[len(NODES) :]
-    print(json.dumps({"values": len(found)} | quantiles(found)))
+    ordered = ages[len(NODES) :]
+    print(json.dumps({"values": len(ordered)} | quantiles(ordered)))
 
 
 def measure(minutes: float, rate_hz: float) -> bool:
@@ -110,15 +110,15 @@ def measure(minutes: float, rate_hz: float) -> bool:
         )
     print(f"bare client: {bare.stdout.strip()}", flush=True)
     with tempfile.TemporaryDirectory() as folder, _server(rate_hz, seconds) as (server, port):
-        found, load = _live(Path(folder), server, port, rate_hz, seconds)
-    print(f"twin: {json.dumps(found)}", flush=True)
+        report, load = _live(Path(folder), server, port, rate_hz, seconds)
+    print(f"twin: {json.dumps(report)}", flush=True)
     print(f"mean load of the machine beside them {load:.2f} of {os.cpu_count()} cores, SCHED_FIFO granted: {at_once()}")
     sent = round(rate_hz * seconds)
-    unaccounted = sent - sum(found[key] for key in ("used", "dropped", "lost"))
+    unaccounted = sent - sum(report[key] for key in ("used", "dropped", "lost"))
     for text, reached, most in (
         ("samples not accounted for", unaccounted, 0),
-        ("age at the twin, 99 % [ms]", found["age_p99_ms"], MOST_AGE_MS),
-        ("share of a core, client and twin", found["core"], MOST_CORE),
+        ("age at the twin, 99 % [ms]", report["age_p99_ms"], MOST_AGE_MS),
+        ("share of a core, client and twin", report["core"], MOST_CORE),
     ):
         print(f"{'reached' if reached <= most else 'MISSED '} {reached:g} of {most:g}: {text}", flush=True)
     return unaccounted == 0

@@ -36,9 +36,9 @@ def random_rows(few: bool, notify: Callable[[str], None]) -> Iterator[Row]:
 
 def exponent_of(row: Row) -> float:
     """Return the exponent of the contact law, parsed from the name of the row's scene."""
-    found = re.search(r" n=(\S+)", row.scene)
-    assert found is not None
-    return float(found[1])
+    match = re.search(r" n=(\S+)", row.scene)
+    assert match is not None
+    return float(match[1])
 
 
 def _is_plain(scene: Scene) -> bool:

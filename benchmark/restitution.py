@@ -115,8 +115,8 @@ def valid_ranges(rows: Sequence[Row]) -> str:
 def page_table(rows: Sequence[Row]) -> str:
     lines = []
     for law in restitution_laws():
-        found = {row.asked: row.delivered for row in rows if row.law == law}
-        lines.append([f"`{law}`", *(f"{found[e]:.4f}" for e in SHOWN)])
+        delivered = {row.asked: row.delivered for row in rows if row.law == law}
+        lines.append([f"`{law}`", *(f"{delivered[e]:.4f}" for e in SHOWN)])
     return table(["law", *(f"{e:g}" for e in SHOWN)], lines)
 
 
@@ -139,8 +139,8 @@ def ramp_table(rows: Sequence[Row]) -> str:
     ratios = [row.asked for row in rows if row.law == "kelvin_voigt"]
     lines = []
     for ramp in RAMPS:
-        found = {row.asked: row.delivered for row in rows if row.law == "ramped_damping" and row.ramp == ramp}
-        lines.append([f"{ramp:g}", *(f"{found[z]:.4f}" for z in ratios)])
+        delivered = {row.asked: row.delivered for row in rows if row.law == "ramped_damping" and row.ramp == ramp}
+        lines.append([f"{ramp:g}", *(f"{delivered[z]:.4f}" for z in ratios)])
     return table(["ramp over v sqrt(m/K)", *(f"{z:g}" for z in ratios)], lines)
 
 

@@ -22,8 +22,8 @@ Impact = Callable[..., tuple[np.ndarray, np.ndarray]]
 def rigid_toss(initial: np.ndarray, rows: int, block: np.ndarray, impact: Impact, e: float, mu: float) -> np.ndarray:
     """Return the motions of m rigid blocks at 250 Hz, shape (m, rows, 6), given their initial states, shape (m, 6)."""
     z = initial.copy()
-    found = np.zeros((len(z), rows, 6))
-    found[:, 0] = z
+    states = np.zeros((len(z), rows, 6))
+    states[:, 0] = z
     drag = np.array([block["drag"], block["drag"], block["spin_drag"]])
     each = round(1.0 / (RATE_HZ * STEP))
     for row in range(1, rows):
@@ -32,8 +32,8 @@ def rigid_toss(initial: np.ndarray, rows: int, block: np.ndarray, impact: Impact
             z[:, :3] += (z[:, 3:] + 0.5 * STEP * rate) * STEP
             z[:, 3:] += STEP * rate
             _hit(z, block, impact, e, mu)
-        found[:, row] = z
-    return found
+        states[:, row] = z
+    return states
 
 
 def deepest(z: np.ndarray, block: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -67,10 +67,10 @@ def _hit(z: np.ndarray, block: np.ndarray, impact: Impact, e: float, mu: float) 
 
 def two_at_once(tossed: np.ndarray, rows: np.ndarray, block: np.ndarray, within: float) -> np.ndarray:
     """Return a mask of the motions, rows every 0.25 ms, in which two corners touch within a time `within` [s]."""
-    found = np.zeros(len(tossed), bool)
+    double = np.zeros(len(tossed), bool)
     width = math.ceil(within * 16.0 * RATE_HZ)
     for index, motion in enumerate(tossed):
         touching = deepest(motion[: rows[index]], block)[0] > 0.0
         near = np.lib.stride_tricks.sliding_window_view(touching, width, axis=0).any(axis=-1)
-        found[index] = bool((near.sum(axis=1) > 1).any())
-    return found
+        double[index] = bool((near.sum(axis=1) > 1).any())
+    return double

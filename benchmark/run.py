@@ -101,9 +101,9 @@ def _run(chosen: set[str], repeats: int, quick: bool, notify: Notify) -> list[Ro
     }
     for name, (more, fill) in further.items():
         if name in chosen:
-            found = measure(list(more), repeats, notify)
-            fill(found)
-            rows += found
+            measured = measure(list(more), repeats, notify)
+            fill(measured)
+            rows += measured
     if "sampled_load" in chosen:
         rows += live_rows.sampled_rows(repeats, notify)
     if "start" in chosen:

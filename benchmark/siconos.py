@@ -95,14 +95,14 @@ def rigid_motion(t_end: float, impacts: int) -> tuple[Array, Array, list[float]]
     time, state = 0.0, np.array([0.0, 0.0, *START])
     times: list[float] = [0.0]
     states: list[Array] = [state]
-    found: list[float] = []
-    while time < t_end and len(found) <= impacts:
+    impact_times: list[float] = []
+    while time < t_end and len(impact_times) <= impacts:
         part = solve_ivp(rate, (time, t_end), state, "DOP853", events=height, rtol=1e-12, atol=1e-14, max_step=1e-5)
         times += part.t[1:].tolist()
         states += list(part.y.T[1:])
         time, state = float(part.t[-1]), part.y[:, -1].copy()
         if part.status == 1:
-            found.append(time)
+            impact_times.append(time)
             mass, _ = inertia_and_force(state[:2], state[2:])
             row = across(state[:2])
             weight = np.linalg.solve(mass, row)
@@ -110,7 +110,7 @@ def rigid_motion(t_end: float, impacts: int) -> tuple[Array, Array, list[float]]
             # the rates jump, so the state after the impact is a second row
             times.append(math.nextafter(time, math.inf))
             states.append(state)
-    return np.array(times), np.array(states), found
+    return np.array(times), np.array(states), impact_times
 
 
 def our_slider(t: Array, angles: Array, rates: Array, stiffness: float, output_dt: float) -> Result:

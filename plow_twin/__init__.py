@@ -107,9 +107,9 @@ __all__ = [name for name, module in _HOMES.items() if not module.startswith(("pl
 def __getattr__(name: str) -> object:
     if name not in _HOMES:
         raise AttributeError(f"module 'plow_twin' has no attribute {name!r}")
-    found = getattr(_import_module(_HOMES[name]), name)
-    globals().setdefault(name, found)
-    return found
+    value = getattr(_import_module(_HOMES[name]), name)
+    globals().setdefault(name, value)
+    return value
 
 
 def __dir__() -> list[str]:

@@ -45,8 +45,8 @@ class Page:
             message = json.loads(self._socket.recv(timeout=60.0))
             if message.get("id") == self._number:
                 assert "error" not in message, message
-                found: dict[str, Any] = message["result"]
-                return found
+                result: dict[str, Any] = message["result"]
+                return result
             self._note(message)
 
     def open(self, url: str) -> None:
@@ -69,9 +69,9 @@ class Page:
                 self.errors.append(str(entry))
 
     def evaluate(self, expression: str) -> Any:
-        found = self.call("Runtime.evaluate", expression=expression)
-        assert "exceptionDetails" not in found, found
-        return found["result"].get("value")
+        answer = self.call("Runtime.evaluate", expression=expression)
+        assert "exceptionDetails" not in answer, answer
+        return answer["result"].get("value")
 
     def picture(self) -> bytes:
         return base64.b64decode(self.call("Page.captureScreenshot")["data"])
@@ -120,8 +120,8 @@ class FirefoxPage:
             message = json.loads(self._socket.recv(timeout=60.0))
             if message.get("id") == self._number:
                 assert message["type"] == "success", message
-                found: dict[str, Any] = message["result"]
-                return found
+                result: dict[str, Any] = message["result"]
+                return result
             if message.get("method") == "log.entryAdded" and message["params"]["level"] == "error":
                 self.errors.append(str(message["params"]["text"]))
 
@@ -132,9 +132,9 @@ class FirefoxPage:
     def evaluate(self, expression: str) -> Any:
         """Return the value of an expression in the page: text, number or truth value."""
         target = {"context": self._context}
-        found = self._call("script.evaluate", expression=expression, target=target, awaitPromise=False)
-        assert found["type"] == "success", found
-        return found["result"].get("value")
+        answer = self._call("script.evaluate", expression=expression, target=target, awaitPromise=False)
+        assert answer["type"] == "success", answer
+        return answer["result"].get("value")
 
     def picture(self) -> bytes:
         return base64.b64decode(self._call("browsingContext.captureScreenshot", context=self._context)["data"])

@@ -180,7 +180,7 @@ class Fork:
                 texts[number] = stream.read()
 
         outputs = enumerate((self.stdout, self.stderr))
-        streams = [(number, found) for number, found in outputs if found is not None and not found.closed]
+        streams = [(number, output) for number, output in outputs if output is not None and not output.closed]
         readers = [Thread(target=read, args=found, daemon=True) for found in streams]
         for reader in readers:
             reader.start()

@@ -83,12 +83,12 @@ def lend(python: Path, *names: str) -> None:
         if (name := waiting.pop()) in known:
             continue
         known.add(name)
-        found = distribution(name)
-        needed = (Requirement(text) for text in found.requires or ())
+        package = distribution(name)
+        needed = (Requirement(text) for text in package.requires or ())
         waiting += [one.name for one in needed if one.marker is None or one.marker.evaluate({"extra": ""})]
-        for part in {file.parts[0] for file in found.files or ()} - {"..", "__pycache__"}:
+        for part in {file.parts[0] for file in package.files or ()} - {"..", "__pycache__"}:
             if not (site / part).exists():
-                (site / part).symlink_to(found.locate_file(part))
+                (site / part).symlink_to(package.locate_file(part))
 
 
 def install(python: Path, *requirements: str) -> None:

@@ -68,8 +68,8 @@ class Plant:
 
     async def number(self, more: int) -> None:
         """Let all subscriptions skip sequence numbers, as if messages were lost, or repeat a number."""
-        for found in self._server.iserver.subscription_service.subscriptions.values():
-            found._notification_seq += more
+        for subscription in self._server.iserver.subscription_service.subscriptions.values():
+            subscription._notification_seq += more
 
     async def lie(self, kind: str) -> None:
         """Answer requests of the history with data from the far future, or with endless data."""

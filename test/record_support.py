@@ -157,7 +157,7 @@ def chunk_spans(file: Path, *, journal: bool | None = None) -> list[tuple[int, i
             inside = breakup_chunk(record) if isinstance(record, records.Chunk) else [record]
             topics.update({item.id: item.topic for item in inside if isinstance(item, records.Channel)})
             if isinstance(record, records.Chunk):
-                found = [topics[item.channel_id] for item in inside if isinstance(item, records.Message)]
-                if journal in (None, any("/journal/" in topic for topic in found)):
+                topics_found = [topics[item.channel_id] for item in inside if isinstance(item, records.Message)]
+                if journal in (None, any("/journal/" in topic for topic in topics_found)):
                     spans.append((stream.tell() - len(record.data), len(record.data)))
     return spans

@@ -39,11 +39,11 @@ def computed_once(name: str, compute: Callable[[], T]) -> T:
     with _locked(name) as file:
         file.seek(0)
         if content := file.read():
-            found: T = pickle.loads(content)
-            return found
-        found = compute()
-        file.write(pickle.dumps(found))
-        return found
+            result: T = pickle.loads(content)
+            return result
+        result = compute()
+        file.write(pickle.dumps(result))
+        return result
 
 
 def compile_once() -> None:

@@ -70,7 +70,7 @@ def test_each_statistic_of_a_run_is_printed_on_one_line(printed: Callable[..., l
 def test_a_recording_and_its_replay_are_described_in_words(printed: Callable[..., list[str]], tmp_path: Path) -> None:
     made = record_run(tmp_path / "run", map(paper_sample, range(50)))
     shown = printed("info", made.folder)
-    columns = {found.end() for line in shown if (found := re.match(r" *\S+ +(?=\S)", line))}
+    columns = {match.end() for line in shown if (match := re.match(r" *\S+ +(?=\S)", line))}
     assert len(columns) == 1  # longer names, such as those of the journal, do not move their values
     lines = shown + printed("replay", made.folder) + printed("doctor", made.folder)
     text = "\n".join(lines)

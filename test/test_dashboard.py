@@ -330,8 +330,8 @@ def _stopped(process: subprocess.Popen[str]) -> dict[str, Any]:
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
-    found: dict[str, Any] = json.loads(out)
-    return found
+    shown: dict[str, Any] = json.loads(out)
+    return shown
 
 
 def _digests(run: Path) -> list[Digest]:
@@ -520,22 +520,22 @@ def test_a_browser_shows_the_twin_and_names_as_text_and_loads_only_from_the_serv
         page = opened.enter_context(browser.page(tmp_path / "browser", f"{url}#token={TOKEN.replace(' ', '%20')}"))
 
         def seen(reached: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-            found: dict[str, Any] = {}
-            until(lambda: found.update(json.loads(page.evaluate(_SEEN))) or reached(found), (found, page.errors), 0.2)
-            return found
+            shown: dict[str, Any] = {}
+            until(lambda: shown.update(json.loads(page.evaluate(_SEEN))) or reached(shown), (shown, page.errors), 0.2)
+            return shown
 
-        seen(lambda found: not found["banner"])
+        seen(lambda page_facts: not page_facts["banner"])
         _feed(process)
-        found = seen(lambda found: "6000" in found["inputs"] and "was warn" in found["alarms"])
-        assert found["pads"] == 8 and found["charts"] == 3 and len(set(found["colors"])) > 1
-        assert "25.000 mm" in found["clearance"] and "assumed" in found["clearance"]
-        assert found["seconds"] >= 6 and "kN m" in found["load"] and name in found["source"]
+        shown = seen(lambda found: "6000" in found["inputs"] and "was warn" in found["alarms"])
+        assert shown["pads"] == 8 and shown["charts"] == 3 and len(set(shown["colors"])) > 1
+        assert "25.000 mm" in shown["clearance"] and "assumed" in shown["clearance"]
+        assert shown["seconds"] >= 6 and "kN m" in shown["load"] and name in shown["source"]
         _check_readable(page)
         page.evaluate("document.getElementById('mark-text').value = \"<img src=x onerror='window.fooled=1'>\"")
         page.evaluate("document.querySelector('#mark button').click()")
         page.evaluate("document.getElementById('acknowledge').click()")
-        found = seen(lambda found: "acknowledge" in found["events"] and name in found["events"])
-        assert "was" not in found["alarms"] and not found["fooled"]
+        shown = seen(lambda found: "acknowledge" in found["events"] and name in found["events"])
+        assert "was" not in shown["alarms"] and not shown["fooled"]
         assert page.evaluate("location.hash + location.search") == ""
         _stopped(process)
         seen(lambda found: "ended" in found["banner"] or "lost" in found["banner"])
@@ -548,12 +548,12 @@ def test_firefox_shows_the_twin(tmp_path: Path) -> None:
         url = said.partition("#")[0].split()[-1]
         with browser.firefox_page(tmp_path / "firefox", url) as page:
             _feed(process)
-            found: dict[str, Any] = {}
+            shown: dict[str, Any] = {}
             until(
-                lambda: found.update(json.loads(page.evaluate(_SEEN)))
-                or ("6000" in found["inputs"] and "was warn" in found["alarms"]),
-                (found, page.errors), 0.2,
+                lambda: shown.update(json.loads(page.evaluate(_SEEN)))
+                or ("6000" in shown["inputs"] and "was warn" in shown["alarms"]),
+                (shown, page.errors), 0.2,
             )  # fmt: skip
-            assert (found["pads"], found["charts"], page.errors) == (8, 3, [])
-            assert "25.000 mm" in found["clearance"] and not found["banner"]
+            assert (shown["pads"], shown["charts"], page.errors) == (8, 3, [])
+            assert "25.000 mm" in shown["clearance"] and not shown["banner"]
         _stopped(process)

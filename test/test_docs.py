@@ -106,8 +106,8 @@ def test_the_reference_page_lists_exactly_the_public_names() -> None:
 def test_no_heading_begins_with_a_digit() -> None:
     """The table of contents selects headings by CSS selectors, which must not begin with a digit."""
     pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "examples").glob("**/README.md")]
-    found = [line for page in pages for line in re.findall(r"^#+ \d.*", page.read_text(), re.MULTILINE)]
-    assert found == []
+    headings = [line for page in pages for line in re.findall(r"^#+ \d.*", page.read_text(), re.MULTILINE)]
+    assert headings == []
 
 
 def test_every_row_of_a_table_is_a_single_line() -> None:

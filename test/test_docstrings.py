@@ -25,12 +25,12 @@ def package() -> griffe.Module:
 def public(package: griffe.Module) -> Iterator[tuple[str, Any]]:
     """Yield all public functions and classes, and the public methods and properties of these classes."""
     for name in re.findall(r"^::: plow_twin\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE):
-        found = package[name]
-        found = found.final_target if found.is_alias else found
-        if found.is_class or found.is_function:
-            yield name, found
-        if found.is_class:
-            members = ((key, member) for key, member in found.members.items() if not key.startswith("_"))
+        item = package[name]
+        item = item.final_target if item.is_alias else item
+        if item.is_class or item.is_function:
+            yield name, item
+        if item.is_class:
+            members = ((key, member) for key, member in item.members.items() if not key.startswith("_"))
             yield from ((f"{name}.{key}", member) for key, member in members if member.is_function)
 
 
@@ -103,10 +103,10 @@ def test_errors_that_a_function_raises_are_documented(package: griffe.Module) ->
 
 def test_no_docstring_begins_with_an_empty_word() -> None:
     """A docstring begins with a verb or the name of its subject, for example `Return whether`, not `Tell whether`."""
-    found = []
+    mistakes = []
     for folder in ("plow_twin", "test", "benchmark", "tools", "studies", "examples", "launch"):
         for path in (ROOT / folder).rglob("*.py"):
             nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, DOCUMENTED)]
             first = [(ast.get_docstring(node) or "-").split(maxsplit=1)[0] for node in nodes]
-            found += [f"{path.relative_to(ROOT)}: {word}" for word in first if word in ("What", "Tell", "Tells")]
-    assert found == []
+            mistakes += [f"{path.relative_to(ROOT)}: {word}" for word in first if word in ("What", "Tell", "Tells")]
+    assert mistakes == []

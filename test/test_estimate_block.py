@@ -47,9 +47,9 @@ def of_drop(drops: Drops, index: int, off: float = 0.0, scene: Scene | None = No
 
 def test_height_of_the_table_follows_from_measured_drops(drops) -> None:
     rng = np.random.default_rng(4)
-    found = [of_drop(drops, index, 0.005 * rng.standard_normal()) for index in range(0, 250, 4)]
-    known = [one for one in found if one.vertical_state.known]
-    assert len(known) > 0.9 * len(found)
+    result = [of_drop(drops, index, 0.005 * rng.standard_normal()) for index in range(0, 250, 4)]
+    known = [one for one in result if one.vertical_state.known]
+    assert len(known) > 0.9 * len(result)
     true = SQUARE.clearance.vertical_m
     # an error of the clearance causes half the error in the height of the table
     off = 0.5 * np.array([one.vertical.mean - true for one in known])
@@ -156,21 +156,21 @@ def test_command_estimates_a_drop(follows: bool, drops, tmp_path) -> None:
         assert rows.shape[1] == 1 + count and np.isfinite(rows).all()
         met = {column for column, values in zip(names, rows.T, strict=True) if "left" in column and values.any()}
         assert met and all("bottom_left_bottom" in column for column in met)
-    found = json.loads(done.stdout)
-    assert found["vertical"]["state"] in ("estimated", "rough")
-    assert abs(0.5 * (found["vertical"]["mean_m"] - SQUARE.clearance.vertical_m)) < 2e-3
-    assert found["figures"]["restitution"] == pytest.approx(0.5, abs=0.3)
+    result = json.loads(done.stdout)
+    assert result["vertical"]["state"] in ("estimated", "rough")
+    assert abs(0.5 * (result["vertical"]["mean_m"] - SQUARE.clearance.vertical_m)) < 2e-3
+    assert result["figures"]["restitution"] == pytest.approx(0.5, abs=0.3)
 
 
 @pytest.fixture(scope="module")
 def elastic() -> dict[float, tuple[np.ndarray, np.ndarray]]:
     """Return times and poses of a block in a guide with clearances of 30 mm and 22 mm, for each stiffness."""
-    found = {}
+    motions = {}
     for stiffness in (1e4, 1e8):
         motion = simulate(guide(stiffness), t_end=12.0, output_dt=0.004, tol=1e-6, energy_balance=True)
         noise = np.random.default_rng(1).normal(0.0, [3e-5, 3e-5, 2e-4], motion.q.shape)
-        found[stiffness] = motion.t, motion.q + noise
-    return found
+        motions[stiffness] = motion.t, motion.q + noise
+    return motions
 
 
 def guide(stiffness: float) -> Scene:

@@ -85,12 +85,12 @@ def test_a_clearance_at_its_bound_is_not_observable() -> None:
     truth = draw(replace(GROUPS["plain"], periods=3.0), 2)
     unknowns = Unknowns(truth.nominal)
     forward = Forward(truth.nominal, truth.load)
-    problem, found = search.candidate(forward, unknowns, truth.poses, truth.load.period()) or (None, None)
-    assert problem is not None and found is not None
-    shared = found.shared.copy()
+    problem, fit_found = search.candidate(forward, unknowns, truth.poses, truth.load.period()) or (None, None)
+    assert problem is not None and fit_found is not None
+    shared = fit_found.shared.copy()
     shared[GX] = LEAST_CLEARANCE
-    bound = replace(found, point=replace(found.point, shared=shared))
-    for one, state in ((found, State.ESTIMATED), (bound, State.NOT_OBSERVABLE)):
+    bound = replace(fit_found, point=replace(fit_found.point, shared=shared))
+    for one, state in ((fit_found, State.ESTIMATED), (bound, State.NOT_OBSERVABLE)):
         result = summarise(problem, one, Verdict(broken=True), 0)
         assert result.horizontal_state is state and result.vertical_state is State.ESTIMATED
     assert result.horizontal.p95 - result.horizontal.p05 > 5e-3
@@ -99,19 +99,19 @@ def test_a_clearance_at_its_bound_is_not_observable() -> None:
 def test_a_wall_that_is_not_touched_is_behind_the_range_of_motion_minus_the_penetrations() -> None:
     truth = draw(replace(GROUPS["plain"], periods=3.0), 2)
     unknowns = Unknowns(truth.nominal)
-    problem, found = search.candidate(
+    problem, fit_found = search.candidate(
         Forward(truth.nominal, truth.load), unknowns, truth.poses, truth.load.period()
     ) or (None, None)
-    assert problem is not None and found is not None
-    contact, turn = found.point.contact.copy(), np.array([0.0, 0.0, 0.1])
+    assert problem is not None and fit_found is not None
+    contact, turn = fit_found.point.contact.copy(), np.array([0.0, 0.0, 0.1])
     contact[:, [1, 7]] = 0.0
     ends = []
     for bias in (0.0 * turn, turn):  # an angle of the sensor makes the range of motion larger
-        window, shared = problem.window, found.shared.copy()
+        window, shared = problem.window, fit_found.shared.copy()
         shared[BIAS] += bias
         problem.window = replace(window, poses=window.poses.moved(bias))
-        point = replace(found.point, contact=contact, shared=shared)
-        result = summarise(problem, replace(found, point=point), Verdict(broken=True), 0)
+        point = replace(fit_found.point, contact=contact, shared=shared)
+        result = summarise(problem, replace(fit_found, point=point), Verdict(broken=True), 0)
         problem.window = window
         assert result.horizontal_state is State.NOT_OBSERVABLE
         ends.append(result.horizontal.p05)
@@ -124,9 +124,9 @@ def test_a_change_without_effect_on_the_motion_has_no_derivative() -> None:
     truth = draw(replace(GROUPS["plain"], periods=3.0), 2)
     unknowns, share = Unknowns(truth.nominal), 1e-5
     forward = Forward(truth.nominal, truth.load)
-    problem, found = search.candidate(forward, unknowns, truth.poses, truth.load.period()) or (None, None)
-    assert problem is not None and found is not None
-    point, step = found.point, np.zeros(SIZE)
+    problem, fit_found = search.candidate(forward, unknowns, truth.poses, truth.load.period()) or (None, None)
+    assert problem is not None and fit_found is not None
+    point, step = fit_found.point, np.zeros(SIZE)
 
     def heavier(scene: Scene) -> Scene:
         head = scene.head
@@ -169,12 +169,12 @@ def test_equal_results_of_different_starts_end_the_search(
     fitted = Mock(side_effect=fit)
     monkeypatch.setattr(search, "fit", fitted)
     forward, unknowns = Forward(truth.nominal, truth.load), Unknowns(truth.nominal)
-    problem, found = search.candidate(forward, unknowns, truth.poses, truth.load.period()) or (None, None)
-    assert problem is not None and found is not None
+    problem, fit_found = search.candidate(forward, unknowns, truth.poses, truth.load.period()) or (None, None)
+    assert problem is not None and fit_found is not None
     assert least <= fitted.call_count <= most
     # one call gives the derivatives with respect to all six initial values; each other unknown needs one call
     run = Mock(side_effect=forward.run)
     monkeypatch.setattr(forward, "run", run)
-    problem.linearise(found.point)
+    problem.linearise(fit_found.point)
     swings = problem.window.swings
     assert sorted(len(call.args[3]) for call in run.call_args_list) == [swings] * len(MOVING) + [6 * swings]

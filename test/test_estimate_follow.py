@@ -260,8 +260,8 @@ def test_a_restored_motion_keeps_the_harmonics_of_the_load_in_phase(truth: Truth
     session = Session(Follower(truth.nominal, MEMBERS), 0)
     applied(session, slice(51))
     wave = Harmonics(2.0, (2,), np.ones(3), np.array([[0.0] * 3, [1e3] * 3, [0.0] * 3]), np.zeros((3, 3)))
-    found = json.dumps(replace(_known(truth), load_harmonics=wave).as_dict())
-    session.apply(Estimated(200_000_000, 500_000_000, 1, 1, (), (0.0,) * 6, found))
+    text = json.dumps(replace(_known(truth), load_harmonics=wave).as_dict())
+    session.apply(Estimated(200_000_000, 500_000_000, 1, 1, (), (0.0,) * 6, text))
     following, saved = session.following, session.snapshot().data
     assert isinstance(following, Follower) and following.estimate is not None
     before = following.estimate.load_harmonics
@@ -301,11 +301,11 @@ def test_intervals_allow_for_the_load_error_of_a_rough_estimate(truth: Truth, fo
     rough = replace(_known(truth, State.ROUGH), figures=figures)
     wrench = truth.load.wrench + np.array([4e3, 0.0, 0.0])
     held, there = {}, slice(200, 401)
-    for name, found in (("plain", _known(truth)), ("rough", rough)):
+    for name, estimate in (("plain", _known(truth)), ("rough", rough)):
         follower = Follower(truth.nominal, MEMBERS)
         follower.every_row = True
         _run(follower, truth, 1.0)
-        assert _take(follower, found)
+        assert _take(follower, estimate)
         off = replace(truth, load=replace(truth.load, wrench=wrench))
         _run(follower, off, 1.995, 1.0)
         saved, told = follower.snapshot(), np.zeros(201, ROW)

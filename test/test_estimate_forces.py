@@ -34,17 +34,17 @@ def truth() -> Truth:
 
 @pytest.fixture(scope="module")
 def fitted(truth: Truth) -> tuple[Estimate, Problem, Fit]:
-    found: list[tuple[Problem, Fit]] = []
+    fits: list[tuple[Problem, Fit]] = []
     plain, summarise = pytest.MonkeyPatch(), estimating.summarise
     with plain.context() as patch:
 
         def seen(problem: Problem, fit: Fit, *others: object) -> Estimate:
-            found.append((problem, fit))
+            fits.append((problem, fit))
             return summarise(problem, fit, *others)  # type: ignore[arg-type]
 
         patch.setattr(estimating, "summarise", seen)
         result = estimating.estimate(truth.nominal, truth.load, truth.poses)
-    return result, *found[-1]
+    return result, *fits[-1]
 
 
 def _exact(result: Estimate) -> dict[str, Interval]:
@@ -86,11 +86,11 @@ def test_a_cell_that_contradicts_the_motion_is_named(
     else:
         force[:, 2] *= 1e-3
     result, problem, fit = fitted
-    found = summary._with_forces(result, problem, fit, replace(truth.forces, force=force), 1.0)
-    assert (found.sensor, found.model, found.horizontal_state) == ("suspect", "ok", State.WITHDRAWN)
+    estimated = summary._with_forces(result, problem, fit, replace(truth.forces, force=force), 1.0)
+    assert (estimated.sensor, estimated.model, estimated.horizontal_state) == ("suspect", "ok", State.WITHDRAWN)
     named = {PAIR_NAMES[2], PAIR_NAMES[5]} if fault == "swapped" else {PAIR_NAMES[2]}
-    assert {name for name in PAIR_NAMES if any(f" {name}:" in why for why in found.reasons)} == named
-    assert found.stiffness == result.stiffness and found.as_dict()["forces_measured"]["rows"] == 0
+    assert {name for name in PAIR_NAMES if any(f" {name}:" in why for why in estimated.reasons)} == named
+    assert estimated.stiffness == result.stiffness and estimated.as_dict()["forces_measured"]["rows"] == 0
 
 
 def test_forces_of_another_law_make_the_model_suspect(truth: Truth, fitted: tuple[Estimate, Problem, Fit]) -> None:
@@ -106,9 +106,9 @@ def test_forces_of_another_law_make_the_model_suspect(truth: Truth, fitted: tupl
     contact = Contact(law="kelvin_voigt", stiffness=truth.scene.contact.stiffness, damping=1e5)
     force = forces_at(replace(truth.scene, contact=contact), -point.residual, point.rate)[1]
     force += 1e3 * np.random.default_rng(0).standard_normal(measured.shape)
-    found = summary._with_forces(result, problem, fit, ContactForces.of(t, force)[0], 1.0)
-    assert (found.model, found.sensor, found.vertical_state) == ("suspect", "ok", State.WITHDRAWN)
-    assert found.stiffness == result.stiffness and "remain unexplained" in found.reasons[-1]
+    estimated = summary._with_forces(result, problem, fit, ContactForces.of(t, force)[0], 1.0)
+    assert (estimated.model, estimated.sensor, estimated.vertical_state) == ("suspect", "ok", State.WITHDRAWN)
+    assert estimated.stiffness == result.stiffness and "remain unexplained" in estimated.reasons[-1]
 
 
 def test_the_law_s_forces_are_those_of_the_solver() -> None:

@@ -37,16 +37,16 @@ def test_gaps_give_the_clearances_without_a_contact_model(
     some = np.full_like(gap, np.nan)
     some[:, list(pairs)] = gap[:, list(pairs)]
     gaps, _ = Gaps.of(truth.poses.t, some)
-    found = fit_gaps(truth.nominal, gaps, truth.poses)
-    assert isinstance(found, GapsFit)
-    assert (np.abs(found.clearance - truth.clearance) < 3.0 * found.deviation).all() and (
-        found.deviation < 1.5e-4
+    gap_fit = fit_gaps(truth.nominal, gaps, truth.poses)
+    assert isinstance(gap_fit, GapsFit)
+    assert (np.abs(gap_fit.clearance - truth.clearance) < 3.0 * gap_fit.deviation).all() and (
+        gap_fit.deviation < 1.5e-4
     ).all()
-    assert len(found.poses.t) == (len(gap) if len(pairs) > 4 else 0)
+    assert len(gap_fit.poses.t) == (len(gap) if len(pairs) > 4 else 0)
     if len(pairs) > 4:
-        assert np.abs(np.median(found.poses.q - truth.poses.q, axis=0)).max() < 1e-3
-    assert found.groups.keys() == ({"horizontal_top", "vertical_left"} if len(pairs) < 8 else set(found.groups))
-    for name, value in found.groups.items():
+        assert np.abs(np.median(gap_fit.poses.q - truth.poses.q, axis=0)).max() < 1e-3
+    assert gap_fit.groups.keys() == ({"horizontal_top", "vertical_left"} if len(pairs) < 8 else set(gap_fit.groups))
+    for name, value in gap_fit.groups.items():
         true = truth.clearance[0 if name.startswith("horizontal") else 1]
         assert abs(value.mean - true) < 4.0 * SENSOR_ERROR
 
@@ -93,8 +93,8 @@ def test_gaps_without_a_pose_give_an_estimate_and_a_shifted_gap_is_found(gapped:
         assert abs(value.mean - true) < 1e-4 and value.p95 - value.p05 < 3e-4
     shifted = gap.copy()
     shifted[:, 1] += 2e-3
-    found = fit_gaps(truth.nominal, Gaps.of(truth.poses.t, shifted)[0], truth.poses)
-    assert isinstance(found, GapsFit) and found.contradiction > 5.0
-    result = with_gaps(known()[0][1], found)
+    gap_fit = fit_gaps(truth.nominal, Gaps.of(truth.poses.t, shifted)[0], truth.poses)
+    assert isinstance(gap_fit, GapsFit) and gap_fit.contradiction > 5.0
+    result = with_gaps(known()[0][1], gap_fit)
     assert result.horizontal_state is result.vertical_state is State.WITHDRAWN and result.sensor == "suspect"
     assert "gaps:" in result.reasons[0]

@@ -204,8 +204,8 @@ def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, caps
     clearance = np.array([0.025, 0.030]) + grown + noise * rng.standard_normal(grown.shape)
     history = History(spans * FAST.travel_speed_m_s, clearance, np.full(grown.shape, noise))
     known = coefficient(scene, history)
-    found = known.interval()
-    assert found.p05 < true_k < found.p95 and found.p95 / found.p05 < 1.3**2
+    interval = known.interval()
+    assert interval.p05 < true_k < interval.p95 and interval.p95 / interval.p05 < 1.3**2
     # without noise, the clearances would determine the coefficient exactly, but the interval includes the error of the
     # path
     sure = replace(known, weight=np.eye(len(known.value))[len(known.value) // 2]).interval()
@@ -233,7 +233,7 @@ def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, caps
     limits = ["--limit-horizontal", "30", "--limit-vertical", "35", "--horizon", "1", "--json", "--history", str(csv)]
     capsys.readouterr()
     assert cli(["forecast", str(file), *limits]) == 0
-    assert json.loads(capsys.readouterr().out)["coefficient_m2_n"]["mean"] == pytest.approx(found.mean)
+    assert json.loads(capsys.readouterr().out)["coefficient_m2_n"]["mean"] == pytest.approx(interval.mean)
 
 
 def test_a_forecast_wears_the_pads_by_the_contact_that_was_estimated() -> None:
@@ -304,7 +304,7 @@ def test_a_history_that_shrinks_is_refused() -> None:
 def test_unusable_input_of_a_forecast_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """There is no forecast for a stop beyond the horizon, an empty estimate or a missing contact."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
-    file, found, history = (tmp_path / name for name in ("scene.yaml", "estimate.json", "history.csv"))
+    file, estimate_file, history = (tmp_path / name for name in ("scene.yaml", "estimate.json", "history.csv"))
     file.write_text(dump_scene(scene))
     # a spreadsheet may write the history with a byte order mark, semicolons and decimal commas
     sheet = "\ufeffkm;horizontal_mm;horizontal_sd_mm;vertical_mm;vertical_sd_mm\n0,0;25;1;30;1\n9;25;1;30;1\n"
@@ -332,10 +332,12 @@ def test_unusable_input_of_a_forecast_is_refused(tmp_path: Path, capsys: pytest.
         (json.dumps({"horizontal": whole, "vertical": whole | {"state": "withdrawn"}}), "a withdrawn vertical"),
         (json.dumps({"horizontal": whole, "vertical": whole | {"p05_m": float("nan")}}), "expected finite values"),
     ):
-        found.write_text(text)
-        assert expected in " ".join(said("--estimate", str(found)).split())
-    found.write_text(json.dumps({"horizontal": whole, "vertical": whole, "stiffness": {"mean": -1e7}}))
-    assert "estimate: stiffness: got {'mean': -10000000.0}" in said("--estimate", str(found), "--history", str(history))
+        estimate_file.write_text(text)
+        assert expected in " ".join(said("--estimate", str(estimate_file)).split())
+    estimate_file.write_text(json.dumps({"horizontal": whole, "vertical": whole, "stiffness": {"mean": -1e7}}))
+    assert "estimate: stiffness: got {'mean': -10000000.0}" in said(
+        "--estimate", str(estimate_file), "--history", str(history)
+    )
 
 
 def test_a_history_that_cannot_be_used_is_refused() -> None:

@@ -203,18 +203,18 @@ def test_the_live_estimate_is_published_and_repeated_by_the_journal(tmp_path: Pa
         probe.until(lambda: heard and heard[-1].header.stamp.sec == last_s, "the last window's estimate", 100.0)
         probe.until_figure("estimate", "estimates", *map(str, range(1, 9)))
         probe.until(lambda: value(probe.status[-1], "horizontal") == "estimated", "the flag")
-        found = dict(zip(heard[-1].name, heard[-1].position, strict=True))
+        published = dict(zip(heard[-1].name, heard[-1].position, strict=True))
         # the hold policy applies the estimate in the next slow publication
-        probe.until(lambda: abs(clearances[-1].position[0] - found["horizontal"]) < 1e-9, "the clearance")
+        probe.until(lambda: abs(clearances[-1].position[0] - published["horizontal"]) < 1e-9, "the clearance")
         last = dict(zip(clearances[-1].name, clearances[-1].position, strict=True))
         status: DiagnosticStatus = probe.status[-1]
         answer = probe.call(Trigger, f"{running.namespace}/plow_twin/forecast", Trigger.Request())
         assert running.twin.stop() == 0
     for name, true in zip(("horizontal", "vertical"), truth.clearance, strict=True):
-        assert found[f"{name}/p05"] < found[name] < found[f"{name}/p95"]
-        assert found[name] == pytest.approx(true, abs=3e-4)
+        assert published[f"{name}/p05"] < published[name] < published[f"{name}/p95"]
+        assert published[name] == pytest.approx(true, abs=3e-4)
         assert [last[f"{name}{point}"] for point in ("", "/p05", "/p95")] == pytest.approx(
-            [found[f"{name}{point}"] for point in ("", "/p05", "/p95")], abs=1e-12
+            [published[f"{name}{point}"] for point in ("", "/p05", "/p95")], abs=1e-12
         )
         assert value(status, name) == "estimated"
     assert (value(status, "model"), value(status, "sensor")) == ("ok", "ok")
@@ -223,7 +223,7 @@ def test_the_live_estimate_is_published_and_repeated_by_the_journal(tmp_path: Pa
     assert completed.returncode == 0, completed.stderr
     facts = json.loads(completed.stdout)
     assert facts["live"]["repeated"] is True and facts["live"]["estimates"] >= 1
-    assert facts["horizontal"]["mean_m"] == found["horizontal"]
+    assert facts["horizontal"]["mean_m"] == published["horizontal"]
     # gaps were measured, so clearances of the groups of pads are estimated too
     group = facts["groups"]["horizontal_top"]
     assert group["mean_m"] == pytest.approx(truth.clearance[0], abs=3e-4) and group["p95_m"] - group["p05_m"] > 4e-4
@@ -254,9 +254,9 @@ def test_without_a_load_the_interval_of_the_rough_clearance_contains_the_truth(t
         probe.until(lambda: len(heard) >= 1, "an estimate", 100.0)
         probe.until(lambda: value(probe.status[-1], "horizontal") == "rough", "the flag")
         assert [value(probe.status[-1], key) for key in ("vertical", "model")] == ["rough", "suspect"]
-    found = dict(zip(heard[-1].name, heard[-1].position, strict=True))
+    published = dict(zip(heard[-1].name, heard[-1].position, strict=True))
     for name, true in zip(("horizontal", "vertical"), truth.clearance, strict=True):
-        assert found[f"{name}/p05"] < true < found[f"{name}/p95"] < found[f"{name}/p05"] + 5e-3
+        assert published[f"{name}/p05"] < true < published[f"{name}/p95"] < published[f"{name}/p05"] + 5e-3
 
 
 def _found(horizontal: State, vertical: State) -> Found:
@@ -483,16 +483,16 @@ def test_the_last_window_of_a_file_is_estimated_or_too_few_data_are_reported(
     words = ["live", tmp_path / "own.csv", *options, *(word for text in given for word in ("--set", text))]
     assert run_cli(list(map(str, words))) == code
     shown = capsys.readouterr()
-    found = list(live_estimates(RunReader(tmp_path / "run")))
+    estimates = list(live_estimates(RunReader(tmp_path / "run")))
     if rows is not None:
         span_s = truth.load.t[rows - 1] - truth.load.t[0]
         assert (
             f"estimate: got {span_s:.3g} s of load without a gap" in shown.err and "expected at least 5 s" in shown.err
         )
-        assert found == []
+        assert estimates == []
         return
     last_s = truth.load.t[-1] + 1.0  # stamps that begin at 0 are shifted by a second
-    window = found[-1].window
+    window = estimates[-1].window
     assert window is not None and window.end_ns == pytest.approx(last_s * 1e9 + 1, abs=1.0)
     assert "Estimate of the window" in shown.out and "horizontal clearance" in shown.out.lower()
     assert replay(tmp_path / "run").exit_code == 0

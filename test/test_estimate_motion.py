@@ -102,9 +102,9 @@ def test_a_lever_arm_or_low_pass_of_the_sensor_is_found(
     ):
         assert state is State.ESTIMATED
         assert abs(value.mean - true) < 3.0 * value.deviation and value.deviation < 4e-4
-    found = [result.differs[one] for one in names]
-    assert max(share for share, _, _ in found) > 0.95
-    assert np.hypot.reduce([share * by for share, by, _ in found]) == pytest.approx(size, rel=0.2)
+    differences = [result.differs[one] for one in names]
+    assert max(share for share, _, _ in differences) > 0.95
+    assert np.hypot.reduce([share * by for share, by, _ in differences]) == pytest.approx(size, rel=0.2)
 
 
 def test_walls_with_different_damping_are_found() -> None:
@@ -393,5 +393,5 @@ def test_a_load_with_a_little_noise_is_followed_in_long_swings() -> None:
     noise = 0.01 * truth.load.wrench.std(axis=0) * np.random.default_rng(1).standard_normal(truth.load.wrench.shape)
     result = estimate(truth.nominal, Load(truth.load.t, truth.load.wrench + noise), truth.poses)
     assert result.horizontal_state is State.ESTIMATED, result.reasons
-    found = [result.horizontal.mean, result.vertical.mean]
-    assert found == pytest.approx(truth.clearance, abs=1e-4)
+    means = [result.horizontal.mean, result.vertical.mean]
+    assert means == pytest.approx(truth.clearance, abs=1e-4)

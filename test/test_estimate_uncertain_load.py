@@ -62,17 +62,17 @@ def test_without_an_angle_the_range_of_motion_gives_the_clearance() -> None:
     q[:, 2] = np.nan
     unknowns, period = Unknowns.stated(truth.nominal, truth.load, truth.poses), truth.load.period()
     poses = Poses(truth.poses.t, q)
-    found, _ = compare_under_uncertain_load(thinned(truth.load, period)[0], unknowns, poses, period)
-    assert found is not None and found.touched.all() and (found.deviation < 2.5e-3).all()
-    assert (np.abs(found.clearance - truth.clearance) < 3.0 * found.deviation).all()
+    compared, _ = compare_under_uncertain_load(thinned(truth.load, period)[0], unknowns, poses, period)
+    assert compared is not None and compared.touched.all() and (compared.deviation < 2.5e-3).all()
+    assert (np.abs(compared.clearance - truth.clearance) < 3.0 * compared.deviation).all()
 
 
 def test_a_clearance_beyond_all_drawn_motions_is_no_result() -> None:
     """With soft walls, unevenly worn pads have the effect of a negative clearance."""
     truth = mismatched(replace(KINDS["hard_askew"], periods=4.0), 99002)
     unknowns, period = Unknowns.stated(truth.nominal, truth.load, truth.poses), truth.load.period()
-    found, work = compare_under_uncertain_load(thinned(truth.load, period)[0], unknowns, truth.poses, period)
-    assert found is None and work > 0
+    compared, work = compare_under_uncertain_load(thinned(truth.load, period)[0], unknowns, truth.poses, period)
+    assert compared is None and work > 0
 
 
 def test_a_fast_load_does_not_change_the_units_of_the_poses() -> None:

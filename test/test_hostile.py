@@ -134,8 +134,8 @@ for name in {files!r}:
     ids=["nesting", "aliases", "merge keys", "keys", "values"],
 )
 def test_an_exceeded_bound_is_named_with_its_place(text: str, got: str, bound: int) -> None:
-    found, problems = load_yaml(text, "scene", "sections", most_values=MOST_VALUES)
-    assert found is None and len(problems) == 1
+    document, problems = load_yaml(text, "scene", "sections", most_values=MOST_VALUES)
+    assert document is None and len(problems) == 1
     assert problems[0].key.startswith("line ")
     assert got in str(problems[0].got) and f"at most {bound} " in problems[0].expected
 
@@ -144,15 +144,15 @@ def test_content_within_the_bounds_is_read() -> None:
     deep = "[" * DEEPEST + "]" * DEEPEST
     assert load_yaml(deep, "scene", "sections")[1] == []
     shared = "head: &one {mass: 1}\nframe: {<<: *one, width: 2}\nloads: [*one, *one]"
-    found, problems = load_yaml(shared, "scene", "sections")
-    assert not problems and found["frame"] == {"mass": 1, "width": 2} and found["loads"] == [{"mass": 1}] * 2
+    document, problems = load_yaml(shared, "scene", "sections")
+    assert not problems and document["frame"] == {"mass": 1, "width": 2} and document["loads"] == [{"mass": 1}] * 2
     assert len(load_yaml(laughs(4), "scene", "sections")[0]["a4"]) == 9
     assert len(load_yaml(keys(MOST_KEYS), "scene", "sections")[0]) == MOST_KEYS
 
 
 def test_a_file_without_end_is_read_up_to_the_largest_size(tmp_path: Path) -> None:
-    found, problems = read_yaml(Path("/dev/zero"), "scene", "sections")
-    assert found is None and problems[0].expected == f"at most {LARGEST_FILE >> 20} MiB of YAML"
+    document, problems = read_yaml(Path("/dev/zero"), "scene", "sections")
+    assert document is None and problems[0].expected == f"at most {LARGEST_FILE >> 20} MiB of YAML"
     (tmp_path / "latin.yaml").write_bytes(b"a: \xff")
     assert "not UTF-8" in read_yaml(tmp_path / "latin.yaml", "scene", "sections")[1][0].expected
 
@@ -308,8 +308,8 @@ def test_names_and_texts_of_a_file_do_not_control_a_terminal(tmp_path: Path) -> 
         (["live", "load.csv", "--set", "\x1b]0;owned\x07=1"], ("\\x1b]0;owned\\x07",)),
         (["simulate", "--\x1b]0;owned\x07"], ("\\x1b]0;owned\\x07",)),
     )
-    found = _on_a_terminal(*(arguments for arguments, _ in expected), folder=tmp_path)
-    for (arguments, shown), written in zip(expected, found, strict=True):
+    output = _on_a_terminal(*(arguments for arguments, _ in expected), folder=tmp_path)
+    for (arguments, shown), written in zip(expected, output, strict=True):
         assert not any(acting in written for acting in ("\x1b]", "\x1b[2J", "\x07", "\u202e")), (arguments, written)
         assert all(text in written for text in shown), (arguments, written)
 

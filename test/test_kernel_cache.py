@@ -73,8 +73,10 @@ def test_processes_that_save_at_once_do_not_exchange_code(tmp_path: Path) -> Non
     second._load_index = dict
     first.save("signature 1", "code 1")
     del second._load_index
-    found = {number: second.load(f"signature {number}") for number in (1, 2)}
-    assert found[1] in (None, "code 1") and found[2] in (None, "code 2") and set(found.values()) != {None}
+    signatures = {number: second.load(f"signature {number}") for number in (1, 2)}
+    assert (
+        signatures[1] in (None, "code 1") and signatures[2] in (None, "code 2") and set(signatures.values()) != {None}
+    )
 
 
 def test_code_of_other_sources_is_removed(tmp_path: Path) -> None:
@@ -138,13 +140,13 @@ def test_no_kernel_assigns_an_array_to_a_slice() -> None:
 
     `copy_into` has none.
     """
-    found = []
+    mistakes = []
     for folder in KERNEL_FOLDERS:
         for source in sorted((ROOT / "plow_twin" / folder).rglob("*.py")):
             kernels = [node for node in ast.walk(ast.parse(source.read_text())) if _is_kernel(node)]
             inside = (node for function in kernels for node in ast.walk(function))
-            found += [f"{source.name}:{node.lineno}" for node in inside if _assigns_a_slice(node)]
-    assert found == []
+            mistakes += [f"{source.name}:{node.lineno}" for node in inside if _assigns_a_slice(node)]
+    assert mistakes == []
 
 
 def _is_kernel(node: ast.AST) -> bool:

@@ -118,7 +118,7 @@ def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(
     # the recording contains the unused messages, and their numbers agree with the counters of the twin
     told = {key.removeprefix("dropped_"): int(count) for key, count in dropped.items()}
     assert report.inputs == examine(tmp_path / "run").inputs == {"excitation": {"used": 1000, **told}}
-    unused = {found["reason"]: found for found in unused_messages(tmp_path / "run")}
+    unused = {unused_entry["reason"]: unused_entry for unused_entry in unused_messages(tmp_path / "run")}
     assert unused["implausible"]["values"] == (1e9, 0.0, 0.0)
     assert repr(unused["non_finite"]["values"]) == "(nan, 0.0, 0.0)"
     assert unused["duplicate"] == {
@@ -339,14 +339,14 @@ def test_a_mapping_has_units_offsets_and_clocks_and_its_faults_are_named(tmp_pat
 
     pose = "head_pose: {topic: p, fields: {x: a, y: b.c, theta: turn}, clock_offset: -0.5, "
     pose += "unit: {x: mm, y: cm, theta: deg}, "
-    found = read(
+    rows = read(
         pose + "offset: {x: 1}, scale: {x: 2}, stamp: at}", a=3, b={"c": 4}, turn=180, at="2026-01-02T03:04:05.25Z"
     )
-    assert found is not None
-    assert found[1] == pytest.approx({"x": 7e-3, "y": 4e-2, "theta": np.pi})
-    assert found[0] == 1_767_323_044_750_000_000
-    found = read(pose + "scale: 0, offset: {x: 1}}", a=3, b={"c": 4}, turn=180)
-    assert found is not None and found[1] == pytest.approx({"x": 1e-3, "y": 0.0, "theta": 0.0})
+    assert rows is not None
+    assert rows[1] == pytest.approx({"x": 7e-3, "y": 4e-2, "theta": np.pi})
+    assert rows[0] == 1_767_323_044_750_000_000
+    rows = read(pose + "scale: 0, offset: {x: 1}}", a=3, b={"c": 4}, turn=180)
+    assert rows is not None and rows[1] == pytest.approx({"x": 1e-3, "y": 0.0, "theta": 0.0})
     assert read(pose + "stamp: at}", a="", b={"c": 4}, turn="x", at=1) is None
     for wrong in (True, [1], {}, None, 10**400):
         assert read(pose + "stamp: at}", a=wrong, b={"c": 4}, turn=1, at=1) is None
@@ -482,7 +482,7 @@ class Live:
             said = json.loads(line)
             self.heard[said["topic"]] = said
             self.alarms += [said] if said["topic"] == "alarms" else []
-        return {key: str(found) for key, found in self.heard["input"]["values"].items()}
+        return {key: str(counts) for key, counts in self.heard["input"]["values"].items()}
 
     def until_count(self, key: str, count: int) -> dict[str, str]:
         return self.until(lambda heard: int(heard["input"]["values"][key]) >= count, f"{count} {key}")
@@ -707,7 +707,7 @@ class Endless:
 
     def poll(self, timeout_s: float) -> list[Arrived]:
         self.finished = self._look(self._index)
-        found = []
+        rows = []
         for _ in range(20):
             t, *load = _row(self._index)
             row: dict[str, Any] = dict(zip(("t", "fx", "fy", "m"), (self._begin + t, *load), strict=True))
@@ -715,10 +715,10 @@ class Endless:
                 zip(("x", "y", "theta"), (1e-3, 1e-3, 0.0) if self._index % 10 == 0 else ("",) * 3, strict=True)
             )
             row["speed"] = 1.0 if self._index % 100 == 0 else ""
-            found.append(Arrived("load", time.time_ns(), row))
+            rows.append(Arrived("load", time.time_ns(), row))
             self._index += 1
         # every 50th batch is in reverse order, so some rows are late
-        return found[::-1] if self._index % 1000 == 0 else found
+        return rows[::-1] if self._index % 1000 == 0 else rows
 
     def close(self) -> None:
         pass
@@ -729,7 +729,7 @@ def test_the_memory_of_a_long_run_is_bounded_except_for_the_index_of_the_recordi
     (tmp_path / "map.yaml").write_text("excitation: {topic: load}\nhead_pose: {topic: load}\ntravel: {topic: load}\n")
     given = {"record_path": str(tmp_path / "run"), "alarm_force": [1e3, 1e9], "alarm_residual": [0.015, 0.0]}
     settings = parameters.settings(given | {"jump_forward": 3600.0, "excitation_timeout": 3600.0})
-    found: list[tuple[int, int, int]] = []
+    memory: list[tuple[int, int, int]] = []
 
     def look(index: int) -> bool:
         if index and index % 8000 == 0:
@@ -740,8 +740,8 @@ def test_the_memory_of_a_long_run_is_bounded_except_for_the_index_of_the_recordi
             writer = recording.recorder._writer
             assert isinstance(writer, RunWriter)
             index_bytes = len(writer._part.file._chunk_index)
-            found.append((len(gc.get_objects()), tracemalloc.get_traced_memory()[0] - index_bytes, index_bytes))
-        return len(found) == 3
+            memory.append((len(gc.get_objects()), tracemalloc.get_traced_memory()[0] - index_bytes, index_bytes))
+        return len(memory) == 3
 
     prepared = Preparation(settings).result(lambda: False)
     front = BridgeFront(Endless(look), tmp_path / "map.yaml", settings, prepared, lambda *_: None, pytest.fail)
@@ -750,9 +750,9 @@ def test_the_memory_of_a_long_run_is_bounded_except_for_the_index_of_the_recordi
         assert front.run(lambda: False) == []
     finally:
         tracemalloc.stop()
-    (_, _, _), (objects, size, before), (more, larger, after) = found
+    (_, _, _), (objects, size, before), (more, larger, after) = memory
     # between the measurements, 8,000 samples and 25,000 messages pass; the number of objects varies by some hundreds
-    assert more - objects < 800 and larger - size < 100_000, found
+    assert more - objects < 800 and larger - size < 100_000, memory
     # before a part ends, its index grows by about 140 B for each chunk, which is 2 MB per hour
     assert 0 < after - before < 20_000
     figures = front.parts()["input"][2]
@@ -760,9 +760,9 @@ def test_the_memory_of_a_long_run_is_bounded_except_for_the_index_of_the_recordi
 
 
 def _free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        return int(server.getsockname()[1])
 
 
 def test_a_refusal_by_the_system_is_a_warning_and_the_other_settings_apply() -> None:
@@ -836,12 +836,12 @@ def test_prometheus_reads_the_numbers_of_the_diagnostics(tmp_path: Path) -> None
             time.sleep(0.02)
         live.until_count("samples_used", 100)
         with urlopen(url, timeout=30.0) as page:
-            found = dict(line.split() for line in page.read().decode().splitlines() if not line.startswith("#"))
-        assert (found["plow_twin_input_samples_used"], found["plow_twin_state_level"]) == ("100.0", "0.0")
-        assert "plow_twin_state_scene" not in found  # texts are not exported
+            metrics = dict(line.split() for line in page.read().decode().splitlines() if not line.startswith("#"))
+        assert (metrics["plow_twin_input_samples_used"], metrics["plow_twin_state_level"]) == ("100.0", "0.0")
+        assert "plow_twin_state_scene" not in metrics  # texts are not exported
         board = (ROOT / "config" / "grafana.json").read_text()
         shown = set(re.findall(r"plow_twin_\w+", " ".join(_expressions(json.loads(board)))))
-        assert len(shown) > 15 and shown <= found.keys(), shown - found.keys()
+        assert len(shown) > 15 and shown <= metrics.keys(), shown - metrics.keys()
         assert run_cli(["live", str(path), "--metrics", str(port), "--quiet"]) == 1  # the port is in use
         assert live.stop() == 0
 
@@ -1074,12 +1074,12 @@ def _recorded(run: Path) -> tuple[list[Any], list[Any]]:
         entries += [record for record in records if not isinstance(record.entry, Unused)]
         outputs += [part.record(index) for part in batch.outputs for index in range(len(part))]
     numbers = [record.sequence for record in entries]
-    found = [
+    times = [
         (bisect_right(numbers, record.sequence), record.topic, record.data)
         for record in outputs
         if record.topic != "/status"
     ]
-    return [record.entry for record in entries], found
+    return [record.entry for record in entries], times
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -1091,7 +1091,7 @@ def test_a_file_gives_the_same_journal_outputs_and_counts_in_batches_as_row_by_r
     rows = [line.removesuffix(",,,\n") + "\n" if seed % 2 else line for line in _troubled_rows(seed, 4000)]
     path = tmp_path / "load.csv"
     path.write_text(f"{columns}\n{''.join(rows)}")
-    found = []
+    runs = []
     for name in ("together", "single"):
         values = given | {"record_path": str(tmp_path / name), "alarm_force": [1e3, 1e5]}
         settings = parameters.settings(values)
@@ -1105,9 +1105,9 @@ def test_a_file_gives_the_same_journal_outputs_and_counts_in_batches_as_row_by_r
         counts = {key: figures["input"][2][key] for key in figures["input"][2] if not key.endswith(("_s", "_ms"))}
         digest = front.runtime.driver.session.twin.digest()
         published = front.runtime.publishing
-        found.append((*_recorded(tmp_path / name), counts, digest, published.published, published.latency.count))
+        runs.append((*_recorded(tmp_path / name), counts, digest, published.published, published.latency.count))
         assert replay(tmp_path / name).exit_code == 0
-    together, single = found
+    together, single = runs
     assert len(together[0]) == len(single[0]) > 3500
     for one, other in zip(together, single, strict=True):
         assert one == other

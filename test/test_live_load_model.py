@@ -44,8 +44,8 @@ def test_power_speed_and_depth_give_the_load_and_its_deviation() -> None:
 
 def test_absurd_telemetry_is_counted_and_has_no_small_deviation(tmp_path: Path) -> None:
     for drive in ({"power": 1e200, "speed": 2.0}, {"chain_force": 1e308}, {"depth": -1e308}):
-        found = MODEL.wrench(drive)
-        assert found is not None and not max(map(abs, (*found[0], *found[1]))) < 1e100
+        wrench = MODEL.wrench(drive)
+        assert wrench is not None and not max(map(abs, (*wrench[0], *wrench[1]))) < 1e100
     # a biased sensor may give a negative depth, which is no better evidence than the same positive depth
     (below, wide), (_, same) = (MODEL.cutting_force({"depth": depth}) for depth in (-0.08, 0.08))  # type: ignore[misc]
     assert (below, wide) == (0.0, same)
@@ -66,16 +66,16 @@ def test_absurd_telemetry_is_counted_and_has_no_small_deviation(tmp_path: Path) 
 
 def test_the_interval_covers_randomly_drawn_coefficients() -> None:
     drive = {"power": 200e3, "speed": 2.0}
-    found = MODEL.wrench(drive)
-    assert found is not None
+    wrench = MODEL.wrench(drive)
+    assert wrench is not None
     rng = np.random.default_rng(5)
     n = 200_000
     assert MODEL.efficiency is not None
     z = rng.normal(*MODEL.efficiency, n) * 100e3 - rng.normal(*MODEL.idle_force_n, n)
     fx, fy = rng.normal(*MODEL.push_ratio, n) * z, rng.normal(*MODEL.lateral_ratio, n) * z
     drawn = np.stack([fx, fy, 0.1 * fy - 0.7 * fx])
-    np.testing.assert_allclose(found[0], drawn.mean(axis=1), rtol=0.01)
-    np.testing.assert_allclose(found[1], drawn.std(axis=1), rtol=0.02)
+    np.testing.assert_allclose(wrench[0], drawn.mean(axis=1), rtol=0.01)
+    np.testing.assert_allclose(wrench[1], drawn.std(axis=1), rtol=0.02)
 
 
 MAP = """

@@ -76,10 +76,10 @@ class Plant:
         self.mend()
 
     def cut(self) -> None:
-        for found in (self._door, *self._sockets):
+        for server in (self._door, *self._sockets):
             with suppress(OSError):
-                found.shutdown(socket.SHUT_RDWR)
-            found.close()
+                server.shutdown(socket.SHUT_RDWR)
+            server.close()
         self._sockets = []
 
     def _let_in(self, door: socket.socket) -> None:
@@ -109,9 +109,9 @@ def _pass_on(source: socket.socket, sink: socket.socket) -> None:
 
 
 def _free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        return int(server.getsockname()[1])
 
 
 @pytest.fixture(scope="module")
@@ -138,12 +138,12 @@ def roles(tmp_path: Path) -> Any:
 
 def _rows(start_ns: int, first: int, last: int, step_ns: int = MS) -> list[list[float]]:
     """Return stamps and values of samples, with the force along x in kN."""
-    found = []
+    samples = []
     for index in range(first, last):
         phase = float(np.sin(2e-9 * step_ns * index))
         fx, fy, m = (phase * amplitude for amplitude in PAPER_AMPLITUDE)
-        found.append([start_ns + index * step_ns, fx / 1e3, fy, m])
-    return found
+        samples.append([start_ns + index * step_ns, fx / 1e3, fy, m])
+    return samples
 
 
 @contextmanager
@@ -157,14 +157,14 @@ def _bridge(plant: Plant, roles: Any, **options: Any) -> Iterator[OpcUa]:
 
 
 def _until(bridge: OpcUa, enough: Callable[[list[Arrived]], bool]) -> list[Arrived]:
-    found: list[Arrived] = []
+    arrived: list[Arrived] = []
 
     def poll() -> bool:
-        found.extend(bridge.poll(0.1))
-        return enough(found)
+        arrived.extend(bridge.poll(0.1))
+        return enough(arrived)
 
-    until(poll, found)
-    return found
+    until(poll, arrived)
+    return arrived
 
 
 def _stamps(found: list[Arrived]) -> list[int]:
@@ -223,9 +223,9 @@ def test_samples_have_source_stamps_and_bad_values_are_counted(server: Plant, ro
     start_ns = time.time_ns() // MS * MS
     with _bridge(server, roles) as bridge:
         server.do("rows", _rows(start_ns, 0, 200), 1e-3)
-        found = _until(bridge, lambda found: len(found) >= 200)
-        assert _stamps(found) == [row[0] for row in _rows(start_ns, 0, 200)]
-        stamp_ns, values = roles["excitation"].read(found[77])
+        arrived = _until(bridge, lambda found: len(found) >= 200)
+        assert _stamps(arrived) == [row[0] for row in _rows(start_ns, 0, 200)]
+        stamp_ns, values = roles["excitation"].read(arrived[77])
         assert (stamp_ns, values["fx"]) == (start_ns + 77 * MS, pytest.approx(1e3 * _rows(start_ns, 77, 78)[0][1]))
         for index, status in ((200, "BadSensorFailure"), (201, "UncertainLastUsableValue"), (202, "GoodClamped")):
             server.do("rows", _rows(start_ns, index, index + 1), status=status)
@@ -248,9 +248,9 @@ def test_a_lost_message_is_detected_and_read_from_the_history(server: Plant, rol
         _until(bridge, lambda found: start_ns + 4 * MS in _stamps(found))
         server.do("number", 1)
         server.do("rows", _rows(start_ns, 6, 8))
-        found = _until(bridge, lambda found: start_ns + 7 * MS in _stamps(found))
+        arrived = _until(bridge, lambda found: start_ns + 7 * MS in _stamps(found))
         assert bridge.part()[2]["notifications_lost"] == "1" and bridge.lost == 0
-        assert _stamps(found) == [start_ns + 6 * MS, start_ns + 7 * MS]
+        assert _stamps(arrived) == [start_ns + 6 * MS, start_ns + 7 * MS]
 
 
 def test_the_server_s_grants_are_compared_with_the_requests() -> None:
@@ -265,14 +265,14 @@ def _without_undone_holds(entries: list[Entry]) -> list[Sample | Hold]:
 
     On a busy machine, the hold policy may act for a few milliseconds between two samples. Such a hold is not undone.
     """
-    found: list[Sample | Hold] = []
+    kept: list[Sample | Hold] = []
     for entry in entries:
         if isinstance(entry, Sample | Hold):
-            if isinstance(entry, Sample) and found and found[-1].stamp_ns >= entry.stamp_ns:
-                while isinstance(found[-1], Hold):
-                    found.pop()
-            found.append(entry)
-    return found
+            if isinstance(entry, Sample) and kept and kept[-1].stamp_ns >= entry.stamp_ns:
+                while isinstance(kept[-1], Hold):
+                    kept.pop()
+            kept.append(entry)
+    return kept
 
 
 def test_a_minute_without_a_connection_is_filled_and_ends_in_the_digest_of_the_uninterrupted_run(
@@ -350,15 +350,15 @@ def test_a_wrong_history_is_not_used(kind: str, server: Plant, roles: Any) -> No
         assert bridge.part()[2]["notifications_lost"] == "0"
         server.do("number", 1)
         server.do("rows", _rows(start_ns, 9, 12))
-        found = _until(bridge, lambda found: start_ns + 11 * MS in _stamps(found))
-        assert _stamps(found) == [start_ns + index * MS for index in (9, 10, 11)]
+        arrived = _until(bridge, lambda found: start_ns + 11 * MS in _stamps(found))
+        assert _stamps(arrived) == [start_ns + index * MS for index in (9, 10, 11)]
         facts = bridge.part()[2]
         assert ((facts["history_strays"] != "0") is (kind == "future")) and bridge.lost == 1
         assert kind == "future" or "history" in facts["no_history"]
         # the clock of the server steps back by an hour
         server.do("rows", _rows(start_ns - 3_600_000 * MS, 0, 5))
-        found = _until(bridge, lambda found: len(found) >= 5)
-        assert _stamps(found) == [start_ns - 3_600_000 * MS + index * MS for index in range(5)]
+        arrived = _until(bridge, lambda found: len(found) >= 5)
+        assert _stamps(arrived) == [start_ns - 3_600_000 * MS + index * MS for index in range(5)]
 
 
 def test_a_server_that_restarts_with_other_namespace_numbers_or_refuses_for_a_while_is_followed(
@@ -376,8 +376,8 @@ def test_a_server_that_restarts_with_other_namespace_numbers_or_refuses_for_a_wh
             second.do("refuse", False)
             _until(bridge, lambda _: bridge.connected)
             second.do("rows", _rows(start_ns, 10, 15))
-            found = _until(bridge, lambda found: start_ns + 14 * MS in _stamps(found))
-            assert _stamps(found)[-5:] == [start_ns + index * MS for index in range(10, 15)]
+            arrived = _until(bridge, lambda found: start_ns + 14 * MS in _stamps(found))
+            assert _stamps(arrived)[-5:] == [start_ns + index * MS for index in range(10, 15)]
     finally:
         second.close()
 

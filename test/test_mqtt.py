@@ -110,8 +110,8 @@ class Subscriber:
         until(reached, self.messages)
 
     def newest(self, topic: str) -> Any:
-        found = [payload for name, payload, _ in self.messages if name == topic]
-        return json.loads(found[-1]) if found else None
+        payloads = [payload for name, payload, _ in self.messages if name == topic]
+        return json.loads(payloads[-1]) if payloads else None
 
     def all(self, topic: str) -> list[Any]:
         return [json.loads(payload) for name, payload, _ in self.messages if name == topic]
@@ -272,7 +272,7 @@ def test_a_flood_of_messages_from_a_broker_takes_bounded_memory(monkeypatch: pyt
         until(lambda: (bridge.lost, len(bridge._queue)) == (12, 14))
         waiting = [len(payload) for _, payload, _, _ in bridge._queue]
         assert waiting == [0] * 5 + [60_000] * 8 + [1]
-        assert [found.content for found in bridge.poll(0.0)] == [None] * 14
+        assert [message.content for message in bridge.poll(0.0)] == [None] * 14
         bridge.close()
 
 
@@ -322,7 +322,7 @@ def test_a_broker_receives_all_groups_with_tls_and_reports_the_end_of_the_twin(b
         clearance, alarms = late.newest("face/plough/clearance"), late.newest("face/plough/alarms")["values"]
         assert clearance["unit"] == "m" and clearance["values"]["horizontal/p05"] == pytest.approx(0.025)
         assert alarms["force_latched"] == "warn" and alarms["force_raised"] > alarms["force_threshold"] == 20e3
-        peaks = [json.loads(found) for topic, found, _ in early.messages if topic == "face/plough/peaks"]
+        peaks = [json.loads(message) for topic, message, _ in early.messages if topic == "face/plough/peaks"]
         largest = max(max(filter(None, found["values"].values()), default=0.0) for found in peaks)
         assert largest == pytest.approx(alarms["force_raised"], rel=1e-6) or largest > alarms["force_raised"]
         assert late.newest("face/plough/online") is True
@@ -363,7 +363,7 @@ def test_a_missing_broker_is_reported_and_does_not_affect_the_twin(tmp_path: Pat
         plow_twin_here("live", path, "--record", run, "--json", *more)
         for run, more in zip(runs, ((), ("--mqtt-out", url)), strict=True)
     ]
-    assert [found.returncode for found in done] == [0, 0], done[1].stderr
+    assert [process.returncode for process in done] == [0, 0], done[1].stderr
     part = json.loads(done[1].stdout)["mqtt_out"]
     assert part["connected"] == "false" and part["sent"] == "0" and int(part["lost"]) > 0
     assert "mqtt_out" not in json.loads(done[0].stdout)
@@ -421,7 +421,7 @@ class EdgeNode:
 
 
 def _metrics(payload: Any) -> dict[str, Any]:
-    return {found.name: found for found in payload.metrics}
+    return {metric.name: metric for metric in payload.metrics}
 
 
 def test_a_sparkplug_host_receives_birth_data_rebirth_and_death_in_sequence(tmp_path: Path) -> None:
@@ -438,7 +438,7 @@ def test_a_sparkplug_host_receives_birth_data_rebirth_and_death_in_sequence(tmp_
         assert born["clearance/horizontal"].datatype == 10 and born["flags/stream"].datatype == 12
         assert [value.string_value for value in born["wear/top_left_top/p05"].properties.values] == ["m"]
         assert _metrics(data).keys() <= born.keys()
-        numbers = [found.seq for found in host.messages("NDATA")]
+        numbers = [message.seq for message in host.messages("NDATA")]
         assert numbers == list(range(1, len(numbers) + 1))
         host.ask_for_rebirth()
         assert host.until("NBIRTH", 2).seq == 0

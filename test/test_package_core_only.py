@@ -77,11 +77,11 @@ def test_pip_install_brings_the_command_and_the_presets(environment: Path, wheel
     lend(environment, "click", "jsonschema", "PyYAML", "rich")
     install(environment, str(wheel))
     programs, prefix = environment.parent, environment.parent.parent
-    found = {path.name for path in programs.iterdir()}
-    assert {"plow-twin", "plow-twin-node", "plow-twin-publisher"} <= found and not {
+    names = {path.name for path in programs.iterdir()}
+    assert {"plow-twin", "plow-twin-node", "plow-twin-publisher"} <= names and not {
         "twin",
         "excitation_publisher",
-    } & found
+    } & names
     for name in ("twin", "excitation_publisher"):  # `ros2 run` searches this folder
         assert os.access(prefix / "lib" / "plow_twin" / name, os.X_OK)
     share = prefix / "share"

@@ -148,17 +148,17 @@ def _module_name(path: Path) -> str:
 
 def _module_imports(path: Path, modules: set[str]) -> set[str]:
     """Return the modules of the package that a module imports, including lazy and type-checking imports."""
-    found = set()
+    imported = set()
     for node in _statements(path):
         if isinstance(node, ast.Import):
             names = [[alias.name] for alias in node.names]
         else:
             # the statement is either `from folder import module` or `from module import name`
             names = [[f"{node.module}.{alias.name}", node.module or ""] for alias in node.names]
-        found |= {
+        imported |= {
             next(name for name in candidates if name in modules) for candidates in names if {*candidates} & modules
         }
-    return found - {_module_name(path)}
+    return imported - {_module_name(path)}
 
 
 def test_no_import_is_circular() -> None:

@@ -133,10 +133,10 @@ def _in_terminal(folder: Path, *expected: bytes) -> tuple[int, str]:
             # readline may miss a signal just before it waits, so the key is pressed again
             while expected[-1] == CTRL_C and not answers and not select.select([near], [], [], 5.0)[0]:
                 os.write(near, CTRL_C)
-            found = os.read(near, 4096)
-            if not found:
+            data = os.read(near, 4096)
+            if not data:
                 break
-            screen += found
+            screen += data
             if answers and screen[seen:].rstrip().endswith(b":"):
                 seen = len(screen)
                 os.write(near, answers.pop(0))

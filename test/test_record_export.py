@@ -83,10 +83,10 @@ def test_an_export_equals_the_recording_and_overwrites_nothing(
             assert name in ("force_intervals", "peak_intervals") and not (out / f"{name}.{kind}").exists()
             continue
         if kind == "npz":
-            with np.load(out) as found:
-                np.testing.assert_array_equal(found[f"{name}/stamp_ns"], stamps)
-                np.testing.assert_array_equal(found[f"{name}/values"], values)
-                assert tuple(found[f"{name}/columns"]) == recording[name].columns
+            with np.load(out) as arrays:
+                np.testing.assert_array_equal(arrays[f"{name}/stamp_ns"], stamps)
+                np.testing.assert_array_equal(arrays[f"{name}/values"], values)
+                assert tuple(arrays[f"{name}/columns"]) == recording[name].columns
             continue
         file = out / f"{name}.{kind}"
         table = pyarrow.csv.read_csv(file) if kind == "csv" else pyarrow.parquet.read_table(file)

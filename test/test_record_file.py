@@ -181,8 +181,8 @@ def test_a_truncated_file_is_read_up_to_its_end(run: Run, tmp_path: Path) -> Non
         records = list(records_of(reader))
         # journal and outputs are in separate chunks, so a truncated file contains the first records of each
         for kind in (EntryRecord, OutputRecord):
-            found = [record for record in records if isinstance(record, kind)]
-            assert found == [record for record in whole if isinstance(record, kind)][: len(found)]
+            chosen = [record for record in records if isinstance(record, kind)]
+            assert chosen == [record for record in whole if isinstance(record, kind)][: len(chosen)]
         assert reader.status is FileStatus.TRUNCATED, cut
         assert reader.lost == {} and reader.damaged_chunks == 0
 
@@ -346,8 +346,8 @@ def test_a_digest_with_a_flipped_bit_is_another_digest_or_an_error() -> None:
     for place in range(len(whole)):
         data = bytearray(whole)
         data[place] ^= 1
-        found, _, _ = read_digests(np.frombuffer(data, np.uint8), np.zeros(1, np.int64), np.array([len(data)]))
-        assert found[0] == (place >= len(whole) - 16)
+        digests, _, _ = read_digests(np.frombuffer(data, np.uint8), np.zeros(1, np.int64), np.array([len(data)]))
+        assert digests[0] == (place >= len(whole) - 16)
     nothing = read_digests(np.frombuffer(whole, np.uint8), np.array([1, -1, 2**40]), np.full(3, len(whole)))
     assert not nothing[0].any()
     with pytest.raises(RecordingError, match="got 3 integers, expected the two of a digest"):
@@ -377,5 +377,5 @@ def test_frames_of_lz4_are_read_as_its_library_reads_them() -> None:
         for bit in range(8):
             flipped = whole.copy()
             flipped[place] ^= 1 << bit
-            found = independent_blocks(flipped.data, 5000)
-            assert found is None or len(found) == 5000
+            blocks = independent_blocks(flipped.data, 5000)
+            assert blocks is None or len(blocks) == 5000

@@ -82,9 +82,9 @@ def test_the_run_in_progress_is_found_beside_an_earlier_run(tmp_path: Path) -> N
     record_run(tmp_path / "run", map(paper_sample, range(10)))
     writer = threading.Thread(target=record_run, args=(tmp_path / "run_2", map(paper_sample, range(COUNT))))
     writer.start()
-    found = find_run(tmp_path / "run", 60.0)
-    asked = RunReader(found, Tail(stop=lambda: True))
-    assert found == tmp_path / "run_2" and [*asked.batches()] and asked.status is FileStatus.UNREAD
+    run_folder = find_run(tmp_path / "run", 60.0)
+    asked = RunReader(run_folder, Tail(stop=lambda: True))
+    assert run_folder == tmp_path / "run_2" and [*asked.batches()] and asked.status is FileStatus.UNREAD
     writer.join()
     assert find_run(tmp_path / "run", 0.0) == tmp_path / "run"
     with pytest.raises(RecordingError, match="expected one that is being written"):

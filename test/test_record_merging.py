@@ -39,9 +39,9 @@ def order(*streams: Iterator[Arrived]) -> list[tuple[str, float | None]]:
 def test_streams_are_merged_by_their_stamps(
     one: tuple[float | None, ...], other: tuple[float | None, ...], expected: str
 ) -> None:
-    found = order(rows("a", *one), rows("b", *other))
-    assert "".join(topic for topic, _ in found) == expected
-    assert [value for topic, value in found if topic == "a"] == list(one)
+    merged = order(rows("a", *one), rows("b", *other))
+    assert "".join(topic for topic, _ in merged) == expected
+    assert [value for topic, value in merged if topic == "a"] == list(one)
 
 
 def test_files_fed_live_are_merged_by_the_stamps_that_the_mapping_reads(tmp_path: Path) -> None:

@@ -202,7 +202,7 @@ def test_nothing_is_published_again_when_a_late_sample_fails(span: float, tmp_pa
 
 
 def test_late_samples_at_the_edge_of_the_memory_give_the_same_motion_in_any_order(tmp_path: Path) -> None:
-    found = []
+    results = []
     for grouped in (True, False):
         live = Mixed(tmp_path / str(grouped), publish_mode="fixed_rate", rollback_span=0.5)
         missing = [248, 249, 290]
@@ -213,9 +213,9 @@ def test_late_samples_at_the_edge_of_the_memory_give_the_same_motion_in_any_orde
             live.send(*group)
         live.publish_due()
         assert live.driver.rolled_back == 3
-        found.append(live.front.frames[-1].rows)
+        results.append(live.front.frames[-1].rows)
         assert _same(live.replayed())
-    assert all((found[0][name] == found[1][name]).all() for name in ("peak", "impulse"))
+    assert all((results[0][name] == results[1][name]).all() for name in ("peak", "impulse"))
 
 
 def test_a_late_speed_at_the_edge_of_the_memory_acts_where_it_did(tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ def test_a_file_of_a_historian_gives_the_same_run_as_its_csv(
 
 def test_instants_are_the_same_in_each_zone_and_naive_times_are_utc(tmp_path: Path) -> None:
     (tmp_path / "map.yaml").write_text(MAP)
-    found = []
+    readings = []
     for unit, precision_ns in (("ns", 1), ("us", 1000)):
         for zone in ZONES:
             table = _table(50)
@@ -100,8 +100,8 @@ def test_instants_are_the_same_in_each_zone_and_naive_times_are_utc(tmp_path: Pa
             parquet.write_table(table, tmp_path / "plant.parquet", version="2.6")
             read = _read(tmp_path / "plant.parquet", tmp_path / "map.yaml")
             assert [stamp for name, stamp, _ in read if name == "excitation"] == (stamps * precision_ns).tolist()
-            found.append([(name, values["fx"]) for name, _, values in read if name == "excitation"])
-    assert all(rows == found[0] for rows in found)
+            readings.append([(name, values["fx"]) for name, _, values in read if name == "excitation"])
+    assert all(rows == readings[0] for rows in readings)
     # dates as texts give equal times
     assert time_ns("2026-01-02T03:03:19.123456789Z") == time_ns("2026-01-02 04:03:19.123456789+01:00") == BEGIN_NS
     assert time_ns("2026-01-02 03:03:19.1234567") == BEGIN_NS - 89
@@ -141,10 +141,10 @@ def test_the_estimates_folder_calibration_and_setup_take_parquet(
         (tmp_path / folder).mkdir()
         write(load, tmp_path / folder / f"load.{ending}")
         write(pose, tmp_path / folder / f"pose.{ending}")
-    found = [read_measured(tmp_path / folder, Path("paper")) for folder in ("p", "c")]
-    np.testing.assert_array_equal(found[0].load, found[1].load)
-    np.testing.assert_array_equal(found[0].poses, found[1].poses)
-    assert len(found[0].load) == 200 and np.isnan(found[0].poses[:, 2]).all() and not found[0].unreadable
+    recordings = [read_measured(tmp_path / folder, Path("paper")) for folder in ("p", "c")]
+    np.testing.assert_array_equal(recordings[0].load, recordings[1].load)
+    np.testing.assert_array_equal(recordings[0].poses, recordings[1].poses)
+    assert len(recordings[0].load) == 200 and np.isnan(recordings[0].poses[:, 2]).all() and not recordings[0].unreadable
     (tmp_path / "c" / "load.csv").rename(tmp_path / "c" / "excitation.csv")
     # if there are too many rows, the newest are used, and the others are counted
     with monkeypatch.context() as patched:
@@ -152,7 +152,7 @@ def test_the_estimates_folder_calibration_and_setup_take_parquet(
         newest = read_measured(tmp_path / "p", Path("paper")), read_recording(tmp_path / "c", Path("paper"))
     for one in newest:
         assert one.lost == {"older_rows": 300} and len(one.poses) == 50
-        np.testing.assert_array_equal(one.load[:, 1:], found[0].load[150:, 1:])
+        np.testing.assert_array_equal(one.load[:, 1:], recordings[0].load[150:, 1:])
     parquet.write_table(pose.set_column(2, "y", pa.array(seconds)), tmp_path / "motion.parquet")
     assert load_poses(tmp_path / "motion.parquet").q.shape == (200, 3)
 

@@ -102,15 +102,15 @@ def test_a_truncated_recording_is_repaired(share: float, begun: int | None, tmp_
         part.write_bytes(data[:begun])
     before = examine(run.folder)
     assert before.problems and before.status == FileStatus.TRUNCATED.value
-    found = list(records_of(run.folder))
+    records = list(records_of(run.folder))
     assert RunReader(run.folder).damaged_chunks == 0 and repair(run.folder) == [run.file, *begun_parts]
     after = examine(run.folder)
     assert after.problems == [] and after.status == FileStatus.COMPLETE.value
     # the repaired file contains every record that could be read before, but not always in the same order
-    assert {repr(record) for record in records_of(run.folder)} == {repr(record) for record in found}
+    assert {repr(record) for record in records_of(run.folder)} == {repr(record) for record in records}
     assert replay(run.folder).exit_code == 0
     with AnyReader([run.folder]) as reader:
-        assert reader.message_count == len(found)
+        assert reader.message_count == len(records)
 
 
 def test_a_recording_in_progress_is_not_repaired(tmp_path: Path) -> None:

@@ -142,11 +142,11 @@ def test_forces_are_compared_with_the_machine_s_and_times_of_estimates_are_print
 
 
 def test_the_synthetic_sensor_belongs_to_a_wider_guide() -> None:
-    found = plan("paper", 1000.0, 7.0, sensor_mm=3.0)
-    assert found.pose is not None and found.pose.shape == (700, 3) and found.pose_every == 10
-    poses, _ = Poses.of(np.arange(700) * 0.01, found.pose)
+    commands = plan("paper", 1000.0, 7.0, sensor_mm=3.0)
+    assert commands.pose is not None and commands.pose.shape == (700, 3) and commands.pose_every == 10
+    poses, _ = Poses.of(np.arange(700) * 0.01, commands.pose)
     reached = range_of_motion(load_scene("paper"), poses)[0]
-    series = Twin(load_scene("paper"), excitation="sampled").advance_samples(np.arange(7000) * 1e-3, found.wrench)
+    series = Twin(load_scene("paper"), excitation="sampled").advance_samples(np.arange(7000) * 1e-3, commands.wrench)
     own = range_of_motion(load_scene("paper"), Poses.of(np.arange(700) * 0.01, series.q[::10])[0])[0]
     assert reached - own == pytest.approx([3e-3, 3e-3], abs=2e-3)
 

@@ -164,8 +164,8 @@ def test_after_a_kill_the_recording_replays_and_the_wear_continues(tmp_path: Pat
         clearances = running.probe.listen(JointState, "clearance")
         running.probe.excitation()(T0, (0.0, 0.0, 0.0))
         running.probe.until(lambda: clearances, "the clearance")
-        found = dict(zip(clearances[0].name, clearances[0].position, strict=True))
-        assert all(found[f"pad_{name}"] >= depth for name, depth in saved.items())
+        clearance = dict(zip(clearances[0].name, clearances[0].position, strict=True))
+        assert all(clearance[f"pad_{name}"] >= depth for name, depth in saved.items())
 
 
 def test_a_full_disk_stops_the_recording_and_not_the_twin(tmp_path: Path) -> None:
@@ -417,8 +417,8 @@ def test_steps_of_the_node_s_own_clock_have_no_effect_on_samples(
             # late
             assert abs(age_s - off_s) < 5.0
             assert (figures["samples_used"], figures["holds"]) == (str(sent), "0")
-        found = probe.figures("state")
-        assert (found["resets"], found["solver_failures"]) == ("0", "0")
+        counters = probe.figures("state")
+        assert (counters["resets"], counters["solver_failures"]) == ("0", "0")
         assert running.twin.stop() == 0
     report = replay(tmp_path / "run")
     assert (report.exit_code, report.samples) == (0, sent)

@@ -133,8 +133,8 @@ def test_a_reconfigured_node_has_another_scene_and_a_second_recording(managed: B
         managed.probe.until_figure("state", "scene", scene)
         assert _change(managed, Transition.TRANSITION_DEACTIVATE)
         assert _change(managed, Transition.TRANSITION_CLEANUP)
-    found = [RunReader(tmp_path / name).header.parameters["scene"] for name in ("run", "run_2")]
-    assert found == ["paper", "bench_kv"]
+    scenes = [RunReader(tmp_path / name).header.parameters["scene"] for name in ("run", "run_2")]
+    assert scenes == ["paper", "bench_kv"]
 
 
 def test_a_shutdown_while_active_ends_in_finalized_and_a_clean_exit(tmp_path: Path) -> None:
@@ -219,9 +219,9 @@ def test_a_parameter_file_with_integers_for_doubles_and_a_typing_error(tmp_path:
     with bench(tmp_path, arguments=("--params-file", str(path)), tolerance="1e-8") as running:
         request = GetParameters.Request(names=["excitation_timeout", "tolerance"])
         service = f"{running.namespace}/plow_twin/get_parameters"
-        found = running.probe.call(GetParameters, service, request).values
-        assert [item.type for item in found] == [ParameterType.PARAMETER_DOUBLE] * 2
-        assert [item.double_value for item in found] == [2.0, 1e-8]
+        response = running.probe.call(GetParameters, service, request).values
+        assert [item.type for item in response] == [ParameterType.PARAMETER_DOUBLE] * 2
+        assert [item.double_value for item in response] == [2.0, 1e-8]
         # an active node accepts its present parameters again
         assert _set(running, "tolerance", 1e-8).successful and _set(running, "scene", "paper").successful
         assert not _set(running, "tolerance", 1e-7).successful
@@ -320,9 +320,9 @@ def test_the_journal_repeats_changes_of_the_model_and_a_restored_motion(tmp_path
 def test_every_parameter_has_a_descriptor_with_meaning_range_and_effect(active: Bench) -> None:
     request = DescribeParameters.Request(names=list(SPECS))
     service = f"{active.namespace}/plow_twin/describe_parameters"
-    found = active.probe.call(DescribeParameters, service, request).descriptors
-    assert [item.name for item in found] == list(SPECS)
-    for item in found:
+    response = active.probe.call(DescribeParameters, service, request).descriptors
+    assert [item.name for item in response] == list(SPECS)
+    for item in response:
         spec = SPECS[item.name]
         assert spec.metadata["doc"] in item.description
         assert item.read_only == (spec.metadata["effect"] is Effect.START)

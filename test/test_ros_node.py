@@ -141,8 +141,8 @@ def test_at_a_fixed_rate_the_latency_includes_the_wait_for_the_publication(tmp_p
         forces = running.probe.listen(JointState, "contact_forces")
         running.probe.excitation()(T0, (1.0, 2.0, 3.0))
         running.probe.until(lambda: forces, "a frame")
-        found = running.probe.figures("output")
-        assert float(found["latency_max_ms"]) > 0.0
+        figures = running.probe.figures("output")
+        assert float(figures["latency_max_ms"]) > 0.0
         running.probe.until_figure("output", "periods_missed", "0", "1", "2", "3")
         running.probe.until(lambda: running.probe.figures("output")["period_mean_ms"] != "", "a period")
 
@@ -222,8 +222,8 @@ def test_one_publisher_is_followed_and_a_second_reported_until_a_switch(tmp_path
         running.twin.stop()
     # the file names the sender of each message
     unused = list(unused_messages(tmp_path / "run"))
-    assert {found["reason"] for found in unused} == {"not_followed"} and len(unused) == 41
-    told = [(found["stamp_ns"], found["values"][0]) for found in unused]
+    assert {message["reason"] for message in unused} == {"not_followed"} and len(unused) == 41
+    told = [(entry["stamp_ns"], entry["values"][0]) for entry in unused]
     assert told == [(T0 + index * MS - 1_500_000_000, -30e3) for index in range(40)] + [(T0 + 40 * MS, 30e3)]
     senders = [found["sender"] for found in unused]
     assert all(name.startswith(f"{running.namespace}/probe ") for name in senders)
@@ -263,7 +263,7 @@ def test_one_of_several_publishers_of_an_optional_input_is_followed(tmp_path: Pa
             node.destroy_publisher(second)
         assert running.twin.stop() == 0
     unused = list(unused_messages(tmp_path / "run"))
-    assert [found["input"] for found in unused] == [topic for topic in kinds for _ in range(20)]
+    assert [entry["input"] for entry in unused] == [topic for topic in kinds for _ in range(20)]
     assert {(found["reason"], *found["values"][:1]) for found in unused} == {("not_followed", 0.002)}
 
 

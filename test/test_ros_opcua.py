@@ -45,7 +45,7 @@ def test_a_node_waits_for_its_server_and_fills_a_break_from_the_history(server: 
         probe.until_figure("source", "connected", "true")
         server.do("rows", _rows(start_ns, 0, 200, 10 * MS))
         probe.until_figure("input", "samples_used", "200")
-        assert max(stamp_ns(found.header) for found in forces) >= start_ns + 1990 * MS
+        assert max(stamp_ns(message.header) for message in forces) >= start_ns + 1990 * MS
         server.cut()
         probe.until_figure("source", "connected", "false")
         server.do("rows", _rows(start_ns, 200, 500, 10 * MS))
@@ -69,9 +69,9 @@ def test_credentials_of_a_server_come_from_a_file(tmp_path: Path, monkeypatch: p
     (tmp_path / "secret").write_text("s3cret\nmore")
     path = tmp_path / "access.yaml"
     path.write_text("{user: plough, password_file: secret, ca: server.pem, certificate: a.pem, key: a.key}")
-    found = read_access("opc.tcp://plant", path)
+    access = read_access("opc.tcp://plant", path)
     files = {"ca": tmp_path / "server.pem", "certificate": tmp_path / "a.pem", "key": tmp_path / "a.key"}
-    assert found == Access("opc.tcp://plant", "plough", "s3cret", **files)
+    assert access == Access("opc.tcp://plant", "plough", "s3cret", **files)
     monkeypatch.setenv("PLOW_TWIN_OPCUA_PASSWORD", "other")
     assert read_access("opc.tcp://plant", None).password == "other"
     for text, message in (("{password: x}", "password"), ("{plain: 1}", "true or false"), ("[1]", r"got \[1\]")):

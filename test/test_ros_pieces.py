@@ -31,8 +31,8 @@ RELIABLE_INPUT = {"qos_overrides.{ns}/excitation.subscription.reliability": "rel
 def _rights(enclave: str, kind: str, right: str, namespace: str) -> set[str]:
     """Return the full names that the policy allows an enclave to use; `~` is replaced by the name of the twin."""
     root = ElementTree.parse(CONFIG / "sros2" / "policy.xml").getroot()
-    found = root.findall(f".//enclave[@path='{enclave}']//{kind}s[@{right}='ALLOW']/{kind}")
-    names = [(item.text or "").replace("~", "/plow_twin") for item in found]
+    elements = root.findall(f".//enclave[@path='{enclave}']//{kind}s[@{right}='ALLOW']/{kind}")
+    names = [(item.text or "").replace("~", "/plow_twin") for item in elements]
     apart = {"/rosout", "/parameter_events", "/diagnostics", "/tf"}
     return {name if name in apart else f"{namespace}/{name.removeprefix('/')}" for name in names}
 

@@ -221,7 +221,7 @@ def test_a_pose_and_its_negative_quaternion_give_the_same_residual() -> None:
     with _node() as node:
         assert node.start()
         assert node.runtime is not None
-        found = []
+        residuals = []
         for number, sign in enumerate((1.0, -1.0), 1):
             message = PoseStamped()
             message.header.stamp.sec = number
@@ -232,8 +232,8 @@ def test_a_pose_and_its_negative_quaternion_give_the_same_residual() -> None:
             front.subscriptions._measured_poses(taken)
             residual = node.runtime.inputs.residual(np.array([0.0, 0.0, 0.002]))
             assert residual is not None
-            found.append(residual[2])
-    assert found == pytest.approx([-0.008, -0.008], abs=1e-12)
+            residuals.append(residual[2])
+    assert residuals == pytest.approx([-0.008, -0.008], abs=1e-12)
 
 
 def test_the_covariance_of_each_pose_goes_into_the_journal_and_the_estimate(tmp_path: Path) -> None:

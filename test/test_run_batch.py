@@ -19,14 +19,14 @@ FIELDS = ("q", "v", "penetration", "rate", "force", "peak", "impulse", "makes", 
 def members() -> list[Scene]:
     """Return scenes that differ in clearance, stiffness, damping, mass and initial pose."""
     scene, rng = preset("bench_kv"), np.random.default_rng(5)
-    found = []
+    scenes = []
     for _ in range(9):
         gaps = dataclasses.replace(scene.clearance, horizontal_m=rng.uniform(0.02, 0.03))
         contact = dataclasses.replace(scene.contact, stiffness=rng.uniform(1e7, 4e7), damping=rng.uniform(3e4, 9e4))
         head = Head(rng.uniform(2000.0, 3000.0), rng.uniform(1000.0, 1500.0))
         initial = dataclasses.replace(scene.initial, q=tuple(rng.uniform(-2e-3, 2e-3, 3)))
-        found.append(dataclasses.replace(scene, clearance=gaps, contact=contact, head=head, initial=initial))
-    return found
+        scenes.append(dataclasses.replace(scene, clearance=gaps, contact=contact, head=head, initial=initial))
+    return scenes
 
 
 def samples(count: int) -> np.ndarray:
@@ -43,13 +43,13 @@ def in_lanes() -> dict[str, list[Scene]]:
         "d^1.5": {"law": "hunt_crossley", "damping": 0.7, "exponent": 1.5, "stiffness": 1e8},
         "d^2": {"law": "hertz", "damping": None, "exponent": 2.0, "stiffness": 1e9},
     }
-    found = {
+    scenes = {
         name: [dataclasses.replace(one, contact=dataclasses.replace(one.contact, **law)) for one in members()]
         for name, law in laws.items()
     }
     # with the kernels of `test_estimate_follow`
-    rubbing = zip(found["lambda d'"], np.linspace(0.05, 0.5, 9), strict=True)
-    return found | {"friction": [dataclasses.replace(one, friction=Friction(mu, 0.02)) for one, mu in rubbing]}
+    rubbing = zip(scenes["lambda d'"], np.linspace(0.05, 0.5, 9), strict=True)
+    return scenes | {"friction": [dataclasses.replace(one, friction=Friction(mu, 0.02)) for one, mu in rubbing]}
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -89,8 +89,8 @@ def test_a_member_in_lanes_has_its_own_bits_and_the_motion_of_a_twin(law: str) -
             assert np.array_equal(getattr(together[index], name), getattr(shared[-1 - index], name)), (index, name)
         assert np.array_equal(together[index].makes, twin.makes) and not together.status[index].any()
         for name in ("q", "v", "penetration", "rate", "force", "peak", "impulse"):
-            found, expected = getattr(together[index], name), getattr(twin, name)
-            assert np.abs(found - expected).max() < 1e-7 * max(np.abs(expected).max(), 1e-3), (index, name)
+            result, expected = getattr(together[index], name), getattr(twin, name)
+            assert np.abs(result - expected).max() < 1e-7 * max(np.abs(expected).max(), 1e-3), (index, name)
     assert together.makes.sum() > 0 and together.steps.sum() > 1.05 * together.steps.size
 
 

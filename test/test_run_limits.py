@@ -100,9 +100,9 @@ def test_the_command_line_writes_the_rows_computed_so_far(tmp_path: Path, capsys
     out = tmp_path / "part.npz"
     code = run(["simulate", "paper", "--t-end", "10", "--max-steps", "100", "--out", str(out), "--json"])
     printed = capsys.readouterr()
-    found = json.loads(printed.out)
+    result = json.loads(printed.out)
     assert code == 1 and "max_steps = 100 reached at t = " in printed.err
-    assert found["solver"]["steps"] == 100 and 0.0 < found["t_end"] < 10.0
+    assert result["solver"]["steps"] == 100 and 0.0 < result["t_end"] < 10.0
     with np.load(out) as file:
         assert 0 < len(file["t"]) < 1001 and np.isfinite(file["q"]).all()
 
@@ -261,8 +261,8 @@ def test_the_command_that_gets_sigint_writes_the_rows_computed_so_far(tmp_path: 
         process.send_signal(signal.SIGINT)
         told, errors = process.communicate(timeout=60)
     assert process.returncode == 1 and "interrupted at t = " in errors
-    found = json.loads(told)
-    assert 0.0 < found["t_end"] < 1e7 and found["solver"]["steps"] > 0
+    result = json.loads(told)
+    assert 0.0 < result["t_end"] < 1e7 and result["solver"]["steps"] > 0
     with np.load(out) as file:
         assert len(file["t"]) >= 1 and np.isfinite(file["q"]).all()
 

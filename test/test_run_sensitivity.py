@@ -91,8 +91,8 @@ def test_the_derivatives_by_parameters_are_finite_differences_of_the_motion(name
             run = simulate(with_parameters(scene, {path: value * (1.0 + sign * 1e-5)}), 0.5, tol=1e-12)
             ends.append(np.concatenate([run.q[-1], run.v[-1]]))
         expected = (ends[0] - ends[1]) / (2e-5 * value)
-        found = result.sensitivity.by_parameter[path][-1]
-        assert found == pytest.approx(expected, abs=1e-3 * np.abs(expected).max()), path
+        sensitivity = result.sensitivity.by_parameter[path][-1]
+        assert sensitivity == pytest.approx(expected, abs=1e-3 * np.abs(expected).max()), path
     with pytest.raises(ArgumentError, match=r"got 'contact\.exponent', expected some of contact\.stiffness"):
         simulate(scene, 0.5, sensitivity=("contact.exponent",))
 
@@ -131,15 +131,15 @@ def test_the_linearised_equations_agree_with_displaced_motions(name: str, monkey
     paths = tuple(sensitivity_parameters(scene))
     beside = sensitivity.displaced_columns
     monkeypatch.setattr(sensitivity, "displaced_columns", lambda *given: used.append(1) or beside(*given))
-    found = sensitivity.sensitivity_of(scene, 0.5, 1e-9, paths)
+    derivatives = sensitivity.sensitivity_of(scene, 0.5, 1e-9, paths)
     assert used
     monkeypatch.setattr(sensitivity, "fits_tangents", lambda compiled: False)
     shadows = sensitivity.sensitivity_of(scene, 0.5, 1e-9, paths)
-    assert found.growth.max() == pytest.approx(shadows.growth.max(), rel=1e-4)
-    assert found.exponent == pytest.approx(shadows.exponent, rel=1e-4)
+    assert derivatives.growth.max() == pytest.approx(shadows.growth.max(), rel=1e-4)
+    assert derivatives.exponent == pytest.approx(shadows.exponent, rel=1e-4)
     for place in (50, 100, 150, 200):
-        pairs = [(found.from_start[place], shadows.from_start[place])]
-        pairs += [(found.by_parameter[path][place], shadows.by_parameter[path][place]) for path in paths]
+        pairs = [(derivatives.from_start[place], shadows.from_start[place])]
+        pairs += [(derivatives.by_parameter[path][place], shadows.by_parameter[path][place]) for path in paths]
         for equations, differences in pairs:
             assert equations == pytest.approx(differences, abs=1e-4 * np.abs(differences).max())
 
@@ -222,8 +222,8 @@ def test_products_of_stretches_grow_like_their_matrices() -> None:
     other = sensitivity.StretchProduct(4, 2)
     for begin in range(0, 300, 7):
         part = slice(begin, begin + 7)
-        found = other.follow(matrices[part], changes[part], ends[part])
-        assert found[0].tobytes() == totals[part].tobytes() and found[2].tobytes() == growth[part].tobytes()
+        columns = other.follow(matrices[part], changes[part], ends[part])
+        assert columns[0].tobytes() == totals[part].tobytes() and columns[2].tobytes() == growth[part].tobytes()
 
 
 def test_a_live_twin_has_the_same_derivatives() -> None:
@@ -283,8 +283,8 @@ def test_a_live_twin_has_the_derivative_by_restitution_without_damping(e: float)
     # the expected derivative is a one-sided difference of second order from three points
     ends = [end(with_parameters(scene, {"contact.restitution": e - d})) for d in (0.0, 1e-5, 2e-5)]
     expected = (1.5 * ends[0] - 2.0 * ends[1] + 0.5 * ends[2]) / 1e-5
-    found = followed.by_parameter["contact.restitution"]
-    assert followed.t > 0.2 and found == pytest.approx(expected, abs=3e-3 * np.abs(expected).max())
+    result = followed.by_parameter["contact.restitution"]
+    assert followed.t > 0.2 and result == pytest.approx(expected, abs=3e-3 * np.abs(expected).max())
 
 
 def test_a_scene_that_amplifies_gives_a_warning() -> None:

@@ -84,8 +84,8 @@ def returned(scene: Scene) -> float:
 )
 def test_drop_returns_the_restitution_that_its_speed_leaves(speed: float, exponent: float, frame: Frame) -> None:
     contact = replace(LAW, exponent=exponent, stiffness=1e8 * 1e3 ** (exponent - 1.0))
-    found = returned(impact(contact, (0.0, -speed, 0.0), head=HEAVY, frame=frame, pairs=("bottom_left_bottom",)))
-    assert found == pytest.approx(E * max(speed / SPEED, 1.0) ** -FALL, abs=2e-5)
+    restitution = returned(impact(contact, (0.0, -speed, 0.0), head=HEAVY, frame=frame, pairs=("bottom_left_bottom",)))
+    assert restitution == pytest.approx(E * max(speed / SPEED, 1.0) ** -FALL, abs=2e-5)
 
 
 @pytest.mark.parametrize("law", [name for name, law in LAWS.items() if law.takes_restitution])
@@ -103,10 +103,10 @@ def test_impact_counts_by_the_mass_at_the_corner(angle: float, omega: float, pow
     speed, arm = 2.0, 0.5 * SIDE * (math.cos(angle) - math.sin(angle))
     # the contact is so hard that the block hardly rotates during the impact
     contact = replace(LAW, stiffness=1e12, restitution_mass_power=power)
-    found = returned(impact(contact, (0.0, -speed, omega), angle, pairs=("bottom_left_bottom",)))
+    restitution = returned(impact(contact, (0.0, -speed, omega), angle, pairs=("bottom_left_bottom",)))
     approach = speed + omega * arm
     mass = 1.0 / (1.0 + MASS * arm**2 / INERTIA)
-    assert found == pytest.approx(E * (approach * mass**power / SPEED) ** -FALL, abs=2e-3)
+    assert restitution == pytest.approx(E * (approach * mass**power / SPEED) ** -FALL, abs=2e-3)
 
 
 @pytest.mark.parametrize("along", [1.5, -1.5])

@@ -104,8 +104,8 @@ RUBBING = {(1, 1, None, None, None)}
 
 
 def drawn(seed: int, count: int, some: bool = True, powers: bool = False, friction: bool = False) -> list[Scene]:
-    rng, found = np.random.default_rng(seed), list[Scene]()
-    while len(found) < count:
+    rng, scenes = np.random.default_rng(seed), list[Scene]()
+    while len(scenes) < count:
         scene = draw(rng, powers)
         if friction:
             scene = dataclasses.replace(scene, friction=Friction(rng.uniform(0.05, 0.5), 10 ** rng.uniform(-2.5, -1.0)))
@@ -114,8 +114,8 @@ def drawn(seed: int, count: int, some: bool = True, powers: bool = False, fricti
         directions = (terms.harmonics or 0) + (terms.second or 0)
         kind = directions, terms.viscous, terms.hysteretic, terms.integer, terms.fraction
         if fits_lanes(compiled) and (not some or kind in (RUBBING if friction else SOME[powers])):
-            found.append(scene)
-    return found
+            scenes.append(scene)
+    return scenes
 
 
 def same(one: Ensemble, i: int, other: Ensemble, k: int) -> bool:
@@ -171,9 +171,9 @@ def _check_beside_the_loop(seed: int, count: int, some: bool, powers: bool, fric
         rows = alone.statistics.values()
         assert many.events[index] == len(alone.events)
         assert many.makes[index].tolist() == [row["makes"] for row in rows]
-        for name, found in (("max", many.peak), ("impulse", many.impulse), ("time_in_contact", many.time_in_contact)):
+        for name, values in (("max", many.peak), ("impulse", many.impulse), ("time_in_contact", many.time_in_contact)):
             expected = np.array([row[name] for row in rows])
-            assert np.abs(found[index] - expected).max() <= 1e-7 * expected.max(initial=1e-9), (index, name)
+            assert np.abs(values[index] - expected).max() <= 1e-7 * expected.max(initial=1e-9), (index, name)
         for sense, shares in zip(many.set_time[index], alone.contact_sets.values(), strict=True):
             found_shares = np.sort(sense[sense > 1e-9] / max(sense.sum(), 1e-300))
             np.testing.assert_allclose(found_shares, np.sort([x for x in shares.values() if x > 1e-9]), atol=1e-7)

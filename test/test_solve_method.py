@@ -90,9 +90,9 @@ SCENES: dict[str, Callable[[], Scene]] = {
 @pytest.mark.parametrize("method", METHODS, ids=lambda method: method.__name__.rpartition(".")[2])
 def test_a_method_has_the_signatures_of_the_contract(method: Any) -> None:
     for name in ("own", "lay_out"):
-        found = inspect.signature(getattr(method, name).py_func)
+        signature = inspect.signature(getattr(method, name).py_func)
         expected = inspect.signature(getattr(Method, name))
-        assert list(found.parameters) == list(expected.parameters)[1:]
+        assert list(signature.parameters) == list(expected.parameters)[1:]
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -119,8 +119,8 @@ def reference(scene: Scene, times: np.ndarray) -> np.ndarray:
         return np.concatenate([rate, frame_rate, (given + total) / masses, held / frame_masses])
 
     start = np.concatenate([scene.initial.q, np.zeros(3), scene.initial.v, np.zeros(3)])
-    found = solve_ivp(change, (0.0, times[-1]), start, "DOP853", times, rtol=1e-11, atol=1e-13, max_step=2e-3)
-    return np.asarray(found.y[:6].T)
+    solution = solve_ivp(change, (0.0, times[-1]), start, "DOP853", times, rtol=1e-11, atol=1e-13, max_step=2e-3)
+    return np.asarray(solution.y[:6].T)
 
 
 def test_a_tilted_throw_agrees_with_independent_equations() -> None:

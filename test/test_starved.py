@@ -129,8 +129,8 @@ def test_a_recording_in_progress_is_replayed_up_to_its_end(folder: Path) -> None
     ids=["150 MB of addresses", "no room for a file", "100 kB for a file", "no compiled code"],
 )
 def test_lacking_resources_are_named(lacking: dict[str, object], code: int, message: str, folder: Path) -> None:
-    found, lines = _run(folder, *LIVE, **lacking)  # type: ignore[arg-type]
-    assert found == code and message in lines[0], lines
+    result, lines = _run(folder, *LIVE, **lacking)  # type: ignore[arg-type]
+    assert result == code and message in lines[0], lines
     assert len(lines) <= (2 if code == 3 else 1), lines  # a loss (exit code 3) may add a second line
 
 
@@ -193,6 +193,6 @@ def test_two_runs_into_one_folder_are_both_complete(folder: Path) -> None:
     runs = [subprocess.Popen(words, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True) for _ in range(2)]
     output = [run.communicate()[1] for run in runs]
     assert [run.returncode for run in runs] == [0, 0], output
-    found = sorted(folder.glob("run*"))
-    assert len(found) == 2 and any("is not empty" in text for text in output), (found, output)
-    assert [(replay(run).exit_code, replay(run).samples) for run in found] == [(0, 1500)] * 2
+    folders = sorted(folder.glob("run*"))
+    assert len(folders) == 2 and any("is not empty" in text for text in output), (folders, output)
+    assert [(replay(run).exit_code, replay(run).samples) for run in folders] == [(0, 1500)] * 2

@@ -110,9 +110,9 @@ def test_many_publications_together_raise_the_same_alarms_as_single_ones(names: 
     thresholds = {name: Thresholds(0.05, 0.97) if name in names else Thresholds() for name in quantities}
     one, many = Alarms(thresholds, 0.02), Alarms(thresholds, 0.02)
     expected = [(index, one.levels) for index, publication in enumerate(run) if _changes(one, publication)]
-    found = []
+    changes_of_level = []
     for first in range(0, len(run), 250):
         changes = many.feed(Published.joined(run[first : first + 250]))
-        found += [(first + index, many.levels) for index in changes]
+        changes_of_level += [(first + index, many.levels) for index in changes]
         assert first + 250 < len(run) or many.alarms == one.alarms
-    assert found == expected and bool(names) == bool(expected)
+    assert changes_of_level == expected and bool(names) == bool(expected)

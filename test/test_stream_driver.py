@@ -32,8 +32,8 @@ def test_silences_are_counted_equally_for_single_and_many_samples() -> None:
     single, many = Silences(0.5), Silences(0.5)
     for stamp in stamps.tolist():
         single.add_one(stamp)
-    found = [(index, (begin - T0) // MS, (end - T0) // MS) for index, begin, end in many.add(stamps)]
-    assert found == [(2, 40, 1100), (5, 1150, 2000)]
+    silences = [(index, (begin - T0) // MS, (end - T0) // MS) for index, begin, end in many.add(stamps)]
+    assert silences == [(2, 40, 1100), (5, 1150, 2000)]
     assert single.facts() == many.facts()
     longest = "the longest from 0.040 s to 1.100 s after the first"
     assert single.text() == f"1.910 s without samples, in 2 stretches, {longest}"

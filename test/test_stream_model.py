@@ -38,9 +38,9 @@ class Bench:
 
     def send(self, first: int, last: int, shift_ns: int = 0) -> list[Published]:
         arrived = [(T0 + shift_ns + k * MS, tuple(WRENCH[k])) for k in range(first, last)]
-        found = list(self.driver.samples(arrived, 0))  # type: ignore[arg-type]
-        self.out += found
-        return found
+        publications = list(self.driver.samples(arrived, 0))  # type: ignore[arg-type]
+        self.out += publications
+        return publications
 
 
 def _same(first: list[Published], second: list[Published]) -> bool:

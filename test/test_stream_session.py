@@ -69,8 +69,8 @@ NUMBERS = ("penetration", "rate", "force", "makes", "impulse", "peak", "q", "v")
 
 
 def _number(published: Published, name: str) -> np.ndarray:
-    found: np.ndarray = published.rows[name][0]
-    return found
+    column: np.ndarray = published.rows[name][0]
+    return column
 
 
 def _stamp(published: Published) -> int:

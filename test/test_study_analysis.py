@@ -339,7 +339,7 @@ def test_duty_is_a_share_of_time_at_any_sampling_rate(tmp_path: Path) -> None:
     """One load, linear between four knots, is given by its knots, or by many samples on the lines."""
     knots, count = np.array([0.0, 0.7, 1.5, 2.0]), 2001
     wrench = np.array([[0, 0, 0], [32e3, -11e3, -45e3], [-32e3, 11e3, 45e3], [0, 0, 0]])
-    found = {}
+    loads = {}
     for name, times in (("coarse", knots), ("fine", np.unique(np.append(np.linspace(0.0, 2.0, count), knots)))):
         values = np.column_stack([np.interp(times, knots, column) for column in wrench.T])
         (tmp_path / name).mkdir()
@@ -347,8 +347,8 @@ def test_duty_is_a_share_of_time_at_any_sampling_rate(tmp_path: Path) -> None:
             tmp_path / name / "load.csv", np.column_stack([times, values]), delimiter=",",
             header="t,fx,fy,m", comments="", fmt="%.12g",
         )  # fmt: skip
-        found[name] = analyse(tmp_path / name, scene=PAPER).predictions[0].loads
-    coarse, fine = (np.array(list(found[name].facts()["duty"].values())) for name in ("coarse", "fine"))
+        loads[name] = analyse(tmp_path / name, scene=PAPER).predictions[0].loads
+    coarse, fine = (np.array(list(loads[name].facts()["duty"].values())) for name in ("coarse", "fine"))
     assert 0.05 < fine.max() < 1.0
     assert coarse == pytest.approx(fine, abs=2e-3)
     # duty is the share of time in contact, not the share of the intervals with an impulse

@@ -69,13 +69,15 @@ def errors(calibration: Calibration) -> list[float]:
 
 
 def test_known_parameters_are_recovered_from_every_random_start() -> None:
-    found, objective = from_recording(3)
-    assert len(found.starts) == 3 and max(errors(found)) < RECOVERED
-    assert len({start.before_polish for start in found.starts}) == 3  # the three starts have taken different paths
-    known = identifiability(space(), objective, found.best.point)
+    calibration, objective = from_recording(3)
+    assert len(calibration.starts) == 3 and max(errors(calibration)) < RECOVERED
+    assert (
+        len({start.before_polish for start in calibration.starts}) == 3
+    )  # the three starts have taken different paths
+    known = identifiability(space(), objective, calibration.best.point)
     assert len(known.singular_values) == 4 and known.singular_values[-1] > 1e-2
     assert sum(value**2 for value in known.weakest.values()) == pytest.approx(1.0)
-    clusters = near_optimal(space(), found, excess=1e-6)
+    clusters = near_optimal(space(), calibration, excess=1e-6)
     assert len(clusters) == 1 and clusters[0].members >= 3 and clusters[0].values["loads.fx2.sign"] == -1.0
     two = [Cluster(2, 1.0, {}, {"x": (1.0, 2.0)}), Cluster(1, 1.05, {}, {"x": (5.0, 6.0)})]
     assert near_optimal_ends(two, "x") == (1.0, 6.0) and near_optimal_ends(two, "law") is None
@@ -83,8 +85,8 @@ def test_known_parameters_are_recovered_from_every_random_start() -> None:
 
 @pytest.mark.stress
 def test_known_parameters_are_recovered_from_20_random_starts() -> None:
-    found, _ = from_recording(20)
-    assert len(found.starts) == 20 and max(errors(found)) < RECOVERED
+    calibration, _ = from_recording(20)
+    assert len(calibration.starts) == 20 and max(errors(calibration)) < RECOVERED
 
 
 def test_the_same_seed_gives_the_same_bits_on_any_number_of_threads() -> None:

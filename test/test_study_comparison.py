@@ -83,14 +83,14 @@ def test_new_pads_do_not_count_as_negative_wear(runs: tuple[Run, Run], monkeypat
     batches = type(recording).batches
 
     def grown(self: Any, *names: str) -> Any:
-        for found in batches(self, *names):
-            if "clearance" in found:
-                part = found["clearance"]
+        for batch in batches(self, *names):
+            if "clearance" in batch:
+                part = batch["clearance"]
                 run_s = (part.stamp_ns - BASE_NS) * 1e-9
                 values = part.values.copy()
                 values[:, _PADS] = np.where(run_s < 1.55, 1e-3 + run_s * 1e-6, run_s * 1e-6)[:, None]
-                found = {**found, "clearance": replace(part, values=values)}
-            yield found
+                batch = {**batch, "clearance": replace(part, values=values)}
+            yield batch
 
     monkeypatch.setattr(type(recording), "batches", grown)
     wear = windows_of(recording, 1.0).pairs["wear"]
@@ -151,8 +151,8 @@ def test_a_change_of_the_machine_is_distinguished_from_a_change_of_the_load(
     force = [
         scale * 1e5 * loads * random.normal(1.0, 0.05, 300) for scale, loads in zip((1.0, factor), load, strict=True)
     ]
-    found = change((force[0], load[0]), (force[1], load[1]), random, draws=300)
-    assert found is not None and found.verdict == verdict and found.low < 0.15 < found.high
+    difference = change((force[0], load[0]), (force[1], load[1]), random, draws=300)
+    assert difference is not None and difference.verdict == verdict and difference.low < 0.15 < difference.high
     steady = change((force[0], np.ones(300)), (force[1], np.full(300, 1.2)), random, draws=300)
     assert steady is not None and steady.verdict == "load or machine"
     assert change((force[0][:5], load[0][:5]), (force[1], load[1]), random) is None
@@ -170,9 +170,9 @@ def test_a_lasting_change_of_the_load_is_attributed_to_the_load() -> None:
             start_ns = 10**9 * np.arange(61)
             seen = with_neighbours(0.5 * (true[1:] + true[:-1]), start_ns)
             groups.append((1e5 * true[1:] * random.normal(1.0, 0.02, 61), seen))
-        found = change(*groups, random, draws=100)
-        assert found is not None
-        verdicts.append(found.verdict)
+        difference = change(*groups, random, draws=100)
+        assert difference is not None
+        verdicts.append(difference.verdict)
     assert verdicts.count("load") >= 34
     np.testing.assert_array_equal(
         with_neighbours(np.array([1.0, 2.0, 3.0]), np.array([0, 10, 90])), [[1, 1, 2], [2, 1, 2], [3, 3, 3]]

@@ -60,8 +60,8 @@ def sqlite_bag(folder: Path) -> Path:
 def test_a_bag_without_its_metadata_and_with_an_open_log_is_read_to_its_end(tmp_path: Path) -> None:
     killed = sqlite_bag(tmp_path / "bag")
     assert not (killed / "metadata.yaml").exists() and list(killed.glob("*-wal"))
-    found = [arrived.log_time_ns for arrived in open_source(killed).messages(lambda topic: True)]
-    assert found == [BASE_NS + index * STEP_NS for index in range(COUNT)]
+    times = [arrived.log_time_ns for arrived in open_source(killed).messages(lambda topic: True)]
+    assert times == [BASE_NS + index * STEP_NS for index in range(COUNT)]
 
 
 def test_a_bag_compressed_by_message_is_read_and_one_compressed_as_a_whole_is_named(tmp_path: Path) -> None:
@@ -79,8 +79,8 @@ def test_a_bag_compressed_by_message_is_read_and_one_compressed_as_a_whole_is_na
     live.commit()
     live.close()
     source = open_source(tmp_path / "MESSAGE")
-    found = [arrived.content.wrench.force.x for arrived in source.messages(lambda topic: True)]
-    assert found == [paper_sample(1).wrench[0]] * 2 and source.losses.counts == {"undecodable": 1}
+    forces = [arrived.content.wrench.force.x for arrived in source.messages(lambda topic: True)]
+    assert forces == [paper_sample(1).wrench[0]] * 2 and source.losses.counts == {"undecodable": 1}
     for read in (open_source, lambda path: expand([path]), replay):
         with pytest.raises(RecordingError, match=r"FILE\.db3\.zstd is compressed as a whole"):
             read(tmp_path / "FILE")

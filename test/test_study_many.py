@@ -186,8 +186,8 @@ def test_a_run_is_analysed_while_it_is_recorded(tmp_path: Path) -> None:
 def test_a_failed_recording_among_many_has_a_row_with_the_error(tmp_path: Path) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(10)))
     (tmp_path / "taken").write_text("no folder")
-    found = run_task(Task(run.folder, None, None, (), tmp_path / "taken"))
-    assert found["run"] == str(run.folder) and "FileExistsError" in found["error"]
+    result = run_task(Task(run.folder, None, None, (), tmp_path / "taken"))
+    assert result["run"] == str(run.folder) and "FileExistsError" in result["error"]
 
 
 @pytest.mark.usefixtures("without_workers")

@@ -30,9 +30,9 @@ def drops() -> Drops:
     return Drops.load(DATA / "square_drops.npz")
 
 
-def misses(found: np.ndarray, after: np.ndarray) -> np.ndarray:
+def misses(predicted: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Return the norm of the velocity errors [m/s]."""
-    return np.linalg.norm((found - after)[:, 3:] * [1.0, 1.0, GYRATION], axis=1)
+    return np.linalg.norm((predicted - after)[:, 3:] * [1.0, 1.0, GYRATION], axis=1)
 
 
 def energy(states: np.ndarray) -> np.ndarray:
@@ -107,8 +107,8 @@ def test_tossed_block_moves_as_the_preset_computed_by_the_solver(drops) -> None:
         # with the balance, the kernels of test_solve_rounded are used
         moving = replace(scene, initial=start)
         solved = simulate(moving, t_end=len(measured) / 250.0, output_dt=0.004, energy_balance=True).q
-        found = toss(np.array([[x, z, theta, *rates]]), len(solved), np.array([block], block.dtype))[0, :, :3]
-        apart.append(np.abs(found[:20] - solved[:20] - [0.0, 1.0, 0.0]).max(axis=0))
+        path = toss(np.array([[x, z, theta, *rates]]), len(solved), np.array([block], block.dtype))[0, :, :3]
+        apart.append(np.abs(path[:20] - solved[:20] - [0.0, 1.0, 0.0]).max(axis=0))
         off = MARKER.measured(solved + np.array([0.0, 1.0, 0.0]))[: len(measured), :2] - measured[:, :2]
         far.append(np.hypot(*off.T).mean())
     # impacts amplify the difference between fixed steps and event detection
@@ -141,13 +141,13 @@ def test_bands_contain_nine_of_ten_measured_rows(drops) -> None:
 
 def test_bands_are_ordered_start_narrow_and_repeat(drops) -> None:
     flight = drops.pose[0, : drops.flight_rows[0]]
-    found = bands(flight, 100)
-    assert found.shape == (100, 3, 3)
-    assert (np.diff(found, axis=1) > 0.0).all()
-    assert (found[0, 2] - found[0, 0] < [1e-3, 1e-3, 0.01]).all()
-    assert (found[80, 2] - found[80, 0] > 0.01).all()
-    assert (bands(flight, 100) == found).all()
-    assert (bands(flight, 5) == found[:5]).all() is np.True_ or bands(flight, 5).shape == (5, 3, 3)
+    bands_found = bands(flight, 100)
+    assert bands_found.shape == (100, 3, 3)
+    assert (np.diff(bands_found, axis=1) > 0.0).all()
+    assert (bands_found[0, 2] - bands_found[0, 0] < [1e-3, 1e-3, 0.01]).all()
+    assert (bands_found[80, 2] - bands_found[80, 0] > 0.01).all()
+    assert (bands(flight, 100) == bands_found).all()
+    assert (bands(flight, 5) == bands_found[:5]).all() is np.True_ or bands(flight, 5).shape == (5, 3, 3)
     assert ensemble(flight, 30, members=7).shape == (7, 30, 3)
 
 

@@ -103,11 +103,11 @@ def test_forces_are_those_of_the_reconstruction(study: PaperStudy) -> None:
         "clockwise: largest mean force, at b": (82.0, 90.24, 0.101, Verdict.DISAGREES),
     }
     for what, (published, value, difference, verdict) in expected.items():
-        found = row(study, what)
-        assert found.published_value == published
-        assert found.value == pytest.approx(value, abs=0.005)
-        assert found.difference == pytest.approx(difference, abs=5e-4)
-        assert found.verdict is verdict
+        statement = row(study, what)
+        assert statement.published_value == published
+        assert statement.value == pytest.approx(value, abs=0.005)
+        assert statement.difference == pytest.approx(difference, abs=5e-4)
+        assert statement.verdict is verdict
 
 
 def test_trends_are_those_of_the_reconstruction(study: PaperStudy) -> None:
@@ -224,8 +224,8 @@ def test_a_failed_run_gives_no_verdict(study: PaperStudy) -> None:
     forces = study.runs.vertical.largest_n.copy()
     forces[10] = np.nan
     table = rows(replace(study.runs, vertical=Sweep(study.runs.vertical.clearance_m, forces)))
-    found = [entry.verdict for entry in table if entry.group.startswith("Vertical")]
-    assert found == [Verdict.NOT_COMPUTED] * 5
+    verdicts = [entry.verdict for entry in table if entry.group.startswith("Vertical")]
+    assert verdicts == [Verdict.NOT_COMPUTED] * 5
     assert all(entry.verdict is not Verdict.NOT_COMPUTED for entry in table if not entry.group.startswith("Vertical"))
 
 

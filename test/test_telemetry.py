@@ -131,8 +131,8 @@ def _meanwhile(live: Live, work: Coroutine[Any, Any, Any]) -> Any:
 
 
 async def _is_good(node: Any) -> bool:
-    found = await node.read_data_value(raise_on_bad_status=False)
-    return bool(found.StatusCode.is_good())
+    data_value = await node.read_data_value(raise_on_bad_status=False)
+    return bool(data_value.StatusCode.is_good())
 
 
 def test_an_opcua_server_for_other_machines_encrypts_and_admits_trusted_clients(tmp_path: Path) -> None:
@@ -172,8 +172,8 @@ def test_an_opcua_server_for_other_machines_encrypts_and_admits_trusted_clients(
         live.until_count("samples_used", 100)
         trusted, other = tmp_path / "trusted" / "client.crt", tmp_path / "other.pem"
         cases = ((trusted, "s3cret"), (trusted, "guess"), (other, "s3cret"), (None, "s3cret"))
-        found = [_meanwhile(live, connects(*given)) for given in cases]
-        assert found == [True, False, False, False]
+        connected = [_meanwhile(live, connects(*given)) for given in cases]
+        assert connected == [True, False, False, False]
         live.process.terminate()
         output = live.process.communicate(timeout=60.0)[1]
         assert live.process.returncode == 0 and b"Traceback" not in output

@@ -34,7 +34,9 @@ def test_the_telemetry_of_a_node_sends_its_results_and_ends_cleanly(tmp_path: Pa
                 probe.pace(index)
             probe.until(lambda: (heard.newest("face/alarms") or {"values": {}})["values"].get("force_level") == "warn",
                         "the alarm")  # fmt: skip
-            peaks = max(max(filter(None, found["values"].values()), default=0.0) for found in heard.all("face/peaks"))
+            peaks = max(
+                max(filter(None, message["values"].values()), default=0.0) for message in heard.all("face/peaks")
+            )
             assert peaks > 1e4 and heard.newest("face/clearance")["values"]["horizontal"] == pytest.approx(0.025)
             # the message names the unreachable receiver
             assert "influx" in beside.output() or "http" in beside.output()

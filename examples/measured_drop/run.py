@@ -34,7 +34,7 @@ def main() -> None:
     drops = Drops.load(DATA)
     pose, given = drops.pose[DROP], int(drops.flight_rows[DROP])
     until = drops.until(DROP, 1) + 1
-    found = bands(pose[:given], until)
+    bands_found = bands(pose[:given], until)
     # in the preset, the centre of the cavity is 1 m above the table
     x, z, theta, *rates = MARKER.state_of_block(fit_flight(pose[:given]).state)
     start = Initial(q=(x, z - 1.0, theta), v=(rates[0], rates[1], rates[2]))
@@ -42,14 +42,14 @@ def main() -> None:
     result = simulate(scene, t_end=(until - given) / RATE_HZ, output_dt=1.0 / RATE_HZ)
     simulated = MARKER.measured(result.q + np.array([0.0, 1.0, 0.0]))
     off = np.hypot(*(simulated[:, :2] - pose[given - 1 : until, :2]).T)
-    inside = ((pose[:until] >= found[:, 0]) & (pose[:until] <= found[:, 2])).mean()
+    inside = ((pose[:until] >= bands_found[:, 0]) & (pose[:until] <= bands_found[:, 2])).mean()
     print(f"first flight: {given} rows; up to the second bounce: {until} rows")
     print(f"mean distance of the simulated centre: {1e3 * off.mean():.1f} mm; measured inside the bands: {inside:.0%}")
     out.mkdir(parents=True, exist_ok=True)
     t = np.arange(until) / RATE_HZ
     figure, axes = plt.subplots(3, 1, sharex=True, figsize=(8, 7))
     for j, (axis, name) in enumerate(zip(axes, ("x [m]", "z [m]", "theta [rad]"), strict=True)):
-        axis.fill_between(t, found[:, 0, j], found[:, 2, j], alpha=0.3, label="90 % band")
+        axis.fill_between(t, bands_found[:, 0, j], bands_found[:, 2, j], alpha=0.3, label="90 % band")
         axis.plot(t, pose[:until, j], "k.", label="measured")
         axis.plot(t[given - 1 :], simulated[:, j], label="measured_square")
         axis.set_ylabel(name)

@@ -60,21 +60,25 @@ def analyse(
         if len(recordings) != 1:
             raise click.UsageError(f"--watch: got {len(recordings)} recordings, expected one")
         return _watched(Task(recordings[0], scene_file, mapping, further, out, units=units), watch, as_json, quiet)
-    found, left = found_recordings(recordings, out)
-    many = len(found) > 1 or found != list(recordings)
+    recordings_found, left = found_recordings(recordings, out)
+    many = len(recordings_found) > 1 or recordings_found != list(recordings)
     for option, given in (("--dask", dask), ("--workers", workers)):
         if given is not None and not many:
             raise click.UsageError(f"{option}: got one recording, expected many, or a folder of recordings")
     if dask is not None and workers is not None:
         raise click.UsageError("--workers cannot be combined with --dask: a cluster has its own workers")
-    folders = [out / name for name in names_apart(found)] if out is not None and many else [out] * len(found)
+    folders = (
+        [out / name for name in names_apart(recordings_found)]
+        if out is not None and many
+        else [out] * len(recordings_found)
+    )
     beside = () if many else left
     tasks = [
         Task(path, scene_file, mapping, further, folder, beside, units)
-        for path, folder in zip(found, folders, strict=True)
+        for path, folder in zip(recordings_found, folders, strict=True)
     ]
     for task in tasks:  # all tasks are checked before any task removes a file
-        task.check(found)
+        task.check(recordings_found)
     results = _results(tasks, many, workers, dask, quiet)
     if many and out is not None:
         from plow_twin.study.analysis.report import write_table_of_runs
@@ -126,10 +130,10 @@ def _watched(task: Any, every: float, as_json: bool, quiet: bool) -> int:
 
     due = time.monotonic() + every
 
-    def show(found: Any, **end: bool) -> None:
-        facts = {**found.facts(), **end}
+    def show(analysis: Any, **end: bool) -> None:
+        facts = {**analysis.facts(), **end}
         if task.out is not None:
-            write_report(found, task.out)
+            write_report(analysis, task.out)
         if as_json:
             click.echo(json.dumps(facts, allow_nan=False))
             sys.stdout.flush()

@@ -58,14 +58,14 @@ def compare(
     from plow_twin.study.comparison.compare import compare as compared
 
     label = _label(by, shifts, zone)
-    found, _ = found_recordings(recordings)
-    tasks = [WindowsTask(path, window) for path in found]
+    recordings_found, _ = found_recordings(recordings)
+    tasks = [WindowsTask(path, window) for path in recordings_found]
     with progress("reading", quiet or as_json) as on_progress:
         results = run_many(tasks, workers=workers or os.cpu_count() or 1, dask=dask, on_progress=on_progress)
     failed = [result["error"] for result in results if "error" in result]
     for error in failed:
         say_error(f"plow-twin: left out: {error}")
-    names = names_apart(found)
+    names = names_apart(recordings_found)
     runs = [(name, result["windows"]) for name, result in zip(names, results, strict=True) if "error" not in result]
     lost = {result["run"]: result["lost"] for result in results if result.get("lost")}
     for run, counts in lost.items():

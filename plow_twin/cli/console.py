@@ -175,9 +175,9 @@ def _plain(value: Any) -> str:
     return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
-def counts(found: Mapping[str, int]) -> str:
+def counts(numbers: Mapping[str, int]) -> str:
     """Return a line of text with names and counts."""
-    return ", ".join(f"{name}: {count}" for name, count in found.items())
+    return ", ".join(f"{name}: {count}" for name, count in numbers.items())
 
 
 def say_end(recording: object, status: str) -> None:

@@ -104,6 +104,6 @@ def dashboard(
             from plow_twin.dashboard.run import show_run
             from plow_twin.record.running import find_run
 
-            found = run if run.exists() else find_run(run, wait, stopped)
-            show_run(found, access, stopped, lambda screen: say_where(screen, access))
+            folder = run if run.exists() else find_run(run, wait, stopped)
+            show_run(folder, access, stopped, lambda screen: say_where(screen, access))
     return DONE

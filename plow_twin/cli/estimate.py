@@ -265,8 +265,8 @@ def _repeated(source: Path) -> _Task | None:
     from plow_twin.record.reader import RunReader
 
     reader = RunReader(source)
-    found = list(live_estimates(reader))
-    whole = [(one.entry, one.window) for one in found if one.window is not None]
+    estimates = list(live_estimates(reader))
+    whole = [(one.entry, one.window) for one in estimates if one.window is not None]
     if not whole:
         return None
     entry, window = whole[-1]
@@ -277,7 +277,7 @@ def _repeated(source: Path) -> _Task | None:
     def run() -> tuple[Estimate, dict[str, Any]]:
         again = answer(scene, window, entry.guess, requests_of(settings(reader.header.parameters)))
         same = again.text == entry.result
-        live = {"estimates": len(found), "repeated": same, "start_ns": entry.start_ns, "end_ns": entry.end_ns}
+        live = {"estimates": len(estimates), "repeated": same, "start_ns": entry.start_ns, "end_ns": entry.end_ns}
         return again.estimate, {**again.also, "live": live, "losses": losses}
 
     return _Task(scene, window.load, window.pose, run, entry.start_ns)

@@ -120,14 +120,14 @@ def forecast(
             deviation = float(known.deviation[0]), float(known.deviation[1])
             model = with_clearances(model, float(known.clearance[0]), float(known.clearance[1]), known.depth)
         _check_limits(limits, model)
-        found = run(model, plan, deviation, known)
-    facts = found.as_dict()
+        result = run(model, plan, deviation, known)
+    facts = result.as_dict()
     if known is not None:
         facts["coefficient_m2_n"] = asdict(known.interval())
     if plot is not None:
         from plow_twin.view.forecast import draw_forecast
 
-        draw_forecast(found, plot, f"Forecast of {Path(scene).name}, drawn {datetime.now(UTC):%Y-%m-%d}")
+        draw_forecast(result, plot, f"Forecast of {Path(scene).name}, drawn {datetime.now(UTC):%Y-%m-%d}")
     facts["lost"] = lost
     if lost:
         say_error(f"plow-twin: {scene}: lost {counts(lost)}; there may be a newer estimate and more wear")
@@ -215,7 +215,7 @@ def _show(facts: dict[str, Any]) -> None:
     console.print(view)
     console.print(f"not reached in {facts['horizon_h']:g} h: {100 * facts['not_reached_in_horizon']:.0f} %")
     if "coefficient_m2_n" in facts:
-        found = facts["coefficient_m2_n"]
-        console.print(f"wear coefficient {found['mean']:.3g} m^2/N ({found['p05']:.3g} .. {found['p95']:.3g})")
+        wear = facts["coefficient_m2_n"]
+        console.print(f"wear coefficient {wear['mean']:.3g} m^2/N ({wear['p05']:.3g} .. {wear['p95']:.3g})")
     if facts["probability_before_stop"] is not None:
         console.print(f"reached before the stop: {100 * facts['probability_before_stop']:.0f} %")

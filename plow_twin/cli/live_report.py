@@ -86,10 +86,10 @@ class Report:
 def _typed(value: str) -> int | float | str:
     for kind in (int, float):
         try:
-            found = kind(value)
+            message = kind(value)
         except ValueError:
             continue
-        return found if math.isfinite(found) else value
+        return message if math.isfinite(message) else value
     return value
 
 

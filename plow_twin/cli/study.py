@@ -29,12 +29,12 @@ def paper_command() -> click.Command:
     if CLONE.is_dir() and str(CLONE) not in sys.path:
         sys.path.append(str(CLONE))
     try:
-        found: click.Command = import_module("plow_twin_paper.command").paper
+        command: click.Command = import_module("plow_twin_paper.command").paper
     except ModuleNotFoundError as error:
         if error.name != "plow_twin_paper":
             raise
         return _absent_paper()
-    return found
+    return command
 
 
 def _absent_paper() -> click.Command:

@@ -195,15 +195,15 @@ def _run(
 
     first = space.point(model)
     with progress("calibrating", quiet) as on_progress:
-        found: Calibration = fit_to(
+        fitted: Calibration = fit_to(
             space, objective, seed=options["seed"], starts=options["starts"], search=search, first=first,
             on_progress=lambda share, best: on_progress(share),
         )  # fmt: skip
-    values = found.best.values
-    excess = options["excess"] or max(0.1 * found.best.objective, 1e-12)
+    values = fitted.best.values
+    excess = options["excess"] or max(0.1 * fitted.best.objective, 1e-12)
     return Fit(
-        fitted_scene(model, values, source), found, search, source,
-        identifiability(space, objective, found.best.point), near_optimal(space, found, excess),
+        fitted_scene(model, values, source), fitted, search, source,
+        identifiability(space, objective, fitted.best.point), near_optimal(space, fitted, excess),
         None if first is None else objective_of(objective, {}),
         target_rows(objective, values) if isinstance(objective, TargetObjective) else [],
     )  # fmt: skip

@@ -87,15 +87,15 @@ def listening(access: PageAccess) -> socket.socket:
     """Return a listening socket. Raise `DashboardError` if the address is in use or does not belong to this machine."""
     try:
         family, kind, _, _, address = socket.getaddrinfo(access.host, access.port, type=socket.SOCK_STREAM)[0]
-        found = socket.socket(family, kind)
+        probe = socket.socket(family, kind)
         try:
-            found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            found.bind(address)
-            found.listen()
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+            probe.listen()
         except OSError:
-            found.close()
+            probe.close()
             raise
     except OSError as error:
         got = f"{access.host}:{access.port}"
         raise DashboardError("--listen", got, f"a free address of this machine ({error.strerror})") from error
-    return found
+    return probe

@@ -52,19 +52,19 @@ class Board:
 
     def since(self, version: int) -> dict[str, Any]:
         """Return all values that are newer than the update `version`."""
-        found: dict[str, Any] = {
+        facts: dict[str, Any] = {
             "version": self.version,
             "age": round(time.monotonic() - self._updated_s, 2),
             "not_taken": self._not_taken,
             "pages": self.pages,
         }
         if self.version == version:
-            return found
+            return facts
         if self._facts_version > version:
-            found["facts"] = self._facts
-        found["parts"] = {name: part for name, (at, part) in self._parts.items() if at > version}
-        found["events"] = [event for at, event in self._events if at > version]
-        found["anew"] = self._anew_version > version
-        found["seconds"] = self._history.since(0 if found["anew"] else version)
-        found["motion"] = self._motion
-        return found
+            facts["facts"] = self._facts
+        facts["parts"] = {name: part for name, (at, part) in self._parts.items() if at > version}
+        facts["events"] = [event for at, event in self._events if at > version]
+        facts["anew"] = self._anew_version > version
+        facts["seconds"] = self._history.since(0 if facts["anew"] else version)
+        facts["motion"] = self._motion
+        return facts

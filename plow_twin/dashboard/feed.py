@@ -92,16 +92,16 @@ class Motion:
         self.clearance, self.estimate = values, {}
 
     def _clearances(self, values: Array) -> dict[str, float | None]:
-        found = {name: number(value) for name, value in zip(CLEARANCE_NAMES, values.tolist(), strict=True)}
+        clearance = {name: number(value) for name, value in zip(CLEARANCE_NAMES, values.tolist(), strict=True)}
         for axis in [axis for axis in ("horizontal", "vertical") if self.status.get(axis) in _KNOWN_STATES]:
             for name in (axis, f"{axis}/p05", f"{axis}/p95"):
                 if name in self.estimate:
-                    found[name] = number(float(self.estimate[name]))
-        return found
+                    clearance[name] = number(float(self.estimate[name]))
+        return clearance
 
     def update(self) -> dict[str, Any]:
         """Return the values for the page."""
-        found = {
+        facts = {
             "t": self.stamp_ns * 1e-9,
             "pose": numbers(self.pose),
             "penetration": numbers(self.penetration),
@@ -114,10 +114,10 @@ class Motion:
             "was_held": self.was_held,
         }
         if self.points is not None:
-            found["points"] = numbers(self.points.ravel())
+            facts["points"] = numbers(self.points.ravel())
         if self.clearance is not None:
-            found["clearance"] = self._clearances(self.clearance)
-        return found
+            facts["clearance"] = self._clearances(self.clearance)
+        return facts
 
 
 class Feed:

@@ -51,8 +51,8 @@ class History:
     def since(self, version: int) -> list[list[Any]]:
         """Return the seconds that have changed since the update `version`."""
         count = 0
-        for found in reversed(self._versions):
-            if found <= version:
+        for older in reversed(self._versions):
+            if older <= version:
                 break
             count += 1
         return list(self._seconds)[len(self._seconds) - count :]
@@ -73,5 +73,5 @@ def _joined(before: list[Any], now: list[Any]) -> list[Any]:
 def _extreme(choose: Any, first: float | None, second: float | None) -> float | None:
     if first is None or second is None:
         return second if first is None else first
-    found: float = choose(first, second)
-    return found
+    extreme: float = choose(first, second)
+    return extreme

@@ -52,8 +52,8 @@ class Link:
         if not data:
             self.broken = True
             return None
-        found: dict[str, Any] = json.loads(data)
-        return found
+        message: dict[str, Any] = json.loads(data)
+        return message
 
     def close(self) -> None:
         """Close this end. The process at the opposite end is notified that the link is broken."""

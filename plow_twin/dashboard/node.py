@@ -167,9 +167,9 @@ class NodeWatch:
         motion.was_held |= motion.held
 
     def _load(self, data: bytes) -> None:
-        found = read_wrench(data)
-        if found is not UNREADABLE:
-            self._motion.add_load(np.array([found[1]]))
+        wrench = read_wrench(data)
+        if wrench is not UNREADABLE:
+            self._motion.add_load(np.array([wrench[1]]))
 
     def _said(self, topic: str, message: plain.Message) -> None:
         assert self.feed is not None
@@ -180,7 +180,7 @@ class NodeWatch:
         for status in message.status:
             name, _, part = status.name.partition(": ")
             if name == self.name:
-                values = {found.key: found.value for found in status.values}
+                values = {item.key: item.value for item in status.values}
                 known: Part = (int.from_bytes(status.level, "little"), status.message, values)
                 self.feed.part(part, known)
 

@@ -59,9 +59,11 @@ class RunFeed:
         self._inputs.add(batch.entries)
         self._feed.part("input", (0, "", {"source": self._inputs.source, **self._counted()}))
         loads, held = Rows(stamps_ns, stamps_ns, wrench), np.array(held_ns, np.int64)
-        arrays = [loads.stamp_ns, held, *(found.stamp_ns for found in rows.values())]
+        arrays = [loads.stamp_ns, held, *(rows_of_topic.stamp_ns for rows_of_topic in rows.values())]
         for second in np.unique(np.concatenate(arrays) // NS_PER_S).tolist():
-            self._second({name: _within(found, second) for name, found in rows.items()}, _within(loads, second))
+            self._second(
+                {name: _within(topic_rows, second) for name, topic_rows in rows.items()}, _within(loads, second)
+            )
             self._feed.motion.held = bool((held // NS_PER_S == second).any())
             self._feed.motion.was_held |= self._feed.motion.held
             while not (self._feed.send() or self._stopped()):
@@ -73,16 +75,16 @@ class RunFeed:
         own = others.pop(self._inputs.source, {})
         counted = {"samples_used": own.pop("used", 0), "samples_lost": own.pop("lost", 0)}
         counted |= {f"dropped_{reason}": count for reason, count in own.items()}
-        for name, found in others.items():
-            counted |= {f"{name}_used": found.pop("used", 0), f"{name}_dropped": sum(found.values())}
+        for name, other_rows in others.items():
+            counted |= {f"{name}_used": other_rows.pop("used", 0), f"{name}_dropped": sum(other_rows.values())}
         return {name: str(count) for name, count in counted.items()}
 
     def _second(self, rows: dict[str, Rows], loads: Rows) -> None:
         motion = self._feed.motion
-        for found in (loads, *rows.values()):
-            if len(found):
-                motion.stamp_ns = int(found.stamp_ns[-1])
-        newest = {name: found.numbers[-1] for name, found in rows.items() if len(found)}
+        for rows_of_topic in (loads, *rows.values()):
+            if len(rows_of_topic):
+                motion.stamp_ns = int(rows_of_topic.stamp_ns[-1])
+        newest = {name: topic_rows.numbers[-1] for name, topic_rows in rows.items() if len(topic_rows)}
         if len(loads):
             motion.add_load(loads.numbers)
         if "contact_peaks" in newest:

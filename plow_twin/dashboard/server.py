@@ -138,10 +138,10 @@ class Pages:
 
 async def _wish(socket: WebSocket) -> dict[str, Any]:
     try:
-        found = json.loads(await socket.receive_text())
+        message = json.loads(await socket.receive_text())
     except (ValueError, KeyError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return message if isinstance(message, dict) else {}
 
 
 def application(board: Board, link: Link, access: PageAccess) -> ASGIApp:

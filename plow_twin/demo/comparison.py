@@ -74,10 +74,10 @@ def compare_forces(run: Path, wider_m: float) -> Comparison | None:
 
 def _estimate_stamps(reader: RunReader) -> list[int]:
     """Return the stamp [ns] of the last sample before each estimate."""
-    found: list[int] = []
+    stamps: list[int] = []
     for batch in reader.batches(outputs=False):
         there = np.flatnonzero(batch.entries.sample)
         places = [index for index, entry in batch.entries.rest.items() if isinstance(entry, Estimated)]
         before = np.searchsorted(there, places) - 1
-        found += batch.entries.stamp_ns[there[before[before >= 0]]].tolist()
-    return found
+        stamps += batch.entries.stamp_ns[there[before[before >= 0]]].tolist()
+    return stamps

@@ -346,16 +346,16 @@ def _print(console: Console, watch: Watch, summary: RunSummary, sent: int, lost:
 
 def _print_clearances(console: Console, summary: RunSummary) -> None:
     for name, (value, low, high) in summary.clearance.items():
-        found = None if summary.estimate is None else summary.estimate[name]
-        if found is None:
+        estimate = None if summary.estimate is None else summary.estimate[name]
+        if estimate is None:
             text = f"{value * 1e3:.6f} mm (prior {low * 1e3:.6f} .. {high * 1e3:.6f} mm)"
-        elif found["state"] in ("estimated", "rough"):
+        elif estimate["state"] in ("estimated", "rough"):
             true = 1e3 * getattr(summary.scene.clearance, f"{name}_m") + _SENSOR_MM
-            low, high = 1e3 * found["p05_m"], 1e3 * found["p95_m"]
-            interval = f"{found['state']} {low:.3f} .. {high:.3f} mm"
-            text = f"{1e3 * found['mean_m']:.3f} mm ({interval}; true of the synthetic sensor: {true:.3f} mm)"
+            low, high = 1e3 * estimate["p05_m"], 1e3 * estimate["p95_m"]
+            interval = f"{estimate['state']} {low:.3f} .. {high:.3f} mm"
+            text = f"{1e3 * estimate['mean_m']:.3f} mm ({interval}; true of the synthetic sensor: {true:.3f} mm)"
         else:
-            text = f"{found['state']} from the synthetic sensor"
+            text = f"{estimate['state']} from the synthetic sensor"
         console.print(f"{name} clearance {text}", highlight=False, soft_wrap=True)
 
 

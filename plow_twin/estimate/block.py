@@ -262,7 +262,7 @@ def impacts(scene: Scene, load: Load, poses: Poses, level: Array) -> tuple[list[
     free = _load_and_weight(scene, load, t) / inertia
     unknown = tuning.DRAG * Gravity().acceleration_m_s2 * np.array([1.0, 1.0, 1.0 / geometry.half_diagonal(scene)])
     ends = _kinks(t, q, free, level, unknown)
-    found = []
+    hits = []
     for index, (first, last) in enumerate(ends):
         begin = ends[index - 1][1] if index else 0
         end = ends[index + 1][0] if index + 1 < len(ends) else len(t) - 1
@@ -277,8 +277,8 @@ def impacts(scene: Scene, load: Load, poses: Poses, level: Array) -> tuple[list[
         room = 0.5 * (t[last] - t[first]) + tuning.BEYOND * float(np.median(np.diff(t)))
         met = _meeting(scene, inertia, flights, room)
         if met is not None:
-            found.append(replace(met, t=met.t + middle))
-    return found, len(ends)
+            hits.append(replace(met, t=met.t + middle))
+    return hits, len(ends)
 
 
 def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -355,8 +355,8 @@ def _meeting(scene: Scene, inertia: Array, flights: list[Array], room: float) ->
 def _corners(scene: Scene) -> Array:
     """Return the positions of the corners relative to the centre of mass, in the block's axes, in m, shape (2, 4)."""
     corners = np.stack(geometry.corner_positions(scene))[:, ::2]
-    found: Array = corners - np.array(scene.head.com_offset_m)[:, None]
-    return found
+    from_centre: Array = corners - np.array(scene.head.com_offset_m)[:, None]
+    return from_centre
 
 
 def _deeper(scene: Scene, mass: float, before: float, after: float) -> float:

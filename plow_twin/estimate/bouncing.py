@@ -361,10 +361,10 @@ class _Spread:
         mean = np.array([math.log(unknowns.penetration_of(float(vector[SOFTNESS]))), vector[DAMPING]])
         return _Spread(mean, tuning.FIRM_SPREAD[0] * np.array([1.0, float(unknowns.damped)]), _FIRM_BOUNDS)
 
-    def narrowed(self, found: _Regressed) -> _Spread:
+    def narrowed(self, regressed: _Regressed) -> _Spread:
         _, over, least = tuning.FIRM_SPREAD
-        deviation = np.minimum(np.maximum(over * found.deviation[5:7], least), self.deviation)
-        return _Spread(found.value[5:7], deviation, _FIRM_BOUNDS)
+        deviation = np.minimum(np.maximum(over * regressed.deviation[5:7], least), self.deviation)
+        return _Spread(regressed.value[5:7], deviation, _FIRM_BOUNDS)
 
 
 class _Drawn:

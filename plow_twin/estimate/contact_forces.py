@@ -152,13 +152,13 @@ def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> t
     return penetration, force
 
 
-def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells | None, list[str]]:
+def cells_of(feeling: Feeling, solution: Fit, forces: ContactForces) -> tuple[Cells | None, list[str]]:
     """Return the usable cells, or None without any, and a reason for each cell that contradicts the motion."""
-    fitted = feeling.at(found.shared, found.point.states, 0.0)
+    fitted = feeling.at(solution.shared, solution.point.states, 0.0)
     if fitted is None:
         return None, []
     delay = _delay(forces, fitted)
-    fitted = feeling.at(found.shared, found.point.states, delay)
+    fitted = feeling.at(solution.shared, solution.point.states, delay)
     if fitted is None:
         return None, []
     offset, noise = np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT)

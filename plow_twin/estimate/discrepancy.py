@@ -107,7 +107,7 @@ class Graded:
     harmonics: Harmonics | None = None
 
 
-def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) -> Graded:
+def graded(problem: Problem, fitted: Fit, doubtful: bool = False, seed: int = 0) -> Graded:
     """Return the result of a fit for a machine that may differ from the model.
 
     Parameters
@@ -125,9 +125,9 @@ def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) 
         If the equations cannot be solved.
     """
     problem = problem.with_fine_steps()
-    found = replace(found, linear=problem.linearise(found.point))
-    columns, pushes = _columns(problem, found)
-    linear = _Linearised(problem, found, columns, pushes)
+    fitted = replace(fitted, linear=problem.linearise(fitted.point))
+    columns, pushes = _columns(problem, fitted)
+    linear = _Linearised(problem, fitted, columns, pushes)
     for rounds in _ROUNDS:
         linear.learn(rounds)
         linear.temper()
@@ -145,14 +145,14 @@ def graded(problem: Problem, found: Fit, doubtful: bool = False, seed: int = 0) 
         out[[GX, GY], [GX, GY]] += bent**2 + unexplained**2
         return out
 
-    clearance = (found.shared + mean[:SIZE])[[GX, GY]]
+    clearance = (fitted.shared + mean[:SIZE])[[GX, GY]]
     added = np.diag(widened(mean, np.zeros_like(covariance)))[[GX, GY]]
     deviation = np.sqrt(ratio * halves**2 + added)
     if not doubtful:
         mean, covariance = linear.exact()
     harmonics, variance = problem.harmonics, ratio * np.diag(covariance)
     return Graded(
-        found.shared + mean[:SIZE], widened(mean, covariance), clearance, deviation, named, linear.load,
+        fitted.shared + mean[:SIZE], widened(mean, covariance), clearance, deviation, named, linear.load,
         linear.inflation, surprise, harmonics and harmonics.moved(mean[linear.waves], variance[linear.waves]),
     )  # fmt: skip
 
@@ -173,19 +173,19 @@ class _Column:
     least: float = -math.inf
 
 
-def _columns(problem: Problem, found: Fit) -> tuple[dict[str, _Column], Array]:
+def _columns(problem: Problem, fitted: Fit) -> tuple[dict[str, _Column], Array]:
     """Return the further quantities, and the derivatives, (n, 3, 3), of the measurements with respect to a load.
 
     A quantity is left out if its prior deviation is zero, if the contact law fixes it, or if its change cannot be
     simulated.
     """
-    point = found.point
+    point = fitted.point
 
     def by(step: float, **changed: Any) -> Array | None:
         moved = problem.evaluate(point.shared, point.states, **changed)
         return None if moved is None else np.nan_to_num((moved.predicted - point.predicted) / step)
 
-    scene, depth = problem.unknowns.scene, problem.unknowns.penetration_of(float(found.shared[SOFTNESS]))
+    scene, depth = problem.unknowns.scene, problem.unknowns.penetration_of(float(fitted.shared[SOFTNESS]))
     out: dict[str, _Column] = {}
     for path, coarse in STATED.items():
         deviation, step = deviation_of(scene, path) if _can_move(scene, path) else 0.0, problem.steps * coarse
@@ -289,24 +289,24 @@ class _Linearised:
     load : (3,) standard deviation of the load's error in a swing
     """
 
-    def __init__(self, problem: Problem, found: Fit, columns: dict[str, _Column], pushes: Array) -> None:
+    def __init__(self, problem: Problem, fitted: Fit, columns: dict[str, _Column], pushes: Array) -> None:
         every, waves = columns.values(), 0 if problem.harmonics is None else problem.harmonics.amplitude.size
         # the harmonics are the last quantities, in the slice `waves` of the border
         self.names = list(columns)[: len(columns) - waves]
         self.waves = slice(SIZE + len(self.names), SIZE + len(columns))
-        self._found, self._swing = found, found.point.swing
+        self._found, self._swing = fitted, fitted.point.swing
         further = np.stack([one.derivative for one in every], axis=2)
         self._precision = np.concatenate([problem.deviation, [one.deviation for one in every]]) ** -2.0
         # values of the further quantities, and whether the fit includes them, shape (k,) each
         self._value = np.array([one.value or 0.0 for one in every])
         self._held = np.array([one.value is not None for one in every])
         self._least = np.array([one.least for one in every])
-        self._pull = np.concatenate([problem.mean - found.shared, -self._value]) * self._precision
+        self._pull = np.concatenate([problem.mean - fitted.shared, -self._value]) * self._precision
         rows = [np.flatnonzero(self._swing == index) for index in range(problem.window.swings)]
         self._rows = [some for some in rows if len(some) >= FEWEST_OF_SWING]
         if not self._rows:
             raise np.linalg.LinAlgError("no swing has enough poses")
-        linear, residual = found.linear.rows, found.point.residual
+        linear, residual = fitted.linear.rows, fitted.point.residual
         self._border = [
             np.concatenate([linear[some][:, :, :SIZE], further[some]], axis=2).reshape(-1, len(self._precision))
             for some in self._rows

@@ -118,10 +118,10 @@ class EquationError:
 
         `q` contains the poses, shape (n, 3), and `span` the range of motion in m, shape (2,).
         """
-        found = [
+        fits = [
             self.fit(q, np.repeat(0.5 * share * span, 2), math.log(depth)) for depth in _DEPTHS for share in _SHARES
         ]
-        return min(found, key=lambda one: one.loss)
+        return min(fits, key=lambda one: one.loss)
 
     def fit(self, q: Array, reach: Array, ln_depth: float) -> Walls:
         """Return the fit to the poses `q`, (n, 3), from starting values of the reaches (4,) [m] and of `ln_depth`."""
@@ -131,17 +131,17 @@ class EquationError:
         stiffness, weight = self._force / math.exp(ln_depth), np.ones_like(acceleration)
         for _ in range(_STEPS):
             columns = self._columns(corners, normals, reach, stiffness)
-            found, left = self._solve(columns, acceleration - self._load, weight)
+            fits, left = self._solve(columns, acceleration - self._load, weight)
             scale = _MAD * np.median(np.abs(left), axis=0) + _SINGULAR
             weight = np.minimum(1.0, np.sqrt(_HUBER * scale / np.maximum(np.abs(left), _SINGULAR))) / scale
-            ln_depth = float(np.clip(math.log(self._force / max(_UNIT * found[0], 1.0)), *np.log(DEPTHS)))
+            ln_depth = float(np.clip(math.log(self._force / max(_UNIT * fits[0], 1.0)), *np.log(DEPTHS)))
             stiffness = self._force / math.exp(ln_depth)
-            step = np.clip(found[2:6], -_LONGEST, _LONGEST)
+            step = np.clip(fits[2:6], -_LONGEST, _LONGEST)
             reach = reach + step
             if np.abs(step).max() < _SMALL:
                 break
         all_of_it = np.median(np.abs(acceleration), axis=0) + _SINGULAR
-        damping = float(_UNIT * found[1] / stiffness)
+        damping = float(_UNIT * fits[1] / stiffness)
         return Walls(reach, ln_depth, damping, np.log(scale / all_of_it), float(np.log(scale).sum()))
 
     def touched(self, q: Array, walls: Walls, deeper: float) -> Array:
@@ -198,8 +198,8 @@ class EquationError:
         held = np.zeros(len(normal))
         held[2:6] = _LONGEST**-2.0
         normal += np.diag(held + _SINGULAR * np.diag(normal) + _SINGULAR)
-        found = np.asarray(np.linalg.solve(normal, rows.T @ (target * weight).ravel()), np.float64)
-        return found, target - columns @ found
+        solution = np.asarray(np.linalg.solve(normal, rows.T @ (target * weight).ravel()), np.float64)
+        return solution, target - columns @ solution
 
     def _weighed(self, values: Array, kernel: Array) -> Array:
         """Return the integrals, (m, ...), of `values`, (n, ...), times the test function or derivative `kernel`."""

@@ -340,24 +340,24 @@ def under_uncertain_load(
     """
     if _known(result) or (measured_load is not None and measured_load.interval() > tuning.COARSEST):
         return result
-    found, work = compare_under_uncertain_load(measured_load, unknowns, poses, period)
+    compared, work = compare_under_uncertain_load(measured_load, unknowns, poses, period)
     figures = result.figures | {"work": result.figures.get("work", 0.0) + float(work)}
-    if found is None or found.distance > tuning.MOST_DISTANCE or found.ln_depth[0] < math.log(tuning.FITTED):
+    if compared is None or compared.distance > tuning.MOST_DISTANCE or compared.ln_depth[0] < math.log(tuning.FITTED):
         return replace(result, figures=figures)
     beside = None if fitted is None else if_it_differs(*fitted)
     values, known = [], []
     for index in (GX, GY):
         prior = float(unknowns.nominal()[index]), float(unknowns.deviations()[index])
-        mean, deviation = weighted_mean((float(found.clearance[index]), float(found.deviation[index])), prior)
+        mean, deviation = weighted_mean((float(compared.clearance[index]), float(compared.deviation[index])), prior)
         if beside is not None:
             by_fit = float(beside.shared[index]), math.sqrt(beside.covariance[index, index])
             if deviations_apart((mean, deviation), by_fit) < tuning.AGREES:
                 mean, deviation = weighted_mean_of_one((mean, deviation), by_fit)
-        observed = bool(found.touched[index]) and deviation < tuning.OBSERVED_SHARE * prior[1]
+        observed = bool(compared.touched[index]) and deviation < tuning.OBSERVED_SHARE * prior[1]
         values.append(Interval.normal(*((mean, deviation) if observed else prior)).above(0.0))
         known.append(state_of(False, observed, rough=True))
     exponent = unknowns.scene.contact.exponent
-    log = Interval.normal(*found.ln_depth)
+    log = Interval.normal(*compared.ln_depth)
     mean, soft, hard = (unknowns.force / math.exp(value) ** exponent for value in (log.mean, log.p95, log.p05))
     return replace(
         result,
@@ -366,10 +366,10 @@ def under_uncertain_load(
         horizontal_state=known[0],
         vertical_state=known[1],
         stiffness=Interval(mean, soft, hard),
-        damping=damping_interval(unknowns, Interval.normal(*found.ln_damping)),
+        damping=damping_interval(unknowns, Interval.normal(*compared.ln_damping)),
         correlation=None,
         groups={},
-        figures=figures | {"distance": found.distance, "load_error": found.load_error},
+        figures=figures | {"distance": compared.distance, "load_error": compared.load_error},
     )
 
 

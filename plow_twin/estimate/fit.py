@@ -306,8 +306,8 @@ class Problem:
         load : Load, optional
             Load that replaces the load of the forward model.
         """
-        found = self._evaluate(shared, states[None], differences, push, stiffness, change, load, damping)
-        return None if found is None else found[0]
+        motion = self._evaluate(shared, states[None], differences, push, stiffness, change, load, damping)
+        return None if motion is None else motion[0]
 
     def _evaluate(
         self, shared: Array, several: Array, differences: Array | None = None, push: Array | None = None,
@@ -398,10 +398,10 @@ class Problem:
         together = self._evaluate(point.shared, point.states + np.diag(displaced)[:, None])
         for j in range(6):
             if together is not None:
-                found = _by_state(point, together[j], j, displaced[j])
+                derivatives = _by_state(point, together[j], j, displaced[j])
             else:
-                found = self._quotient_by_state(point, j, displaced[j])
-            rows[:, :, SIZE + j], ends[:, :, SIZE + j] = found
+                derivatives = self._quotient_by_state(point, j, displaced[j])
+            rows[:, :, SIZE + j], ends[:, :, SIZE + j] = derivatives
         for j in reversed(MOVING):
             if j != DAMPING or self.unknowns.damped:
                 rows[:, :, j], ends[:, :, j] = self._quotient(point, j)
@@ -589,14 +589,14 @@ def freed(swings: int, unknowns: int) -> float:
     return swings / max(swings - unknowns, swings / tuning.MOST_FREED)
 
 
-def joint_step(problem: Problem, found: Fit, columns: Array, precision: Array, pull: Array) -> tuple[Array, Array]:
+def joint_step(problem: Problem, result: Fit, columns: Array, precision: Array, pull: Array) -> tuple[Array, Array]:
     """Return the step and the covariance of `whole_step`."""
-    step, covariance, _ = whole_step(problem, found, columns, precision, pull)
+    step, covariance, _ = whole_step(problem, result, columns, precision, pull)
     return step, covariance
 
 
 def whole_step(
-    problem: Problem, found: Fit, columns: Array, precision: Array, pull: Array
+    problem: Problem, result: Fit, columns: Array, precision: Array, pull: Array
 ) -> tuple[Array, Array, Array]:
     """Return the linearised step of the unknowns, its covariance, and the step of the starting states.
 
@@ -617,17 +617,17 @@ def whole_step(
     """
     size = SIZE + len(precision)
     normal = np.diag(np.concatenate([1.0 / problem.deviation**2, precision]))
-    gradient = np.concatenate([(problem.mean - found.shared) / problem.deviation**2, pull])
-    z = np.abs(np.nan_to_num(found.point.residual)) / np.sqrt(found.variance)
-    weight = np.isfinite(found.point.residual) * huber_weight(z) / found.variance
-    residual = np.nan_to_num(found.point.residual)
+    gradient = np.concatenate([(problem.mean - result.shared) / problem.deviation**2, pull])
+    z = np.abs(np.nan_to_num(result.point.residual)) / np.sqrt(result.variance)
+    weight = np.isfinite(result.point.residual) * huber_weight(z) / result.variance
+    residual = np.nan_to_num(result.point.residual)
     alone, gains = np.zeros((problem.window.swings, OWN)), np.zeros((problem.window.swings, size, OWN))
     for swing in range(problem.window.swings):
-        inside = found.point.swing == swing
+        inside = result.point.swing == swing
         if inside.sum() < FEWEST_OF_SWING:
             continue
-        shared = np.concatenate([found.linear.rows[inside][:, :, :SIZE], columns[inside]], axis=2).reshape(-1, size)
-        own = found.linear.rows[inside][:, :, SIZE:].reshape(-1, 6)
+        shared = np.concatenate([result.linear.rows[inside][:, :, :SIZE], columns[inside]], axis=2).reshape(-1, size)
+        own = result.linear.rows[inside][:, :, SIZE:].reshape(-1, 6)
         weights = weight[inside].reshape(-1, 1)
         cross = (weights * shared).T @ own
         held = (weights * own).T @ own

@@ -507,11 +507,11 @@ class Follower:
     def begin_at(self, origin_ns: int) -> None:
         """Set the stamp [ns] of model time 0, and use harmonics of the load that wait for it."""
         if _WAITING in self._text:
-            found = json.loads(self._text)
-            harmonics = found.pop(_WAITING)
-            found[_HARMONICS] = harmonics | {"begin_s": (harmonics.pop(_BEGIN_NS) - origin_ns) * 1e-9}
+            facts = json.loads(self._text)
+            harmonics = facts.pop(_WAITING)
+            facts[_HARMONICS] = harmonics | {"begin_s": (harmonics.pop(_BEGIN_NS) - origin_ns) * 1e-9}
             self.catch_up()
-            self._begin_anew(json.dumps(found))
+            self._begin_anew(json.dumps(facts))
 
     def _begin_anew(self, text: str) -> None:
         before = self._ensemble
@@ -546,20 +546,20 @@ class Follower:
 
     def _load_error(self) -> Array:
         """Return the standard deviation of the load's error in N, N, N m, shape (3,)."""
-        found: Array = tuning.LOAD_ERROR_SHARE * self._load_share * 0.5 * (self._range[1] - self._range[0])
-        return found
+        deviation: Array = tuning.LOAD_ERROR_SHARE * self._load_share * 0.5 * (self._range[1] - self._range[0])
+        return deviation
 
     def _sensor(self) -> tuple[Array | None, float]:
         """Return the noise of the sensor in m, m, rad (None after too few poses), and its delay in s."""
-        found = self.estimate
+        estimate = self.estimate
         noise: Array | None = None
-        if found is not None and found.noise is not None:
-            noise = np.array(found.noise)
+        if estimate is not None and estimate.noise is not None:
+            noise = np.array(estimate.noise)
         elif len(self._noise_rows) >= _NOISE_ROWS[0]:
             noise = noise_level(np.array(self._noise_rows))
         if noise is None or not noise.all():
             return None, 0.0
-        return noise, 0.0 if found is None or found.delay is None else max(found.delay.mean, 0.0)
+        return noise, 0.0 if estimate is None or estimate.delay is None else max(estimate.delay.mean, 0.0)
 
     # -- clearances and forces ---------------------------------------------------------------------------------------
 
@@ -577,9 +577,9 @@ class Follower:
         """
         self.catch_up()
         start, self._span_start = self._span_start, self.time
-        found = Span(start, self.time, *self._ensemble.span())
+        interval = Span(start, self.time, *self._ensemble.span())
         self._ensemble.begin_span()
-        return found
+        return interval
 
     def held(self, t: float) -> Rows:
         """Return the row, shape (1,), at `t` under the load of the newest sample, without a change of the state."""
@@ -599,27 +599,27 @@ def _harmonics_from(text: str, start: float) -> str:
     """Return an estimate (JSON) with the harmonics' phases counted from `start` [s]."""
     if _HARMONICS not in text:
         return text
-    found = json.loads(text)
-    found[_HARMONICS]["begin_s"] = start
-    return json.dumps(found)
+    facts = json.loads(text)
+    facts[_HARMONICS]["begin_s"] = start
+    return json.dumps(facts)
 
 
 def _waiting(text: str, origin_ns: int | None) -> str:
     """Return an estimate (JSON) whose harmonics wait for `begin_at`; without an origin, they are dropped."""
     if _HARMONICS not in text:
         return text
-    found = json.loads(text)
-    harmonics = found.pop(_HARMONICS)
+    facts = json.loads(text)
+    harmonics = facts.pop(_HARMONICS)
     if origin_ns is not None:
-        found[_WAITING] = harmonics | {_BEGIN_NS: origin_ns + round(harmonics.pop("begin_s") * 1e9)}
-    return json.dumps(found)
+        facts[_WAITING] = harmonics | {_BEGIN_NS: origin_ns + round(harmonics.pop("begin_s") * 1e9)}
+    return json.dumps(facts)
 
 
 def _load_share(text: str) -> Array:
     """Return a rough estimate's (JSON) error of the load in units of half the load's range, shape (3,), or zero."""
-    found = json.loads(text) if text else {}
-    rough = State.ROUGH.value in [found.get(axis, {}).get("state") for axis in ("horizontal", "vertical")]
-    figures = found.get("figures", {}) if rough else {}
+    facts = json.loads(text) if text else {}
+    rough = State.ROUGH.value in [facts.get(axis, {}).get("state") for axis in ("horizontal", "vertical")]
+    figures = facts.get("figures", {}) if rough else {}
     return np.array([figures.get(f"load_error_{name}", 0.0) for name in ("fx", "fy", "m")])
 
 

@@ -107,7 +107,7 @@ def not_used(why: str) -> JointFit:
     return JointFit(ForcesUsed(unused=why))
 
 
-def fit_jointly(problem: Problem, found: Fit, forces: ContactForces, widened: float) -> JointFit:
+def fit_jointly(problem: Problem, fitted: Fit, forces: ContactForces, widened: float) -> JointFit:
     """Return the joint fit of poses and forces. `widened` is a factor on the variance of the poses' noise."""
     if problem.unknowns.scene.contact.restitution is not None:
         return not_used("the law's damping follows from the speed of each touch")
@@ -117,20 +117,20 @@ def fit_jointly(problem: Problem, found: Fit, forces: ContactForces, widened: fl
         return not_used(f"got {len(forces.t)} messages in the window, expected at least {FEWEST_FOR_SCATTER}")
     forces = forces.thinned(_MOST_ROWS)
     feeling = Feeling(problem, forces.t)
-    cells, against = cells_of(feeling, found, forces)
+    cells, against = cells_of(feeling, fitted, forces)
     if against:
         return replace(not_used("a cell contradicts the motion"), sensor=tuple(against))
     if cells is None:
         return not_used("the head touches no wall with a load cell")
-    return _Joint(problem, found, feeling, cells, widened).solve()
+    return _Joint(problem, fitted, feeling, cells, widened).solve()
 
 
 class _Joint:
     """The fit of the poses, extended by measured forces. The force of one cell in one row is called an *entry*."""
 
-    def __init__(self, problem: Problem, found: Fit, feeling: Feeling, cells: Cells, widened: float) -> None:
-        self._problem, self._found, self._feeling, self._cells = problem, found, feeling, cells
-        self._variance = found.variance * widened
+    def __init__(self, problem: Problem, fitted: Fit, feeling: Feeling, cells: Cells, widened: float) -> None:
+        self._problem, self._found, self._feeling, self._cells = problem, fitted, feeling, cells
+        self._variance = fitted.variance * widened
         self._border = SIZE + 1 + len(cells.pairs)
         self._precision = np.concatenate(
             [
@@ -305,12 +305,14 @@ class _Joint:
     def _summary(self, at: _At, covariance: Array) -> JointFit:
         cells, place = self._cells, at.place
         deviation, left_over = np.sqrt(np.diag(covariance)), self._left_over(at)
-        found = {}
+        cell_of_pair = {}
         for k, pair in enumerate(cells.pairs.tolist()):
             gain = Interval.normal(np.exp(place.gain[k]), np.exp(place.gain[k]) * deviation[SIZE + 1 + k])
             rows, share = int((self._cell == k).sum()), float(np.median(left_over[k])) if left_over[k] else 0.0
-            found[PAIR_NAMES[pair]] = Cell(rows, gain, float(cells.offset[pair]), float(cells.noise[pair]), share)
-        used = ForcesUsed(found, Interval.normal(place.delay, deviation[SIZE]))
+            cell_of_pair[PAIR_NAMES[pair]] = Cell(
+                rows, gain, float(cells.offset[pair]), float(cells.noise[pair]), share
+            )
+        used = ForcesUsed(cell_of_pair, Interval.normal(place.delay, deviation[SIZE]))
         all_shares = [share for shares in left_over for share in shares]
         together = float(np.median(all_shares)) if all_shares else 0.0
         most, most_together = tuning.MOST_LEFT_OVER
@@ -320,7 +322,7 @@ class _Joint:
             return JointFit(used, model=(why,))
         bad = tuple(
             f"contact forces: {name}: {cell.left_over:.0%} remain unexplained, expected at most {most:.0%}"
-            for name, cell in found.items()
+            for name, cell in cell_of_pair.items()
             if cell.left_over > most
         )
         if bad:

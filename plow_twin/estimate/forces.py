@@ -235,8 +235,8 @@ def loads_of(t: Array, wrench: Array, gain: Array, harmonics: Harmonics | None, 
     """
     if harmonics is not None:
         wrench = wrench + harmonics.basis(t) @ amplitude
-    found: Array = wrench * gain[:, None, :]
-    return found
+    scaled: Array = wrench * gain[:, None, :]
+    return scaled
 
 
 def _normal(value: Interval, white: Array) -> Array:

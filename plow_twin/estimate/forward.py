@@ -168,21 +168,21 @@ class Forward:
         times : ndarray, shape (n,)
             Times in s, which rise and are not before `start`.
         """
-        found: list[Array | None] = [None] * len(starts)
+        motions: list[Array | None] = [None] * len(starts)
         edges, begin, fitting = np.array([0, len(times)]), np.array([start]), []
         for place, one in enumerate(starts):
             if fits_lanes(compile_scene(one.scene, tuning.TOLERANCE, sampled=True), sampled=True):
                 fitting.append(place)
                 continue
             run = self.run(one.scene, one.gain, begin, one.state[None], edges, times)
-            found[place] = None if run is None else run.q
+            motions[place] = None if run is None else run.q
         # a vector ends with its slowest motion, and harder contacts take more steps
         fitting.sort(key=lambda place: starts[place].scene.contact.stiffness)
         for first in range(0, len(fitting), WIDTH):
             places = fitting[first : first + WIDTH]
             for place, q in zip(places, self._in_lanes([starts[i] for i in places], start, times), strict=True):
-                found[place] = q
-        return found
+                motions[place] = q
+        return motions
 
     def _in_lanes(self, starts: Sequence[Start], start: float, times: Array) -> list[Array | None]:
         knots = self._knots

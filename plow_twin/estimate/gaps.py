@@ -110,13 +110,13 @@ def fit_gaps(scene: Scene, gaps: Gaps, poses: Poses) -> GapsFit | str:
     sets, counts = np.unique(known, axis=0, return_counts=True)
     for pairs in sets[np.argsort(counts, kind="stable")]:
         own = (known == pairs).all(axis=1)
-        found = _fit_one_set(
+        gap_fit = _fit_one_set(
             rows, gaps.t[own], gaps.gap[own][:, pairs], np.flatnonzero(pairs), theta[own], error, scene
         )
-        if isinstance(found, str):
-            unused = found
+        if isinstance(gap_fit, str):
+            unused = gap_fit
         else:
-            fits.append(found)
+            fits.append(gap_fit)
     return max(fits, key=lambda fit: fit.used, default=unused)
 
 

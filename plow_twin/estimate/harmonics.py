@@ -81,8 +81,8 @@ class Harmonics:
 
     def at(self, t: Array) -> Array:
         """Return the sum of all terms at n times `t` in s, shape (n, 3), in N, N, N m."""
-        found: Array = self.basis(t) @ self.amplitude * self.size
-        return found
+        coefficients: Array = self.basis(t) @ self.amplitude * self.size
+        return coefficients
 
     def added(self, load: Load) -> Load:
         """Return the sum of a load and the harmonics, with additional knots that resolve the harmonics."""
@@ -101,8 +101,8 @@ class Harmonics:
         """Return random amplitudes in N, N, N m, shape (members, k, 3); the first member has the means."""
         white = rng.standard_normal((members, *self.amplitude.shape))
         white[0] = 0.0
-        found: Array = (self.amplitude + np.sqrt(self.variance) * white) * self.size
-        return found
+        coefficients: Array = (self.amplitude + np.sqrt(self.variance) * white) * self.size
+        return coefficients
 
     @property
     def names(self) -> list[str]:
@@ -134,5 +134,5 @@ def _phasor(omega: float, t: Array, wrench: Array) -> NDArray[np.complex128]:
     """Return the complex amplitude of exp(i omega t) in each component, shape (3,)."""
     turns = omega * t
     basis = np.stack([np.cos(turns), np.sin(turns), np.ones(len(t))], axis=1)
-    found = np.linalg.lstsq(basis, wrench, rcond=None)[0]
-    return np.asarray(found[0] - 1j * found[1])
+    coefficients = np.linalg.lstsq(basis, wrench, rcond=None)[0]
+    return np.asarray(coefficients[0] - 1j * coefficients[1])

@@ -29,7 +29,7 @@ _LONGER = 2.0
 
 
 def with_harmonics(
-    problem: Problem, found: Fit, measured_load: Load, period: float
+    problem: Problem, fitted: Fit, measured_load: Load, period: float
 ) -> tuple[tuple[Problem, Fit], Verdict] | None:
     """Return a fit that includes harmonics of the measured load `measured_load`, and its verdict.
 
@@ -42,29 +42,29 @@ def with_harmonics(
     near = near_horizon(poses, period)
     for horizon in (near, _LONGER * near, np.inf):
         stage = Problem(problem.forward, problem.unknowns, problem.window, horizon=horizon)
-        states = better_states(stage, found.shared, found.point.states)
-        begun = fit(stage, found.shared, states, found.noise, _ITERATIONS)
+        states = better_states(stage, fitted.shared, fitted.point.states)
+        begun = fit(stage, fitted.shared, states, fitted.noise, _ITERATIONS)
         ended = None if begun is None else _alternated(stage, begun, measured_load, harmonics)
         if ended is None:
             return None
-        problem, found, harmonics = ended
-        verdict = judge(problem, found, period)
+        problem, fitted, harmonics = ended
+        verdict = judge(problem, fitted, period)
         if verdict.model or verdict.sensor:
             return None
     verdict.lacking = _named(harmonics)
-    return ((problem, found), verdict) if found.finished else None
+    return ((problem, fitted), verdict) if fitted.finished else None
 
 
 def _alternated(
-    problem: Problem, found: Fit, measured_load: Load, harmonics: Harmonics
+    problem: Problem, fitted: Fit, measured_load: Load, harmonics: Harmonics
 ) -> tuple[Problem, Fit, Harmonics] | None:
     """Return a fit with harmonics, by linearised steps and fits from `harmonics`; None if a simulation fails."""
-    best, in_vain = found.loss, 0
+    best, in_vain = fitted.loss, 0
     for index in range(_ROUNDS):
         value = harmonics.amplitude.ravel()
         precision = np.full(len(value), tuning.LACKING**-2.0)
-        columns = problem.by_harmonics(found.point, harmonics)
-        step, covariance, states = whole_step(problem, found, columns, precision, -value * precision)
+        columns = problem.by_harmonics(fitted.point, harmonics)
+        step, covariance, states = whole_step(problem, fitted, columns, precision, -value * precision)
         (shared, change), covariance = np.split(step, [SIZE]), covariance[SIZE:, SIZE:]
         size = float(change @ np.linalg.solve(covariance, change))
         # a change within the noise is left to the linearised step of `discrepancy.graded`
@@ -77,15 +77,15 @@ def _alternated(
         )  # fmt: skip
         most = problem.deviation, problem.start_spread
         shared, states = (np.clip(one, -bound, bound) for one, bound in zip((shared, states), most, strict=True))
-        shared = problem.unknowns.within(found.shared + shared)
-        states = better_states(problem, shared, found.point.states + states)
-        again = fit(problem, shared, states, found.noise, _ITERATIONS)
+        shared = problem.unknowns.within(fitted.shared + shared)
+        states = better_states(problem, shared, fitted.point.states + states)
+        again = fit(problem, shared, states, fitted.noise, _ITERATIONS)
         if again is None:
             return None
-        found = again
-        in_vain = 0 if found.loss < best else in_vain + 1
-        best = min(best, found.loss)
-    return problem, found, harmonics
+        fitted = again
+        in_vain = 0 if fitted.loss < best else in_vain + 1
+        best = min(best, fitted.loss)
+    return problem, fitted, harmonics
 
 
 def _named(harmonics: Harmonics) -> str:

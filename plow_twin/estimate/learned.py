@@ -45,14 +45,14 @@ def numbers_of(scenes: Sequence[Scene], gain: Array, bias: Array) -> Array:
         gain,
         bias,
     ])  # fmt: skip
-    found: Array = raw / np.array(tuning.LEARNED_TO)
-    return found
+    numbers: Array = raw / np.array(tuning.LEARNED_TO)
+    return numbers
 
 
 def biases_of(numbers: Array) -> Array:
     """Return the biases of the sensor in m, m, rad, shape (..., 3), from the parameters of members, shape (..., 10)."""
-    found: Array = (numbers * np.array(tuning.LEARNED_TO))[..., -3:]
-    return found
+    scaled: Array = (numbers * np.array(tuning.LEARNED_TO))[..., -3:]
+    return scaled
 
 
 def with_numbers(scenes: Sequence[Scene], numbers: Array) -> tuple[list[Scene], Array]:

@@ -61,12 +61,12 @@ def likeliest(drawn: Array, gain: float, motions: PathFeatures, measured: PathFe
     motions, measured : PathFeatures
         Features of the n simulated motions, and of the measured motion.
     """
-    found = np.zeros((len(drawn) + 1, 2))
-    found[-1] = _likeliest(drawn, gain, motions, measured)[0]
+    points = np.zeros((len(drawn) + 1, 2))
+    points[-1] = _likeliest(drawn, gain, motions, measured)[0]
     for part in range(_PARTS):
         inside = np.arange(len(drawn)) % _PARTS == part
-        found[:-1][inside] = _likeliest(drawn[~inside], gain, motions.rows(~inside), motions.rows(inside))
-    return found
+        points[:-1][inside] = _likeliest(drawn[~inside], gain, motions.rows(~inside), motions.rows(inside))
+    return points
 
 
 def _likeliest(drawn: Array, gain: float, motions: PathFeatures, asked: PathFeatures) -> Array:
@@ -93,8 +93,8 @@ def _likeliest(drawn: Array, gain: float, motions: PathFeatures, asked: PathFeat
         step = np.linalg.solve(curvature, pull[:, :, None])[:, :, 0]
         point += np.clip(step, -_LONGEST, _LONGEST)
         np.clip(point, -tuning.OUTLYING, tuning.OUTLYING, out=point)
-    found: Array = point[:, :2] * scale[:2] + middle[:2]
-    return found
+    position: Array = point[:, :2] * scale[:2] + middle[:2]
+    return position
 
 
 def _terms(points: Array) -> Array:

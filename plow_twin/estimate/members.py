@@ -158,8 +158,8 @@ class Ensemble:
 
     def _loads(self, t: Array, wrench: Array, which: slice) -> Array:
         loads = loads_of(t, wrench, self._gain[which], self._harmonics, self._amplitude[which])
-        found: Array = loads + self._load_off[which, None, :]
-        return found
+        applied: Array = loads + self._load_off[which, None, :]
+        return applied
 
     def advance_first(self, t: Array, wrench: Array, rows: Rows) -> int:
         """Advance the first member, write its rows, shape (n,), and return the number of failed advances."""
@@ -456,8 +456,8 @@ class Ensemble:
 
     def _force(self, depth: Array, which: NDArray[np.int64] | slice = _ALL) -> Array:
         """Return the elastic force of each pair of some members in N, shape (m, 8), from the penetrations in m."""
-        found: Array = self._stiffness[which, None] * np.maximum(depth, 0.0) ** self._exponent
-        return found
+        force: Array = self._stiffness[which, None] * np.maximum(depth, 0.0) ** self._exponent
+        return force
 
     def _allowed(self, q: Array, force: Array, which: NDArray[np.int64] | slice = _ALL) -> NDArray[np.bool_]:
         """Return whether no pair of a member at the poses `q`, (m, 3), bears much more than `force` [N], (m, 8)."""
@@ -477,8 +477,8 @@ class Ensemble:
         """Return the penetration of each pair in m, shape (m, 8), for some members at poses `q`, shape (m, 3)."""
         state = states_of(self._scene, np.concatenate([q, np.zeros_like(q)], axis=1))
         body = np.concatenate([state[:, _PLACES], np.ones((len(q), 1))], axis=1)
-        found: Array = np.einsum("mi,mij->mj", body, self._walls[which]) - self.worn[which]
-        return found
+        depth: Array = np.einsum("mi,mij->mj", body, self._walls[which]) - self.worn[which]
+        return depth
 
     def twins(self) -> list[bytes]:
         """Return the exact states of the first twin and of all further twins."""
@@ -527,8 +527,8 @@ class Ensemble:
 
 def _bytes(rows: Rows) -> NDArray[np.uint8]:
     """Return the fields of `ADVANCE` in rows (m, n) as bytes, which NumPy copies faster than records."""
-    found: NDArray[np.uint8] = np.ascontiguousarray(rows)[..., None].view(np.uint8)[..., : ADVANCE.itemsize]
-    return found
+    views: NDArray[np.uint8] = np.ascontiguousarray(rows)[..., None].view(np.uint8)[..., : ADVANCE.itemsize]
+    return views
 
 
 def _off(q: Array, then: Array, there: NDArray[np.int64]) -> Array:
@@ -552,8 +552,8 @@ def _worn(scenes: Sequence[Scene], wear: Wear, moved: Array) -> list[Scene]:
 def widening(scene: Scene, worn: Array) -> Array:
     """Return the growth of the clearances in m, shape (..., 2), due to wear depths `worn` in m, shape (..., 8)."""
     own = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
-    found: Array = clearances(scene, worn)[..., :2] - own
-    return found
+    offset: Array = clearances(scene, worn)[..., :2] - own
+    return offset
 
 
 def may_rub(scene: Scene) -> bool:

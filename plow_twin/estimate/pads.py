@@ -42,35 +42,35 @@ def deviations() -> Array:
     return out
 
 
-def by_group(problem: Problem, found: Fit, widened: float) -> dict[str, tuple[Interval, float]]:
+def by_group(problem: Problem, fitted: Fit, widened: float) -> dict[str, tuple[Interval, float]]:
     """Return the clearance of each group of facing pads, and its standard deviation in m.
 
     `widened` is a factor on the standard deviations of the fit.
     """
-    step, covariance = _joint_step(problem, found)
+    step, covariance = _joint_step(problem, fitted)
     out = {}
     for name, (axis, shares) in _MADE_OF.items():
         made = np.zeros(SIZE + len(DIFFERENCES))
         made[axis] = 1.0
         made[SIZE : SIZE + len(WALLS)] = shares
-        mean = float(found.shared[axis] + shares @ problem.differences[TURNS] + made @ step)
+        mean = float(fitted.shared[axis] + shares @ problem.differences[TURNS] + made @ step)
         deviation = widened * float(np.sqrt(made @ covariance @ made))
         out[name] = Interval.normal(mean, deviation), deviation
     return out
 
 
-def shown(problem: Problem, found: Fit) -> float:
+def shown(problem: Problem, fitted: Fit) -> float:
     """Return chi^2 of the linearised step of the differences; a large value is evidence of differences."""
-    step, covariance = _joint_step(problem, found)
+    step, covariance = _joint_step(problem, fitted)
     step, covariance = step[SIZE:], covariance[SIZE:, SIZE:]
     return float(step @ np.linalg.solve(covariance, step))
 
 
-def with_differences(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None:
+def with_differences(problem: Problem, fitted: Fit) -> tuple[Problem, Fit] | None:
     """Return a fit that includes the differences; None if the motion cannot be simulated."""
     forward, most = problem.forward.renewed(), 0.5 * deviations()
     for index in range(_ROUNDS):
-        step, covariance = _joint_step(problem, found)
+        step, covariance = _joint_step(problem, fitted)
         differences = problem.differences + np.clip(step[SIZE:], -most, most)
         differences[LAG] = max(differences[LAG], 0.0)
         change = differences - problem.differences
@@ -82,21 +82,23 @@ def with_differences(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None
             forward, problem.unknowns, problem.window, horizon=problem.horizon, differences=differences,
             drift=problem.drift,
         )  # fmt: skip
-        again = fit(problem, found.shared, found.point.states, found.noise, _ITERATIONS)
+        again = fit(problem, fitted.shared, fitted.point.states, fitted.noise, _ITERATIONS)
         if again is None:
             return None
-        found = again
-    return problem, found
+        fitted = again
+    return problem, fitted
 
 
-def of_differences(problem: Problem, found: Fit) -> Array:
+def of_differences(problem: Problem, fitted: Fit) -> Array:
     """Return the covariance of the shared unknowns due to uncertain differences, shape (SIZE, SIZE)."""
-    _, covariance = _joint_step(problem, found)
+    _, covariance = _joint_step(problem, fitted)
     held = np.linalg.inv(covariance)[:SIZE, :SIZE]
     added: Array = covariance[:SIZE, :SIZE] - np.linalg.inv(held)
     return added
 
 
-def _joint_step(problem: Problem, found: Fit) -> tuple[Array, Array]:
+def _joint_step(problem: Problem, fitted: Fit) -> tuple[Array, Array]:
     precision = deviations() ** -2.0
-    return joint_step(problem, found, problem.by_differences(found.point), precision, -problem.differences * precision)
+    return joint_step(
+        problem, fitted, problem.by_differences(fitted.point), precision, -problem.differences * precision
+    )

@@ -29,11 +29,11 @@ class Scales:
     chi2: float
 
 
-def scales_of(problem: Problem, found: Fit) -> Scales:
+def scales_of(problem: Problem, fitted: Fit) -> Scales:
     """Return the scale factors of the sensor from the residuals of a fit."""
-    motion = np.nan_to_num(problem.window.poses.q - found.point.residual - found.shared[BIAS])
+    motion = np.nan_to_num(problem.window.poses.q - fitted.point.residual - fitted.shared[BIAS])
     columns = motion[:, :, None] * np.eye(3)
-    step, covariance = joint_step(problem, found, columns, np.full(3, NO_PRIOR), np.zeros(3))
+    step, covariance = joint_step(problem, fitted, columns, np.full(3, NO_PRIOR), np.zeros(3))
     scale = step[SIZE:]
     chi2 = float(scale @ np.linalg.solve(covariance[SIZE:, SIZE:], scale))
     return Scales(1.0 + scale, chi2)

@@ -60,11 +60,11 @@ def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float)
     for stage, horizon in zip(STAGES, horizons, strict=True):
         problem, fits = Problem(forward, unknowns, window, horizon=horizon), []
         for shared, states, noise in points:
-            found = fit(problem, shared, better_states(problem, shared, states), noise, stage.iterations)
-            if found is None:
+            fitted = fit(problem, shared, better_states(problem, shared, states), noise, stage.iterations)
+            if fitted is None:
                 continue
-            fits = sorted([*fits, found], key=lambda one: one.loss)
-            if _have_met(fits, found):
+            fits = sorted([*fits, fitted], key=lambda one: one.loss)
+            if _have_met(fits, fitted):
                 del fits[1:]
                 break
         fits = fits[: stage.keep]
@@ -84,7 +84,7 @@ def _have_met(fits: list[Fit], newest: Fit) -> bool:
     return bool(near.all()) and other.loss - best.loss < tuning.OUTLYING**2
 
 
-def behind_low_pass(problem: Problem, found: Fit) -> Fit | None:
+def behind_low_pass(problem: Problem, fitted: Fit) -> Fit | None:
     """Return a fit of the same swings with the time constant of the sensor's low pass fixed at its prior deviation.
 
     Steps from a fit without a low pass do not lead to a time constant longer than an impact. The result is None if the
@@ -95,8 +95,8 @@ def behind_low_pass(problem: Problem, found: Fit) -> Fit | None:
     other = Problem(
         problem.forward.renewed(), problem.unknowns, problem.window, horizon=problem.horizon, differences=LOW_PASS
     )
-    again = fit(other, found.shared, found.point.states, found.noise, STAGES[-1].iterations)
-    return again if again is not None and again.loss < found.loss - tuning.OUTLYING**2 else None
+    again = fit(other, fitted.shared, fitted.point.states, fitted.noise, STAGES[-1].iterations)
+    return again if again is not None and again.loss < fitted.loss - tuning.OUTLYING**2 else None
 
 
 def refine(
@@ -148,13 +148,13 @@ def refine(
     for start in starts:
         states = better_states(near, start, states_at(window, start))
         fits.append(fit(near, start, states, noise, 10, *(() if hard else (tuning.ENOUGH,))))
-    found = min((one for one in fits if one is not None), key=lambda one: one.loss, default=None)
-    if found is None:
+    best = min((one for one in fits if one is not None), key=lambda one: one.loss, default=None)
+    if best is None:
         return None
     whole = Problem(forward, unknowns, window, horizon=horizon, differences=differences, drift=None if hard else drift)
-    states = better_states(whole, found.shared, found.point.states)
-    found = fit(whole, found.shared, states, found.noise, 20 if not hard and drift is None else 12)
-    return None if found is None else (whole, found)
+    states = better_states(whole, best.shared, best.point.states)
+    best = fit(whole, best.shared, states, best.noise, 20 if not hard and drift is None else 12)
+    return None if best is None else (whole, best)
 
 
 def near_horizon(poses: Poses, period: float) -> float:

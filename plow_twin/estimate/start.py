@@ -132,7 +132,7 @@ def first_vectors(problem: Problem, most: int) -> list[Array]:
     """
     unknowns, window = problem.unknowns, problem.window
     measured, bias = range_of_motion(unknowns.scene, window.poses)
-    found: list[tuple[float, Array]] = []
+    matches: list[tuple[float, Array]] = []
     for penetration in (None, *tuning.PENETRATIONS):
         for damping in (0.0, -1.0, 1.0) if unknowns.damped else (0.0,):
             vector = unknowns.nominal()
@@ -141,9 +141,9 @@ def first_vectors(problem: Problem, most: int) -> list[Array]:
             if penetration is not None:
                 vector[SOFTNESS] = unknowns.softness_of(unknowns.force / penetration**unknowns.scene.contact.exponent)
             vector[[GX, GY]] = measured - np.array([1.2, 1.6]) * np.exp(vector[SOFTNESS])
-            found += _matched(problem, vector, measured)
-    found.sort(key=lambda pair: pair[0])
-    return [vector for _, vector in found[:most]]
+            matches += _matched(problem, vector, measured)
+    matches.sort(key=lambda pair: pair[0])
+    return [vector for _, vector in matches[:most]]
 
 
 def _matched(problem: Problem, vector: Array, measured: Array) -> list[tuple[float, Array]]:
@@ -152,7 +152,7 @@ def _matched(problem: Problem, vector: Array, measured: Array) -> list[tuple[flo
     The result is a list of one item, or empty if the motion cannot be simulated.
     """
     poses, unknowns = problem.window.poses, problem.unknowns
-    found = []
+    matches = []
     for _ in range(4):
         vector = unknowns.within(vector)
         states = problem.window.states.copy()
@@ -162,12 +162,12 @@ def _matched(problem: Problem, vector: Array, measured: Array) -> list[tuple[flo
             break
         scale = np.nanstd(poses.q, axis=0)
         error = point.residual / np.where(scale > 0.0, scale, 1.0)
-        found.append((float(np.nanmean(np.minimum(error * error, 1.0))), vector))
+        matches.append((float(np.nanmean(np.minimum(error * error, 1.0))), vector))
         predicted = Poses(poses.t, poses.q - point.residual - vector[BIAS])
         clearance, _ = range_of_motion(unknowns.scene, predicted)
         vector = vector.copy()
         vector[[GX, GY]] += 0.8 * (measured - clearance)
-    return sorted(found, key=lambda pair: pair[0])[:1]
+    return sorted(matches, key=lambda pair: pair[0])[:1]
 
 
 __all__ = ["DELAY", "Unknowns", "cut", "filled", "first_vectors", "range_of_motion"]

@@ -183,10 +183,10 @@ def _graded(problem: Problem, fit: Fit, verdict: Verdict) -> Graded | None:
     clean = not fails(fit, verdict)
     if len(problem.link) and (clean or not fit.finished):
         return None
-    found = if_it_differs(problem, fit, doubtful=not clean)
-    if found is None or (not fit.finished and found.inflation.mean() >= tuning.MOST_INFLATED):
+    inflation = if_it_differs(problem, fit, doubtful=not clean)
+    if inflation is None or (not fit.finished and inflation.inflation.mean() >= tuning.MOST_INFLATED):
         return None
-    return found
+    return inflation
 
 
 def if_it_differs(problem: Problem, fit: Fit, doubtful: bool = True) -> Graded | None:
@@ -308,8 +308,8 @@ def _groups(
         whole = math.sqrt(deviation**2 + max(float(added[axis, axis]), 0.0))
         if state.known and whole > 0.5 * tuning.OBSERVED:
             state = State.NOT_OBSERVABLE
-        found = Interval.normal(value.mean + float(shared[axis] - fit.shared[axis]), whole).above(0.0)
-        out[name] = untested.get(axis, found), state
+        share_above = Interval.normal(value.mean + float(shared[axis] - fit.shared[axis]), whole).above(0.0)
+        out[name] = untested.get(axis, share_above), state
     return out
 
 
@@ -355,13 +355,13 @@ def summarise_bounced(
     observable.
     """
     sensor, touched = judge_sensor(poses), np.ones(2) if first is None else _touched(first)
-    found = (
+    distances = (
         ("motion", bounced.distance, tuning.MOST_DISTANCE),
         ("path over the load's period", bounced.path, tuning.MOST_PATH),
     )
     model = [
         f"{name} unlike the model's: distance {value:.1f}, expected at most {most:g}"
-        for name, value, most in found
+        for name, value, most in distances
         if value > most
     ]
     if bounced.law > MOST_OTHER_LAW and not -math.inf < bounced.odds < tuning.MOST_ODDS[1]:
@@ -370,7 +370,7 @@ def summarise_bounced(
         odds = f"ln odds {bounced.odds:.1f}, expected at most {tuning.MOST_ODDS[0]:g}"
         model.append(f"motion likely under another contact law: {odds}")
     reasons = sensor or model
-    beyond = max(1.0, *(value / most for _, value, most in found)) if model else 0.0
+    beyond = max(1.0, *(value / most for _, value, most in distances)) if model else 0.0
     apparent, clearances, states = [], [], []
     for index in (GX, GY):
         deviation = math.hypot(bounced.clearance_deviation[index], beyond * tuning.UNEXPLAINED_HARD)
@@ -487,6 +487,6 @@ def without_fit(
     )
 
 
-def fails(found: Fit, verdict: Verdict) -> bool:
+def fails(fitted: Fit, verdict: Verdict) -> bool:
     """Return whether a fit fails a check or has not reached an optimum."""
-    return bool(verdict.model or verdict.sensor) or not found.finished
+    return bool(verdict.model or verdict.sensor) or not fitted.finished

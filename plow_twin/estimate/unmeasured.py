@@ -168,21 +168,21 @@ def fit_some_components(
         some = replace(poses, assumed=q).between(float(poses.t[0]), end)
         return refine(forward.renewed(), unknowns, some, period, shared, noise, drift, close=True)
 
-    def finished(found: tuple[Problem, Fit], end: float) -> tuple[Problem, Fit]:
+    def finished(candidate: tuple[Problem, Fit], end: float) -> tuple[Problem, Fit]:
         # each repetition has better values of the missing components
         for _ in range(tuning.UNMEASURED_ROUNDS):
-            again = None if found[1].finished else refined(found[1].shared, end, found[1])
-            if again is None or again[1].loss > found[1].loss:
+            again = None if candidate[1].finished else refined(candidate[1].shared, end, candidate[1])
+            if again is None or again[1].loss > candidate[1].loss:
                 break
-            found = again
-        return found
+            candidate = again
+        return candidate
 
     candidates = [refined(vector, end) for vector in _starts(whole, int(np.searchsorted(poses.t, end)), rng)]
     best = min((one for one in candidates if one is not None), key=lambda one: one[1].loss, default=None)
     if best is None:
         return None
-    found = refined(finished(best, end)[1].shared, np.inf)
-    return None if found is None else finished(found, np.inf)
+    refined_fit = refined(finished(best, end)[1].shared, np.inf)
+    return None if refined_fit is None else finished(refined_fit, np.inf)
 
 
 def _starts(whole: _Simulation, rows: int, rng: np.random.Generator) -> list[Array]:

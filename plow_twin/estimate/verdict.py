@@ -77,7 +77,7 @@ def judge(problem: Problem, fit: Fit, period: float) -> Verdict:
 
 def judge_sensor(poses: Poses) -> list[str]:
     """Return messages about faults of the sensor that the poses alone show, such as a constant value."""
-    found = []
+    reasons = []
     for i, name in enumerate(COMPONENTS):
         column = poses.q[np.isfinite(poses.q[:, i]), i]
         if len(column) < 5 * FEWEST_POSES:
@@ -85,12 +85,12 @@ def judge_sensor(poses: Poses) -> list[str]:
         ends = np.flatnonzero(np.append(np.diff(column) != 0.0, True))
         longest = int(np.diff(np.append(-1, ends)).max())
         if longest > FEWEST_FOR_SCATTER:
-            found.append(f"{name}: the same value {longest} times in a row")
+            reasons.append(f"{name}: the same value {longest} times in a row")
         parts = np.array([noise_level(part[:, None])[0] for part in np.array_split(column, 5)])
         ratio = float(parts.max() / max(float(np.median(parts)), 1e-12))
         if ratio > tuning.MOST_RATIO:
-            found.append(f"{name}: the noise of one part of the window is {ratio:.1f} times that of the rest")
-    return found
+            reasons.append(f"{name}: the noise of one part of the window is {ratio:.1f} times that of the rest")
+    return reasons
 
 
 def predicted(fit: Fit) -> NDArray[np.bool_]:

@@ -163,14 +163,14 @@ class Worker:
             return None
         try:
             if self._connection.poll():
-                found: Found | str | None = self._connection.recv()
-                if found is None:
+                reply: Found | str | None = self._connection.recv()
+                if reply is None:
                     self.ready = True
                     return None
-                if isinstance(found, str):
-                    self.ended = found
+                if isinstance(reply, str):
+                    self.ended = reply
                     return None
-                return found if found.restarts == self._restarts else None
+                return reply if reply.restarts == self._restarts else None
         except (EOFError, OSError):
             code = self._process.poll()
             if code is not None:  # None while the process is ending
@@ -231,15 +231,15 @@ def serve(connection: Connection) -> None:
             connection.recv()  # raises `EOFError` when the near side closes the connection
         assert due is not None
         begin = time.perf_counter()
-        found = answer(scene, due, guess, asked)
+        reply = answer(scene, due, guess, asked)
         wall_s = time.perf_counter() - begin
-        if asked.follows and not compiled and rubs(scene, found.estimate):
+        if asked.follows and not compiled and rubs(scene, reply.estimate):
             # the process of the twin then loads these kernels from the cache
             compile_friction(scene, TOLERANCE)
             compiled = True
         bounds = (due.start_ns, due.end_ns, due.samples, due.poses)
-        connection.send(Found(*bounds, guess, found.estimate, wall_s, skipped, restarts, found.text, found.also))
-        guess, skipped = found.following, 0
+        connection.send(Found(*bounds, guess, reply.estimate, wall_s, skipped, restarts, reply.text, reply.also))
+        guess, skipped = reply.following, 0
 
 
 def add(windows: Windows, item: tuple[Any, ...]) -> Window | None:

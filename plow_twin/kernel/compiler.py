@@ -35,13 +35,13 @@ def _load_numba() -> None:
     Numba would import SciPy's linear algebra only to check that BLAS is available, which takes a third of the start
     time.
     """
-    found = linalg.ensure_blas
+    ensure_blas = linalg.ensure_blas
     linalg.ensure_blas = lambda: None
     try:
         with garbage_kept():
             cpu_target.target_context.refresh()
     finally:
-        linalg.ensure_blas = found
+        linalg.ensure_blas = ensure_blas
 
 
 _load_numba()
@@ -122,12 +122,12 @@ def for_kernels(entry: Callable[..., Any]) -> Callable[..., Any]:
 def _read_only_cache() -> Iterator[None]:
     """Make numba accept a read-only disk cache in the package's folder, for example from the installation."""
     locator: Any = caching._CacheLocator
-    found = locator.ensure_cache_path
+    ensure_cache_path = locator.ensure_cache_path
     locator.ensure_cache_path = lambda its: None
     try:
         yield
     finally:
-        locator.ensure_cache_path = found
+        locator.ensure_cache_path = ensure_cache_path
 
 
 def kept(function: Callable[..., Any], **options: Any) -> Any:
@@ -204,5 +204,5 @@ def for_arguments(function: Callable[..., Any], arguments: tuple[Any, ...]) -> C
     compile_for = getattr(function, "compile", None)
     if compile_for is None:
         return function  # NUMBA_DISABLE_JIT: the function is plain Python
-    found: Callable[..., Any] = compile_for(tuple(map(numba.typeof, arguments)))
-    return found
+    compiled: Callable[..., Any] = compile_for(tuple(map(numba.typeof, arguments)))
+    return compiled

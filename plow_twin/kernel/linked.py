@@ -182,7 +182,7 @@ def for_any_value(dispatcher: Any) -> None:
     fold = dispatcher._compiler.fold_argument_types
 
     def fold_without_values(arguments: Any, named: Any) -> Any:
-        signature, found = fold(arguments, named)
-        return signature, tuple(map(types.unliteral, found))
+        signature, library = fold(arguments, named)
+        return signature, tuple(map(types.unliteral, library))
 
     dispatcher._compiler.fold_argument_types = fold_without_values

@@ -241,8 +241,8 @@ def below(typingctx: Any, left: Any, right: Any) -> Any:
     """Return an integer whose bit i is set if left < right in lane i. A NaN leaves bit i unset."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        found = builder.fcmp_ordered("<", *arguments)
-        return builder.zext(builder.bitcast(found, ir.IntType(_WIDTH)), ir.IntType(64))
+        comparison = builder.fcmp_ordered("<", *arguments)
+        return builder.zext(builder.bitcast(comparison, ir.IntType(_WIDTH)), ir.IntType(64))
 
     return types.int64(left, right), codegen
 
@@ -254,9 +254,9 @@ def equal(typingctx: Any, array: Any, index: Any, number: Any) -> Any:
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place, sought = (context.cast(builder, arguments[i], signature.args[i], types.int64) for i in (1, 2))
         pointer = _pointer(context, builder, signature.args[0], arguments[0], place)
-        found = builder.load(builder.bitcast(pointer, _BITS.as_pointer()), align=8)
+        loaded = builder.load(builder.bitcast(pointer, _BITS.as_pointer()), align=8)
         wanted = builder.bitcast(_splatted(builder, builder.bitcast(sought, ir.DoubleType())), _BITS)
-        same = builder.icmp_signed("==", found, wanted)
+        same = builder.icmp_signed("==", loaded, wanted)
         return builder.zext(builder.bitcast(same, ir.IntType(_WIDTH)), ir.IntType(64))
 
     return types.int64(array, index, number), codegen
@@ -393,9 +393,9 @@ def _elementwise(operation: Callable[..., Any], emit: str) -> None:
 
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
             known = all(isinstance(kind, (Lanes, types.Float, types.Integer)) for kind in args)
-            found = {kind for kind in args if isinstance(kind, Lanes)}
-            if len(args) == 2 and known and len(found) == 1:
-                return signature(*found, *args)
+            lane_types = {kind for kind in args if isinstance(kind, Lanes)}
+            if len(args) == 2 and known and len(lane_types) == 1:
+                return signature(*lane_types, *args)
             return None
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

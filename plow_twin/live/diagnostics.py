@@ -372,23 +372,23 @@ class Health:
     def estimate(self, runtime: Runtime) -> Part:
         """Return the part `estimate` about the estimates and their process."""
         values = dict.fromkeys(KEYS["estimate"], "")
-        found = runtime.estimation
-        if found is None:
+        estimation = runtime.estimation
+        if estimation is None:
             return OK, "not estimating", values
         age_s = runtime.estimate_age_s()
         values |= {
-            "ready": str(int(found.worker.ready)),
-            "estimates": str(found.count),
-            "skipped": str(found.skipped),
+            "ready": str(int(estimation.worker.ready)),
+            "estimates": str(estimation.count),
+            "skipped": str(estimation.skipped),
             "window_age_s": "" if age_s is None else f"{age_s:.3f}",
-            "wall_s": f"{found.wall_s:.3f}" if found.count else "",
-            "reasons": "; ".join(found.reasons),
-            "restarts": str(found.restarts),
-            "error": found.worker.error,
+            "wall_s": f"{estimation.wall_s:.3f}" if estimation.count else "",
+            "reasons": "; ".join(estimation.reasons),
+            "restarts": str(estimation.restarts),
+            "error": estimation.worker.error,
         }
-        trouble = found.worker.error or values["reasons"]
-        doing = "estimating" if found.worker.ready else "compiling the estimator"
-        return (ERROR if found.worker.error else WARN if trouble else OK), trouble or doing, values
+        trouble = estimation.worker.error or values["reasons"]
+        doing = "estimating" if estimation.worker.ready else "compiling the estimator"
+        return (ERROR if estimation.worker.error else WARN if trouble else OK), trouble or doing, values
 
     def follow(self, runtime: Runtime) -> Part:
         """Return the part `follow` about the twins that follow the measurements."""
@@ -418,18 +418,18 @@ class Health:
         values = dict.fromkeys(KEYS["recorder"], "")
         if runtime.recording is None:
             return OK, "not recording", values
-        found = runtime.recording.recorder.counters
+        counters = runtime.recording.recorder.counters
         values |= {
             "recording": str(runtime.recording.recorder.path),
-            "written": str(found.written),
-            "queued": str(found.queued),
-            "lost": ", ".join(f"{topic}: {count}" for topic, count in sorted(found.lost.items())),
-            "marks": str(found.marks),
-            "marks_lost": str(found.marks_lost),
-            "error": found.error or "",
+            "written": str(counters.written),
+            "queued": str(counters.queued),
+            "lost": ", ".join(f"{topic}: {count}" for topic, count in sorted(counters.lost.items())),
+            "marks": str(counters.marks),
+            "marks_lost": str(counters.marks_lost),
+            "error": counters.error or "",
         }
-        if found.error or found.lost:
-            return ERROR, found.error or f"lost: {values['lost']}", values
+        if counters.error or counters.lost:
+            return ERROR, counters.error or f"lost: {values['lost']}", values
         return OK, "recording", values
 
     def _grown(self, now: dict[str, int], keys: Iterable[str]) -> list[str]:

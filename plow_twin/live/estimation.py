@@ -135,27 +135,27 @@ class Estimation:
         Without a finished estimate, the result is an empty dictionary. If the wear of the pads has been set, the
         messages have no values, and they replace the latched messages of the old estimate.
         """
-        found = self.worker.poll()
+        reply = self.worker.poll()
         stamp_ns, self._set_ns = self._set_ns, None
-        if found is None:
+        if reply is None:
             topics = self._topics if stamp_ns is not None else ()
             return {topic: plain.JointState(stamp_ns or 0, self._frame_id, ()) for topic in topics}
         self._proven = True
         self.count += 1
-        self.skipped += found.skipped
-        self.wall_s, self.end_ns = found.wall_s, found.end_ns
-        result = found.estimate
+        self.skipped += reply.skipped
+        self.wall_s, self.end_ns = reply.wall_s, reply.end_ns
+        result = reply.estimate
         self.states = {"horizontal": result.horizontal_state, "vertical": result.vertical_state}
         self.trust = {"model": result.model, "sensor": result.sensor}
         self.reasons = result.reasons
-        self.entry = entry_of(found, session, self.entry)
+        self.entry = entry_of(reply, session, self.entry)
         session.apply(self.entry)
-        self.forecast, self.forecast_error = found.also.get("forecast"), found.also.get("forecast_error", "")
-        messages = {ESTIMATE: message_of(found, self._frame_id)}
-        if "forces" in found.also:
-            messages[WINDOW_FORCES] = forces_message(found, self._frame_id)
-        if "forecast" in found.also:
-            messages[FORECAST] = forecast_message(found, self._frame_id)
+        self.forecast, self.forecast_error = reply.also.get("forecast"), reply.also.get("forecast_error", "")
+        messages = {ESTIMATE: message_of(reply, self._frame_id)}
+        if "forces" in reply.also:
+            messages[WINDOW_FORCES] = forces_message(reply, self._frame_id)
+        if "forecast" in reply.also:
+            messages[FORECAST] = forecast_message(reply, self._frame_id)
         return messages
 
     def _drop_estimate(self) -> None:
@@ -163,7 +163,7 @@ class Estimation:
         self.states = dict.fromkeys(self.states, State.PRIOR)
 
 
-def entry_of(found: Found, session: Session, before: journal.Estimated | None) -> journal.Estimated:
+def entry_of(answer: Found, session: Session, before: journal.Estimated | None) -> journal.Estimated:
     """Return the journal entry of an estimate.
 
     If a clearance is not observable, its shift is that of the previous estimate `before`. If a clearance is withdrawn,
@@ -171,7 +171,7 @@ def entry_of(found: Found, session: Session, before: journal.Estimated | None) -
     """
     model = session.outputs.modelled(session.wear_depth)
     shift = np.array(before.shift) if before is not None else np.zeros(6)
-    result = found.estimate
+    result = answer.estimate
     for axis, (value, state) in enumerate(
         ((result.horizontal, result.horizontal_state), (result.vertical, result.vertical_state))
     ):
@@ -180,26 +180,26 @@ def entry_of(found: Found, session: Session, before: journal.Estimated | None) -
             shift[own] = np.array([value.mean, value.p05, value.p95]) - model[own]
         elif state is not State.NOT_OBSERVABLE:
             shift[own] = 0.0
-    bounds = (found.start_ns, found.end_ns, found.samples, found.poses)
-    return journal.Estimated(*bounds, found.guess, tuple(shift.tolist()), found.text)
+    bounds = (answer.start_ns, answer.end_ns, answer.samples, answer.poses)
+    return journal.Estimated(*bounds, answer.guess, tuple(shift.tolist()), answer.text)
 
 
-def message_of(found: Found, frame_id: str) -> plain.JointState:
+def message_of(answer: Found, frame_id: str) -> plain.JointState:
     """Return the message of an estimate, with the end of its window as stamp.
 
     The message of a withdrawn estimate has no values.
     """
-    result = found.estimate
+    result = answer.estimate
     names: list[str] = []
     numbers: list[float] = []
     withdrawn = State.WITHDRAWN in (result.horizontal_state, result.vertical_state)
     for name, value in ({} if withdrawn else result.values()).items():
         names += [name, f"{name}/p05", f"{name}/p95"]
         numbers += [value.mean, value.p05, value.p95]
-    return plain.JointState(found.end_ns, frame_id, tuple(names), position=np.array(numbers))
+    return plain.JointState(answer.end_ns, frame_id, tuple(names), position=np.array(numbers))
 
 
-def forces_message(found: Found, frame_id: str) -> plain.JointState:
+def forces_message(answer: Found, frame_id: str) -> plain.JointState:
     """Return the message of the contact forces in a window, in the form of the messages on `contact_peaks`.
 
     If the forces were not computed, the message has no values.
@@ -207,21 +207,21 @@ def forces_message(found: Found, frame_id: str) -> plain.JointState:
     names: list[str] = []
     peaks: list[float] = []
     impulses: list[float] = []
-    for pair, forces in ((found.also["forces"] or {}).get("pairs", {})).items():
+    for pair, forces in ((answer.also["forces"] or {}).get("pairs", {})).items():
         for suffix, point in (("", "p50"), ("/p05", "p05"), ("/p95", "p95")):
             names.append(f"{pair}{suffix}")
             peaks.append(forces["peak_n"][point])
             impulses.append(forces["impulse_n_s"][point])
     numbers = {"velocity": np.array(impulses), "effort": np.array(peaks)}
-    return plain.JointState(found.end_ns, frame_id, tuple(names), **numbers)
+    return plain.JointState(answer.end_ns, frame_id, tuple(names), **numbers)
 
 
-def forecast_message(found: Found, frame_id: str) -> plain.JointState:
+def forecast_message(answer: Found, frame_id: str) -> plain.JointState:
     """Return the message of a forecast.
 
     It contains the time [s], the distance [m], the passes and the shifts until the wear limit is reached.
     """
-    forecast = found.also["forecast"] or {}
+    forecast = answer.also["forecast"] or {}
     names: list[str] = []
     numbers: list[float] = []
     for point in ("p10", "p50", "p90"):
@@ -234,7 +234,7 @@ def forecast_message(found: Found, frame_id: str) -> plain.JointState:
         if forecast.get(key) is not None:
             names.append(key)
             numbers.append(forecast[key])
-    return plain.JointState(found.end_ns, frame_id, tuple(names), position=np.array(numbers))
+    return plain.JointState(answer.end_ns, frame_id, tuple(names), position=np.array(numbers))
 
 
 def requests_of(settings: Settings) -> Requests:
@@ -254,31 +254,33 @@ def scenarios_of(settings: Settings) -> tuple[Scenario, ...]:
 
 def problems(settings: Settings, scene: Scene) -> list[Problem]:
     """Return contradictions between the parameters of the estimate, or between these parameters and the scene."""
-    found = []
+    problems_found = []
     if settings.excitation_source == "scene":
-        found.append(Problem("estimate", True, "false with excitation_source scene: no load arrives"))
+        problems_found.append(Problem("estimate", True, "false with excitation_source scene: no load arrives"))
     if scene.support is not None:
-        found.append(Problem("estimate", True, "false where the scene has a support: the fit assumes a fixed frame"))
+        problems_found.append(
+            Problem("estimate", True, "false where the scene has a support: the fit assumes a fixed frame")
+        )
     if settings.follows != "off" and settings.max_evaluations:
         expected = "0 unless follow is off: the number is not limited for twins that follow"
-        found.append(Problem("max_evaluations", settings.max_evaluations, expected))
+        problems_found.append(Problem("max_evaluations", settings.max_evaluations, expected))
     limits = settings.forecast_limits
     if any(limits) and not all(limits):
-        found.append(Problem("forecast_limits", limits, "both limits, or 0 for both"))
+        problems_found.append(Problem("forecast_limits", limits, "both limits, or 0 for both"))
     if any(limits) and (scene.wear is None or scene.wear.travel_speed_m_s <= 0.0):
-        found.append(Problem("forecast_limits", limits, "0 where the scene has no wear or no travel speed"))
+        problems_found.append(Problem("forecast_limits", limits, "0 where the scene has no wear or no travel speed"))
     if any(limits) and scene.wear is not None:
         try:
             check_prior(scene.wear)
         except LifeError as error:
-            found.append(Problem("forecast_limits", limits, f"0 with this scene: {error}"))
+            problems_found.append(Problem("forecast_limits", limits, f"0 with this scene: {error}"))
     if any(limits) and settings.forecast_stop > settings.forecast_horizon:
         expected = f"at most forecast_horizon, {settings.forecast_horizon:g} s"
-        found.append(Problem("forecast_stop", settings.forecast_stop, expected))
+        problems_found.append(Problem("forecast_stop", settings.forecast_stop, expected))
     try:
         scenarios_of(settings)
     except LifeError as error:
-        found.append(Problem("forecast_scenarios", settings.forecast_scenarios, str(error)))
+        problems_found.append(Problem("forecast_scenarios", settings.forecast_scenarios, str(error)))
     if 0 < settings.estimate_forces < FEWEST:
-        found.append(Problem("estimate_forces", settings.estimate_forces, f"0, or at least {FEWEST}"))
-    return found
+        problems_found.append(Problem("estimate_forces", settings.estimate_forces, f"0, or at least {FEWEST}"))
+    return problems_found

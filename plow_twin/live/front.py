@@ -271,9 +271,9 @@ class BridgeFront:
 
 def _first_messages(bridge: Bridge) -> Iterator[Messages]:
     count = 0
-    while count < CHECKED and len(found := bridge.poll(0.0)):
-        count += len(found)
-        yield found
+    while count < CHECKED and len(arrived := bridge.poll(0.0)):
+        count += len(arrived)
+        yield arrived
 
 
 def roles_of(

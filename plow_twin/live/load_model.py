@@ -61,7 +61,7 @@ class LoadModel:
         known = {name: value for name, value in drive.items() if math.isfinite(value)}
         if abs(known.get("speed", math.inf)) < SLOWEST_M_S and "chain_force" not in known:
             return 0.0, 0.0
-        opinions = [found for found in (self._by_drive(known), self._by_coal(known)) if found is not None]
+        opinions = [load for load in (self._by_drive(known), self._by_coal(known)) if load is not None]
         if not opinions:
             return None
         deviations = [max(deviation, 1.0) for _, deviation in opinions]

@@ -296,8 +296,8 @@ def problems(values: Mapping[str, Any]) -> list[Problem]:
     from plow_twin.scene_file.validation import validate
 
     known = {name: _bounded(coerce(name, value)) for name, value in values.items() if name in SPECS}
-    found = validate(known, schema(), "parameters")
-    return [Problem(problem.key, values.get(problem.key, problem.got), problem.expected) for problem in found]
+    problems_found = validate(known, schema(), "parameters")
+    return [Problem(problem.key, values.get(problem.key, problem.got), problem.expected) for problem in problems_found]
 
 
 def _bounded(value: Any) -> Any:
@@ -335,15 +335,15 @@ def settings(values: Mapping[str, Any]) -> Settings:
     ParameterError
         A value is invalid, or values contradict each other.
     """
-    found = problems(values)
-    if found:
-        raise ParameterError(found)
+    problems_found = problems(values)
+    if problems_found:
+        raise ParameterError(problems_found)
     made = Settings(**{name: coerce(name, value) for name, value in values.items() if name in SPECS})
-    found = [*outside(made), *_unknown_services(made), *_swapped_thresholds(made)]
+    problems_found = [*outside(made), *_unknown_services(made), *_swapped_thresholds(made)]
     if bool(made.opcua_server) != bool(made.opcua_map):
-        found.append(Problem("opcua_map", made.opcua_map, "a mapping to nodes, together with opcua_server"))
-    if found:
-        raise ParameterError(found)
+        problems_found.append(Problem("opcua_map", made.opcua_map, "a mapping to nodes, together with opcua_server"))
+    if problems_found:
+        raise ParameterError(problems_found)
     return made
 
 
@@ -410,12 +410,12 @@ def read_parameters(path: Path) -> dict[str, Any]:
     """
     from plow_twin.scene_file.yaml_text import read_yaml
 
-    given, found = read_yaml(path, "parameter", "a mapping of names to values")
-    if found:
-        raise ParameterError(found, str(path))
-    nodes = [given] if isinstance(given, dict) else []
+    document, problems_found = read_yaml(path, "parameter", "a mapping of names to values")
+    if problems_found:
+        raise ParameterError(problems_found, str(path))
+    nodes = [document] if isinstance(document, dict) else []
     nodes += [node for node in nodes[0].values() if isinstance(node, dict)] if nodes else []
-    values = next((node["ros__parameters"] for node in nodes if "ros__parameters" in node), given)
+    values = next((node["ros__parameters"] for node in nodes if "ros__parameters" in node), document)
     if not isinstance(values, dict):
         raise ParameterError([Problem("file", type(values).__name__, "a mapping of names to values")], str(path))
     return {str(name): value for name, value in values.items()}
@@ -425,8 +425,8 @@ def read_value(text: str) -> Any:
     """Return the value of a YAML text, or the text itself if it is not valid YAML."""
     from plow_twin.scene_file.yaml_text import load_yaml
 
-    value, found = load_yaml(text, "value", "a value")
-    return text if found else value
+    value, problems_found = load_yaml(text, "value", "a value")
+    return text if problems_found else value
 
 
 def unknown(names: Iterable[str]) -> Iterator[tuple[str, str]]:

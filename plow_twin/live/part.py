@@ -23,7 +23,7 @@ def part_of(message: Message) -> Part:
 def number_of(text: str) -> float | None:
     """Return the number that a value contains, or None if the value is not a finite number."""
     try:
-        found = float(text)
+        number = float(text)
     except ValueError:
         return None
-    return found if math.isfinite(found) else None
+    return number if math.isfinite(number) else None

@@ -173,8 +173,8 @@ class Runtime:
     @property
     def follower(self) -> Follower | None:
         """The twin, or None if it does not follow measurements."""
-        found: Follower | None = cast(Any, self.driver.session.following)
-        return found
+        recorder: Follower | None = cast(Any, self.driver.session.following)
+        return recorder
 
     @property
     def reads_at_once(self) -> bool:
@@ -186,8 +186,8 @@ class Runtime:
         """State of the recorder: `off`, `recording`, or `trouble` if data were lost or the recording has stopped."""
         if self.recording is None:
             return "off"
-        found = self.recording.recorder.counters
-        return "trouble" if found.error or found.lost else "recording"
+        counters = self.recording.recorder.counters
+        return "trouble" if counters.error or counters.lost else "recording"
 
     def residual(self) -> tuple[float, float, float] | None:
         """Return the pose of the model minus the last measured pose: x, y [m], theta [rad], or None."""
@@ -350,11 +350,11 @@ class Runtime:
             yield from self.step(list(zip(stamps.tolist(), map(tuple, wrench.tolist()), strict=True)))
             return
         self.publishing.received_ns = now_ns = time.monotonic_ns()
-        for found in self.driver.series(stamps, wrench, now_ns):
-            if isinstance(found, Series):
-                yield from self.publishing.series(found, self._journal_series)
+        for applied in self.driver.series(stamps, wrench, now_ns):
+            if isinstance(applied, Series):
+                yield from self.publishing.series(applied, self._journal_series)
             else:
-                yield from self.publishing.messages(found)
+                yield from self.publishing.messages(applied)
         self._advanced(len(stamps))
 
     def _journal_series(self, series: Series) -> None:

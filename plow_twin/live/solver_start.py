@@ -69,10 +69,10 @@ def key(settings: Settings) -> tuple[object, ...]:
     follow = settings.follows, settings.follow_members
     own = settings.scene, settings.tolerance, settings.excitation_source, settings.max_evaluations, *follow
     try:
-        found = os.stat(scene_path(settings.scene))
+        status = os.stat(scene_path(settings.scene))
     except (OSError, PlowTwinError):
         return own
-    return *own, found.st_mtime_ns, found.st_size
+    return *own, status.st_mtime_ns, status.st_size
 
 
 def _prepare(settings: Settings, warm_up: Callable[[], None]) -> Prepared:

@@ -49,7 +49,7 @@ class UnusedMessages:
         """Return and remove the journal entries; `name_of` returns the name of a sender of an input."""
         pending, self._pending = self._pending, {}
         return [
-            Unused(topic, name_of(topic, sender), reason, found.count, tuple(found.stamps_ns), tuple(found.values))
-            for (topic, sender, reason), found in pending.items()
-            if found.count
+            Unused(topic, name_of(topic, sender), reason, count.count, tuple(count.stamps_ns), tuple(count.values))
+            for (topic, sender, reason), count in pending.items()
+            if count.count
         ]

@@ -63,11 +63,11 @@ class WearKeeper:
         If the depths `kept` could not be saved, and the file has not changed since then, they replace those in the
         file.
         """
-        found = read_wear(self.folder)
-        if found is not None:
-            self._own = (found,)
-            self._saved = parse_wear(found, self.folder / FILE_NAME, self._head, self._scene)
-        return kept.depth_m if kept is not None and found in (None, *kept.older_files) else self._saved
+        stored = read_wear(self.folder)
+        if stored is not None:
+            self._own = (stored,)
+            self._saved = parse_wear(stored, self.folder / FILE_NAME, self._head, self._scene)
+        return kept.depth_m if kept is not None and stored in (None, *kept.older_files) else self._saved
 
     def kept(self, depth: NDArray[np.float64]) -> KeptWear:
         """Return the wear depths [m] for the next runtime of the process. `close` must be called before."""
@@ -101,15 +101,15 @@ class WearKeeper:
                 # the locked folder was moved or removed, or another file system was mounted over it
                 self.release()
                 self._claim = claim_folder(self.folder)
-            found = read_wear(self.folder)
-            if found not in (None, *self._own):
+            stored = read_wear(self.folder)
+            if stored not in (None, *self._own):
                 raise WearStateError(
                     f"{self.folder / FILE_NAME} is not the file that this twin has read or written and is left as it "
                     "is: clean up and configure to continue with its wear, or move it away to save the wear of "
                     "this twin"
                 )
             content = wear_content(self._head, self._identity, values)
-            self._own = (content,) if found is None else (found, content)
+            self._own = (content,) if stored is None else (stored, content)
             save_wear(self.folder, content)
             self._own = (content,)
         except (OSError, WearStateError) as error:

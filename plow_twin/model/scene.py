@@ -445,9 +445,9 @@ def variants(scenes: Sequence[Scene], numbers: Mapping[str, Mapping[str, Any]], 
 
 def _copied(part: _Part, values: Mapping[str, Any]) -> _Part:
     """Return a copy of a frozen dataclass without a check of its new values."""
-    found = object.__new__(type(part))
-    found.__dict__.update(part.__dict__, **values)
-    return found
+    copy = object.__new__(type(part))
+    copy.__dict__.update(part.__dict__, **values)
+    return copy
 
 
 #: Parts that every scene has.
@@ -467,9 +467,9 @@ PARTS: Final[Mapping[str, type]] = {**SECTIONS, **OPTIONAL_PARTS}
 
 def check(scene: Scene) -> Iterator[Problem]:
     """Yield every problem of a scene. Conflicts between fields are checked only if each field is valid."""
-    found = list(_check_fields(scene, ""))
-    yield from found
-    if not found:
+    problems = list(_check_fields(scene, ""))
+    yield from problems
+    if not problems:
         yield from _check_contact(scene.contact)
         yield from _check_rotation(scene)
         yield from _check_corners(scene)

@@ -68,7 +68,7 @@ def alarm_texts(values: Mapping[str, str], *, own_start: bool = False, newest: b
 
     The argument `newest` adds the present value to each sentence, and `own_start` is passed to `time_text`.
     """
-    found = []
+    texts = []
     for name, (factor, unit) in _UNITS.items():
         stamp = values.get(f"{name}_stamp_ns")
         if not stamp:
@@ -80,8 +80,8 @@ def alarm_texts(values: Mapping[str, str], *, own_start: bool = False, newest: b
         time = time_text(int(stamp), own_start=own_start)
         limit = f"{title} threshold {threshold:.4g} {unit}"
         now = f", now {float(values[name]) * factor:.4g} {unit}" if newest else ""
-        found.append(f"{name.replace('_', ' ')} {raised:.4g} {unit}{place}, {limit}, at {time}{now}")
-    return found
+        texts.append(f"{name.replace('_', ' ')} {raised:.4g} {unit}{place}, {limit}, at {time}{now}")
+    return texts
 
 
 class AlarmCheck:

@@ -119,13 +119,13 @@ def readable_beside(run: Path, lost: Counter[str]) -> list[Path]:
 
     The counter `lost` receives the losses that the recorder counted, and the number of files in each unreadable folder.
     """
-    found = []
+    folders = []
     for folder in beside_folders(run):
         lost.update(recorded_losses(folder))
         parts = [*folder.glob("*.mcap")]
         # if a folder can be read in part, its reader counts the unreadable files
         if any(map(is_mcap, parts)):
-            found.append(folder)
+            folders.append(folder)
         else:
             lost.update("truncated_files" if is_mcap(part) is None else "damaged_files" for part in parts)
-    return found
+    return folders

@@ -351,10 +351,10 @@ def metadata_records(path: Path) -> list[tuple[str, dict[str, str]]]:
             return [(record.name, dict(record.metadata)) for record in make_reader(stream).iter_metadata()]
         except Exception:  # the index at the end of the file is missing or damaged
             pass
-    found: list[tuple[str, dict[str, str]]] = []
-    for _ in ChunkReader(path, lambda name, record: found.append((name, record)), lambda numbers: False):
+    records: list[tuple[str, dict[str, str]]] = []
+    for _ in ChunkReader(path, lambda name, record: records.append((name, record)), lambda numbers: False):
         pass
-    return found
+    return records
 
 
 class _Heads:

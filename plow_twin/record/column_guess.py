@@ -70,17 +70,17 @@ class Guess:
 
     def mapping(self) -> dict[str, Any]:
         """Return the content of a mapping file."""
-        found: dict[str, Any] = {}
+        roles: dict[str, Any] = {}
         for (role, name), column in self.columns.items():
-            entry = found.setdefault(role, {"topic": self.path.stem, "fields": {}})
+            entry = roles.setdefault(role, {"topic": self.path.stem, "fields": {}})
             entry["fields"][name] = column
             if name in self.units:
                 entry.setdefault("unit", {})[name] = self.units[name]
-        for entry in found.values():
+        for entry in roles.values():
             entry["stamp"] = self.time
             if self.time_unit:
                 entry["stamp_unit"] = self.time_unit
-        return found
+        return roles
 
     def mapping_text(self) -> str:
         """Return the content of a mapping file as YAML."""
@@ -174,15 +174,15 @@ def _find_time(
     guess: Guess, rows: Sequence[Sequence[str]], numbers: Mapping[str, Array], given: str, unit: str
 ) -> None:
     alike = [name for name in guess.names if re.fullmatch(_TIME, _plain(name))]
-    rising = [name for name, found in numbers.items() if len(found) > 2 and (np.diff(found) > 0.0).all()]
+    rising = [name for name, values in numbers.items() if len(values) > 2 and (np.diff(values) > 0.0).all()]
     choices = [given] if given else alike or rising
     if len(choices) != 1:
         guess.open["t"] = tuple(choices or guess.names)
         return
     guess.time = choices[0]
     guess.because["t"] = "as stated" if given else "by its name" if alike else "as the only rising column"
-    found = numbers[guess.time]
-    if not np.isfinite(found).any():
+    column = numbers[guess.time]
+    if not np.isfinite(column).any():
         index = guess.names.index(guess.time)
         stamps = [time_ns(row[index]) for row in rows]
         # time is counted from the first stamp, because a float resolves the time since 1970 only to 0.2 us
@@ -196,10 +196,10 @@ def _find_time(
             guess.because["t"] += "; dates without a zone are UTC"
         return
     header = _unit_of(guess.time)
-    newest = float(np.nanmax(np.abs(found)))
+    newest = float(np.nanmax(np.abs(column)))
     dates = next((name for name, least in _DATES if newest > least), "")
     guess.time_unit = unit or (header if header in STAMP_UNITS else "") or dates or "s"
-    guess.stamps_s = found * STAMP_UNITS[guess.time_unit] * 1e-9 if guess.time_unit in STAMP_UNITS else found
+    guess.stamps_s = column * STAMP_UNITS[guess.time_unit] * 1e-9 if guess.time_unit in STAMP_UNITS else column
     if not (unit or header in STAMP_UNITS or dates):
         guess.because["t"] += "; its unit by the rate of the samples"
 
@@ -248,11 +248,11 @@ def _number(cell: str) -> float:
 
 
 def _unit_of(name: str) -> str:
-    found = _UNIT.fullmatch(name)
-    unit = (found[2] or found[3]) if found else ""
+    match = _UNIT.fullmatch(name)
+    unit = (match[2] or match[3]) if match else ""
     return {"Nm": "N m", "kNm": "kN m", "°": "deg", "µm": "um", "sec": "s"}.get(unit, unit)
 
 
 def _plain(name: str) -> str:
-    found = _UNIT.fullmatch(name)
-    return re.sub(r"[^a-z0-9]", "", (found[1] if found else name).lower())
+    match = _UNIT.fullmatch(name)
+    return re.sub(r"[^a-z0-9]", "", (match[1] if match else name).lower())

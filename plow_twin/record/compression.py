@@ -52,11 +52,11 @@ def _lz4_block() -> Callable[[int, int, int, int], int] | None:
     import lz4.block
 
     try:
-        found: Any = ctypes.CDLL(lz4.block._block.__file__).LZ4_decompress_safe
+        function: Any = ctypes.CDLL(lz4.block._block.__file__).LZ4_decompress_safe
     except (OSError, AttributeError):
         return None
-    found.argtypes, found.restype = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_int), ctypes.c_int
-    return cast("Callable[[int, int, int, int], int]", found)
+    function.argtypes, function.restype = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_int), ctypes.c_int
+    return cast("Callable[[int, int, int, int], int]", function)
 
 
 def independent_blocks(data: memoryview, size: int) -> Bytes | None:

@@ -378,10 +378,10 @@ def _copy(messages: Messages, reader: ChunkReader, file: McapFile, numbers: dict
 
 def _description(channel: Channel) -> Mapping[str, str]:
     """Return the metadata of a channel. A missing or damaged QoS, which other readers refuse, is replaced."""
-    kind, found = channel.message_type, channel.metadata
-    if kind not in MESSAGE_TYPES or profiles(found.get(_QOS, "")):
-        return found
-    return {**found, _QOS: qos_text(channel.topic.rpartition("/")[2]), _HASH: type_hash(kind)}
+    kind, metadata = channel.message_type, channel.metadata
+    if kind not in MESSAGE_TYPES or profiles(metadata.get(_QOS, "")):
+        return metadata
+    return {**metadata, _QOS: qos_text(channel.topic.rpartition("/")[2]), _HASH: type_hash(kind)}
 
 
 def _facts(part: Path) -> PartFacts:

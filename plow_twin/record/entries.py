@@ -103,11 +103,11 @@ class Entries:
     def others(self) -> Mapping[int, Entry | Dropped]:
         """All entries that are not samples, by index."""
         stamps = self.stamp_ns[self.digest_at].tolist()
-        found: dict[int, Entry | Dropped] = {
+        digests: dict[int, Entry | Dropped] = {
             index: Digest(stamp_ns, f"{digest:016x}")
             for index, stamp_ns, digest in zip(self.digest_at.tolist(), stamps, self.digest.tolist(), strict=True)
         }
-        return found | dict(self.rest)
+        return digests | dict(self.rest)
 
     def record(self, index: int) -> EntryRecord:
         """Return the entry at `index` as a record."""

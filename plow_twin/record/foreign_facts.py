@@ -77,7 +77,7 @@ def foreign_facts(path: Path, mapping: Path | None, units: Mapping[str, str]) ->
     facts = {
         "file": str(path),
         "topics": {topic: str(kind) for topic, kind in topics.items()},
-        "roles": {name: found.facts(roles[name].topic) for name, found in seen.items()},
+        "roles": {name: seen_signal.facts(roles[name].topic) for name, seen_signal in seen.items()},
         "lost": lost,
     }
-    return facts, bool(lost) or any(found.unfit for found in seen.values())
+    return facts, bool(lost) or any(signal.unfit for signal in seen.values())

@@ -113,12 +113,12 @@ def read_digests(
 
     Return whether each message is a digest, shape (n,), and the stamps [ns] and values of the digests, shape (m,).
     """
-    found = (length == _DIGEST_SIZE) & (start >= 0) & (start + _DIGEST_SIZE <= buffer.size)
-    messages = buffer[start[found, None] + np.arange(_DIGEST_SIZE)]
+    complete = (length == _DIGEST_SIZE) & (start >= 0) & (start + _DIGEST_SIZE <= buffer.size)
+    messages = buffer[start[complete, None] + np.arange(_DIGEST_SIZE)]
     good = (messages[:, : len(_DIGEST_HEAD)] == _DIGEST_HEAD).all(axis=1)
-    found[found] = good
+    complete[complete] = good
     numbers = np.ascontiguousarray(messages[good, len(_DIGEST_HEAD) :]).view("<u8")
-    return found, numbers[:, 0].astype(np.int64), numbers[:, 1]
+    return complete, numbers[:, 0].astype(np.int64), numbers[:, 1]
 
 
 def _from_json(text: str, source: str) -> journal.Entry | Dropped:
@@ -148,10 +148,10 @@ def _no_number(text: str) -> Any:
 
 
 def _integer(value: Any) -> int:
-    found: int = _exactly(int)(value)
-    if not -_SIGN <= found < _SIGN:
-        raise ValueError(f"got an integer of {found.bit_length()} bits, expected a signed 64-bit integer")
-    return found
+    number: int = _exactly(int)(value)
+    if not -_SIGN <= number < _SIGN:
+        raise ValueError(f"got an integer of {number.bit_length()} bits, expected a signed 64-bit integer")
+    return number
 
 
 _READERS: Final[dict[str, Callable[[Any], Any]]] = {

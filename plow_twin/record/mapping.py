@@ -260,10 +260,10 @@ def readings(
 
 def roles_by_topic(roles: Mapping[str, Role]) -> dict[str, list[tuple[str, Role]]]:
     """Return the roles of each topic, with their names."""
-    found: dict[str, list[tuple[str, Role]]] = {}
+    by_topic: dict[str, list[tuple[str, Role]]] = {}
     for name, role in roles.items():
-        found.setdefault(role.topic, []).append((name, role))
-    return found
+        by_topic.setdefault(role.topic, []).append((name, role))
+    return by_topic
 
 
 def stamps_by(roles: Mapping[str, Role]) -> StampOf[Arrived]:
@@ -274,8 +274,8 @@ def stamps_by(roles: Mapping[str, Role]) -> StampOf[Arrived]:
     by_topic = roles_by_topic(roles)
 
     def stamp_ns(arrived: Arrived) -> int | None:
-        found = (role.stamp_ns(arrived) for _, role in by_topic.get(arrived.topic, ()))
-        return next((stamp for stamp in found if stamp is not None), None)
+        stamps = (role.stamp_ns(arrived) for _, role in by_topic.get(arrived.topic, ()))
+        return next((stamp for stamp in stamps if stamp is not None), None)
 
     return stamp_ns
 
@@ -320,7 +320,7 @@ def read_map(path: Path | None, topics: Mapping[str, TopicType] | None) -> dict[
     """
     if path is None:
         topics = topics or {}
-        return {role: found for role in _NAMES if (found := _guess(role, topics)) is not None}
+        return {role: guess for role in _NAMES if (guess := _guess(role, topics)) is not None}
     given = read_map_file(path)
     return {role: _role(path, role, entry, topics) for role, entry in given.items() if role != LOAD_MODEL}
 
@@ -333,7 +333,7 @@ def _role(path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str, 
     if role == "excitation" and (missing := set(ROLES[role]) - set(fields)):
         raise map_error(path, f"{role}.fields", sorted(fields), f"{', '.join(sorted(missing))} too")
     units = entry.get("unit", {})
-    found = Role(
+    read_role = Role(
         topic,
         kind,
         {name: str(field) for name, field in fields.items()},
@@ -347,23 +347,23 @@ def _role(path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str, 
         str(entry.get("sequence", "")),
         "stamp_unit" in entry,
     )
-    _check_columns(path, role, found)
+    _check_columns(path, role, read_role)
     if "stamp_unit" in entry:
-        _check_stamp_unit(path, role, found)
+        _check_stamp_unit(path, role, read_role)
     if kind == OPCUA:
-        _check_nodes(path, role, found)
-    elif not isinstance(kind, Columns) and kind != "json" and found.stamp not in ("header", "log"):
-        raise map_error(path, f"{role}.stamp", found.stamp, f"header or log for {kind}")
-    return found
+        _check_nodes(path, role, read_role)
+    elif not isinstance(kind, Columns) and kind != "json" and read_role.stamp not in ("header", "log"):
+        raise map_error(path, f"{role}.stamp", read_role.stamp, f"header or log for {kind}")
+    return read_role
 
 
-def _check_nodes(path: Path, role: str, found: Role) -> None:
-    if found.stamp not in (SOURCE_STAMP, SERVER_STAMP):
-        raise map_error(path, f"{role}.stamp", found.stamp, f"{SOURCE_STAMP} or {SERVER_STAMP} for nodes")
-    if found.stamp_unit != "ns":
-        raise map_error(path, f"{role}.stamp_unit", found.stamp_unit, "none: the stamps of nodes are dates")
-    if found.sequence:
-        raise map_error(path, f"{role}.sequence", found.sequence, "none: the server numbers its messages")
+def _check_nodes(path: Path, role: str, read_role: Role) -> None:
+    if read_role.stamp not in (SOURCE_STAMP, SERVER_STAMP):
+        raise map_error(path, f"{role}.stamp", read_role.stamp, f"{SOURCE_STAMP} or {SERVER_STAMP} for nodes")
+    if read_role.stamp_unit != "ns":
+        raise map_error(path, f"{role}.stamp_unit", read_role.stamp_unit, "none: the stamps of nodes are dates")
+    if read_role.sequence:
+        raise map_error(path, f"{role}.sequence", read_role.sequence, "none: the server numbers its messages")
 
 
 def with_units(roles: Mapping[str, Role], units: Mapping[str, str]) -> dict[str, Role]:

@@ -239,7 +239,7 @@ def _journal(reader: RunReader, lost: Counter[str]) -> tuple[Array, list[int], A
         places = [place for place in holes.find(entries) if place >= since]
         begins += [loads.came + int(entries.sample[since:place].sum()) for place in places]
         loads.add(rows[since:][entries.sample[since:]])
-    tables = [_counted(found, lost) for found in (loads, poses, gaps)]
+    tables = [_counted(signal_rows, lost) for signal_rows in (loads, poses, gaps)]
     begins = [row - loads.dropped for row in begins]
     return tables[0], begins, tables[1][:, :4], tables[2], spread, tables[1][:, 4:]
 

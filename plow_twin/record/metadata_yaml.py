@@ -137,10 +137,10 @@ def listed_parts(folder: Path) -> list[str]:
     """
     path = folder / "metadata.yaml"
     try:
-        found = _information(folder)["relative_file_paths"]
+        information = _information(folder)["relative_file_paths"]
     except (RecordingError, LookupError, TypeError) as error:
         raise RecordingError(f"{path}: cannot be read as metadata of a bag") from error
-    return [str(name) for name in found]
+    return [str(name) for name in information]
 
 
 def _information(folder: Path) -> Any:

@@ -241,11 +241,11 @@ class RunReader:
 
     def size(self) -> int:
         """Return the total size of the parts [B]."""
-        found = 0
+        count = 0
         for part in self.parts:
             with suppress(FileNotFoundError):
-                found += part.stat().st_size
-        return found
+                count += part.stat().st_size
+        return count
 
     def duration_s(self) -> float:
         """Return the time from the first to the last record [s].
@@ -434,18 +434,18 @@ def read_header(path: Path) -> RunHeader | None:
     RecordingError
         The file is not an MCAP file, or its header is invalid.
     """
-    found: list[RunHeader] = []
+    headers: list[RunHeader] = []
 
     def on_metadata(name: str, record: dict[str, str]) -> None:
         if name == HEADER_RECORD:
-            found.append(RunHeader.from_record(record, str(path)))
+            headers.append(RunHeader.from_record(record, str(path)))
 
     for _ in ChunkReader(path, on_metadata):
         break
-    if not found:  # programs that rewrite MCAP files move metadata records to the end
+    if not headers:  # programs that rewrite MCAP files move metadata records to the end
         for name, record in metadata_records(path):
             on_metadata(name, record)
-    return found[0] if found else None
+    return headers[0] if headers else None
 
 
 def run_parts(path: Path) -> list[Path]:

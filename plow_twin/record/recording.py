@@ -157,16 +157,16 @@ class Recording:
         sent = [name for name in wanted if name in templates]
         topics = {self.header.topic(name): name for name in sent}
         for batch in self._read(outputs=bool(sent)):
-            found: dict[str, Batched] = {}
+            batched: dict[str, Batched] = {}
             if "excitation" in wanted and batch.entries.sample.any():
-                found["excitation"] = Batched(*batch.entries.samples())
+                batched["excitation"] = Batched(*batch.entries.samples())
             if "head_pose" in wanted and (poses := _poses(batch)) is not None:
-                found["head_pose"] = poses
+                batched["head_pose"] = poses
             if sent:
                 rows = rows_by_topic(batch.outputs, topics, templates)
-                found |= {name: _plain(name, rows[name]) for name in sent if name in rows}
-            if found:
-                yield found
+                batched |= {name: _plain(name, rows[name]) for name in sent if name in rows}
+            if batched:
+                yield batched
 
 
 @dataclass(frozen=True)
@@ -179,8 +179,8 @@ class Table:
 
     def batches(self) -> Iterator[Batched]:
         """Return an iterator over batches of rows, which fit in memory even if the run is long."""
-        for found in self.recording.batches(self.name):
-            yield found[self.name]
+        for batched in self.recording.batches(self.name):
+            yield batched[self.name]
 
     def numpy(self) -> tuple[Indexes, Array]:
         """Return the stamps [ns], shape (n,), and the values, shape (n, number of columns)."""
@@ -235,8 +235,8 @@ def _exported_npz(recording: Recording, out: Path) -> dict[str, int]:
     from plow_twin.record.durable import whole_file
 
     parts: dict[str, list[Batched]] = {}
-    for found in recording.batches():
-        for name, part in found.items():
+    for batch in recording.batches():
+        for name, part in batch.items():
             parts.setdefault(name, []).append(part)
     arrays: dict[str, Any] = {}
     for name, rows in parts.items():
@@ -261,8 +261,8 @@ def _exported_tables(recording: Recording, kind: str, out: Path) -> dict[str, in
     counts: dict[str, int] = {}
     writers: dict[str, Any] = {}
     with ExitStack() as opened:
-        for found in recording.batches():
-            for name, part in found.items():
+        for batch in recording.batches():
+            for name, part in batch.items():
                 table = recording[name]
                 if name not in writers:
                     make = pyarrow.csv.CSVWriter if kind == "csv" else pyarrow.parquet.ParquetWriter
@@ -274,14 +274,14 @@ def _exported_tables(recording: Recording, kind: str, out: Path) -> dict[str, in
 
 
 def _poses(batch: Batch) -> Batched | None:
-    found = [
+    poses = [
         (entry.stamp_ns, whole_pose(entry))
         for _, entry in sorted(batch.entries.others.items())
         if isinstance(entry, Pose | PartOfPose)
     ]
-    if not found:
+    if not poses:
         return None
-    return Batched(np.array([stamp for stamp, _ in found], np.int64), np.array([pose for _, pose in found], float))
+    return Batched(np.array([stamp for stamp, _ in poses], np.int64), np.array([pose for _, pose in poses], float))
 
 
 def _plain(name: str, rows: Rows) -> Batched:

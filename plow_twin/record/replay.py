@@ -271,7 +271,7 @@ class _Replay:
                 self.rows = np.zeros(len(stamps), ROW)
             rows = self.rows[: len(stamps)]
         try:
-            found = self.session.advance(stamps, wrench, rows, taken, done[digests])
+            applied = self.session.advance(stamps, wrench, rows, taken, done[digests])
         except ValueError:  # the caller applies the entries singly
             return False
         self.inputs.add(entries)
@@ -281,11 +281,11 @@ class _Replay:
         self.resumed = False
         self.first_ns = int(stamps[0]) if self.first_ns is None else self.first_ns
         first_step = self.report.steps - len(stamps)
-        computed = np.frombuffer(bytes.fromhex("".join(found.digests)), ">u8")
+        computed = np.frombuffer(bytes.fromhex("".join(applied.digests)), ">u8")
         differences = [
             (
                 first_step + int(done[index]) - 1, int(entries.stamp_ns[index]), "digest", "digest",
-                f"{entries.digest[number]:016x}", found.digests[number],
+                f"{entries.digest[number]:016x}", applied.digests[number],
             )
             for number in np.flatnonzero(computed != entries.digest).tolist()
             for index in (digests[number],)
@@ -294,16 +294,18 @@ class _Replay:
         self.next_sequence = (int(entries.sequence[-1]) + 1) & _SEQUENCE_MASK
         self.in_a_row += len(entries)
         if self.sink is not None:
-            self._write_run(entries, found)
+            self._write_run(entries, applied)
             self._messages(sent, begin, end)
         elif sent_here is not None:
-            self.published = found.published if len(taken) and taken[-1] == len(stamps) - 1 else None
-            differences += self._compare_sent(entries, sent, (begin, end), sent_here, found.published, done, first_step)
+            self.published = applied.published if len(taken) and taken[-1] == len(stamps) - 1 else None
+            differences += self._compare_sent(
+                entries, sent, (begin, end), sent_here, applied.published, done, first_step
+            )
         for difference in sorted(differences, key=lambda found: found[0]):
             self._note(Divergence(*difference))
         return True
 
-    def _write_run(self, entries: Entries, found: Applied) -> None:
+    def _write_run(self, entries: Entries, applied: Applied) -> None:
         assert self.sink is not None
         begin = 0
         for end in (*sorted(entries.others), len(entries)):
@@ -316,9 +318,9 @@ class _Replay:
                 record = entries.record(end)
                 self.sink.write_entry(record.sequence, record.log_time_ns, record.entry)
             begin = end + 1
-        samples, published = np.flatnonzero(entries.sample), found.published
-        if found.failed:
-            good = np.flatnonzero(found.rows["stamp_ns"])
+        samples, published = np.flatnonzero(entries.sample), applied.published
+        if applied.failed:
+            good = np.flatnonzero(applied.rows["stamp_ns"])
             samples, published = samples[good], published.of(good)
         self.sink.write_publications(entries.sequence[samples], entries.log_time_ns[samples], published)
 
@@ -343,7 +345,7 @@ class _Replay:
         entries: Entries,
         sent: SentMessages,
         span: tuple[int, int],
-        found: Sent,
+        computed: Sent,
         published: Published,
         done: Indexes,
         first_step: int,
@@ -353,18 +355,18 @@ class _Replay:
             for index, entry in sorted(entries.rest.items())
             if isinstance(entry, journal.Pose)
         ]
-        self.alarms.published(found.first_sequence & _SEQUENCE_MASK, first_step + found.taken, published, poses)
+        self.alarms.published(computed.first_sequence & _SEQUENCE_MASK, first_step + computed.taken, published, poses)
         compared = self.outputs_synced | ~_IS_CUMULATIVE
-        for name, count, known in zip(PUBLICATION_TOPICS, found.counts.tolist(), compared.tolist(), strict=True):
+        for name, count, known in zip(PUBLICATION_TOPICS, computed.counts.tolist(), compared.tolist(), strict=True):
             if count or name not in FOLLOWED_TOPICS:
                 (self.report.compared if known else self.report.not_compared)[name] += count
-        found.expect(published, self.templates, compared)
+        computed.expect(published, self.templates, compared)
         differences, begin = [], span[0]
         for messages, from_, to in sent.pieces(*span):
             chosen = slice(from_ - begin, to - begin)
-            for index in found.differing(messages, chosen):
-                record, advance = sent.record(from_ + index), int(found.after[from_ - begin + index])
-                where = self._difference(record, published.at(int(found.publication[advance])))
+            for index in computed.differing(messages, chosen):
+                record, advance = sent.record(from_ + index), int(computed.after[from_ - begin + index])
+                where = self._difference(record, published.at(int(computed.publication[advance])))
                 if where is not None:
                     topic = self.topics[record.topic]
                     differences.append((first_step + advance, record.publish_time_ns, topic, *where))

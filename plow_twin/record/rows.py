@@ -55,7 +55,7 @@ def rows_by_topic(
     `topics` maps each topic to its base name, and `templates` maps each base name to its template. A message with a
     string that differs from the template is decoded. A message with more or fewer values than the template is omitted.
     """
-    found: dict[str, list[Rows]] = {}
+    by_topic: dict[str, list[Rows]] = {}
     for part in outputs:
         for channel, (topic, _) in part.topics.items():
             name = topics.get(topic)
@@ -63,8 +63,8 @@ def rows_by_topic(
                 continue
             chosen = np.flatnonzero(part.messages.channel == channel)
             if chosen.size:
-                found.setdefault(name, []).append(_rows(part, chosen, templates[name]))
-    return {name: Rows.joined(parts) for name, parts in found.items()}
+                by_topic.setdefault(name, []).append(_rows(part, chosen, templates[name]))
+    return {name: Rows.joined(parts) for name, parts in by_topic.items()}
 
 
 def _rows(part: Outputs, chosen: Indexes, template: Template) -> Rows:

@@ -17,10 +17,10 @@ def find_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False
 
     Raise `RecordingError` if no recording exists.
     """
-    found = running_run(path, wait_s, stop)
-    if found is None and not path.exists():
+    run = running_run(path, wait_s, stop)
+    if run is None and not path.exists():
         raise RecordingError(f"{path}: got no recording within {wait_s:g} s, expected one that is being written")
-    return found or path
+    return run or path
 
 
 def running_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False) -> Path | None:

@@ -43,13 +43,13 @@ class Messages:
         rows, slow = published
         if not self._each.fill(rows) or (len(slow) and not self._slow.fill(slow)):
             return ()
-        found = self._each.parts
+        parts = self._each.parts
         if len(slow):
-            found += self._slow.parts
+            parts += self._slow.parts
         if rows["marked"][0]:
             self._marked.fill(rows)
-            found += self._marked.parts
-        return found
+            parts += self._marked.parts
+        return parts
 
     def intervals(self, published: Published) -> tuple[tuple[str, memoryview], ...]:
         """Return the messages with the intervals of a publication, in the form of `write`."""

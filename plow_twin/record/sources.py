@@ -124,8 +124,8 @@ def open_source(path: Path) -> Source:
         elif files := tables(path):
             return CsvSource(files)
         else:
-            found = f"a folder without .mcap, .db3, .csv or .parquet{packed(path)}"
-            raise RecordingError(f"{path}: got {found}, expected a recording")
+            content = f"a folder without .mcap, .db3, .csv or .parquet{packed(path)}"
+            raise RecordingError(f"{path}: got {content}, expected a recording")
         if missing:
             source.losses.counts["missing_parts"] = len(missing)
         return source
@@ -212,7 +212,7 @@ class McapSource:
 
     def topics(self) -> dict[str, str]:
         """Return the type of each topic in the first chunks of each part."""
-        found: dict[str, str] = {}
+        types: dict[str, str] = {}
         for part in self.parts:
             if len(self.parts) > 1 and not is_mcap(part):
                 continue
@@ -220,8 +220,8 @@ class McapSource:
             for number, _ in enumerate(reader):
                 if number >= 8:
                     break
-            found |= {channel.topic: channel.message_type for channel in reader.channels.values()}
-        return found
+            types |= {channel.topic: channel.message_type for channel in reader.channels.values()}
+        return types
 
     def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf[Arrived] | None = None) -> Iterator[Arrived]:
         """Yield the messages on the topics for which `wanted` returns True, in the order of the files."""
@@ -295,14 +295,14 @@ class SqliteSource:
 
     def topics(self) -> dict[str, str]:
         """Return the type of each topic. Raise `RecordingError` if no file can be read."""
-        found: dict[str, str] = {}
+        types: dict[str, str] = {}
         for part in self.parts:
             with self._reading(part) as (_, topics):
-                found |= {name: kind for _, name, kind in topics}
+                types |= {name: kind for _, name, kind in topics}
         if len(self._damaged) == len(self.parts):
             part, why = next(iter(self._damaged.items()))
             raise RecordingError(f"{part}: not a recording of rosbag2: {why}")
-        return found
+        return types
 
     @contextmanager
     def _reading(self, part: Path) -> Iterator[tuple[sqlite3.Connection | None, list[tuple[int, str, str]]]]:
@@ -374,15 +374,15 @@ class CsvSource:
 
     def topics(self) -> dict[str, TopicType]:
         """Return the columns of each topic."""
-        found: dict[str, TopicType] = {}
+        types: dict[str, TopicType] = {}
         for part in self.parts:
             try:
                 with open_csv(part) as stream:
                     names = [name.strip() for name in next(csv_rows(stream), (0, []))[1]]
             except csv.Error as error:
                 raise RecordingError(f"{part}: {error}") from None
-            found[part.stem] = columns_of(part, names)
-        return found
+            types[part.stem] = columns_of(part, names)
+        return types
 
     def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf[Arrived] | None = None) -> Iterator[Arrived]:
         """Return an iterator over the rows of the wanted files in the order of their stamps.
@@ -465,4 +465,4 @@ def _log_time_ns(arrived: Arrived) -> int | None:
 
 def _row_time_ns(cell: str) -> int:
     """Return the time in a table cell [ns]. A number that is too large for seconds is read in a smaller unit."""
-    return next((found for unit in STAMP_UNITS if (found := time_ns(cell, unit)) is not None), NO_TIME)
+    return next((stamp_ns for unit in STAMP_UNITS if (stamp_ns := time_ns(cell, unit)) is not None), NO_TIME)

@@ -95,7 +95,7 @@ def unit_doubts(
     `values` contains the measured numbers of each quantity, by role and name, such as ("excitation", "fx"). A missing
     number is NaN.
     """
-    magnitudes = {key: _usual_magnitude(np.asarray(found, float)) for key, found in values.items()}
+    magnitudes = {key: _usual_magnitude(np.asarray(number, float)) for key, number in values.items()}
     load = [values["excitation", name] for name in ("fx", "fy", "m") if ("excitation", name) in values]
     spacing = _spacing(np.asarray(load_stamps_s, float), np.array(load, float).T) if load else []
     angle = _angle(np.asarray(values.get(("head_pose", "theta"), ()), float), scene)
@@ -105,7 +105,7 @@ def unit_doubts(
 def small_thresholds(thresholds: Sequence[float], scene: Scene) -> str:
     """Return a warning if the thresholds of the contact force [N] seem to be in kN, otherwise an empty string."""
     usual = _largest_force(scene)
-    small = [found for found in thresholds if 0.0 < found < _IDLE_SHARE * usual]
+    small = [threshold for threshold in thresholds if 0.0 < threshold < _IDLE_SHARE * usual]
     if not small:
         return ""
     return f"alarm_force: got {small[0]:g} N, expected some {usual:.2g} N as in the scene; is it in kN?"
@@ -118,7 +118,7 @@ def large_loads(values: Mapping[tuple[str, str], Array], units: Mapping[str, str
     more than one number in a hundred exceeds the limit. `values` contains measured numbers by role and name [SI units],
     and `units` the original unit of each component.
     """
-    found = {}
+    messages = {}
     for name, most in zip(("fx", "fy", "m"), excitation_limits(scene).largest, strict=True):
         key = "excitation", name
         largest = _usual_magnitude(values.get(key, np.zeros(0)))
@@ -130,8 +130,8 @@ def large_loads(values: Mapping[tuple[str, str], Array], units: Mapping[str, str
         likely = next((unit for unit, factor in reversed(known.items()) if raw * factor <= most), "")
         remedy = f"state the unit: --unit {name}={likely.replace(' ', '')}" if likely else "is it this machine's scene?"
         expected = f"at most {most:.2g} {si}, ten times the scene's"
-        found[name] = f"{name}: got {largest:.3g} {si}, expected {expected}: {remedy}"
-    return found
+        messages[name] = f"{name}: got {largest:.3g} {si}, expected {expected}: {remedy}"
+    return messages
 
 
 def check_units(messages: Iterable[Arrived], roles: Mapping[str, Role], scene: Scene, source: object) -> None:
@@ -191,9 +191,9 @@ def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
 
     Only the larger of the two forces is checked, because the smaller force may be small in any unit.
     """
-    found = [magnitudes[key] for key in (("excitation", "fx"), ("excitation", "fy")) if key in magnitudes]
+    loads = [magnitudes[key] for key in (("excitation", "fx"), ("excitation", "fy")) if key in magnitudes]
     usual = _largest_force(scene)
-    largest = max(found, default=0.0)
+    largest = max(loads, default=0.0)
     doubts = []
     for unit, size in _SMALLER.items():
         if _BROKEN_SHARE * size * usual < largest < _IDLE_SHARE * size * usual:
@@ -221,12 +221,12 @@ def _angle(theta: Array, scene: Scene) -> list[UnitDoubt]:
     swing = 0.5 * float(high - low)
     allowed = max(_BELIEVED_SWING_RAD, _BEYOND_CLEARANCE * largest_angle(scene))
     if largest > _LARGEST_ANGLE_RAD:
-        found, expected = f"{largest:.3g}", f"less than {_LARGEST_ANGLE_RAD:.3g} rad"
+        description, expected = f"{largest:.3g}", f"less than {_LARGEST_ANGLE_RAD:.3g} rad"
     elif swing > allowed:
-        found, expected = f"a swing of {swing:.3g} to either side", f"at most {allowed:.2g} rad in this clearance"
+        description, expected = f"a swing of {swing:.3g} to either side", f"at most {allowed:.2g} rad in this clearance"
     else:
         return []
-    return [UnitDoubt("head_pose", ("theta",), found, expected, "deg", True)]
+    return [UnitDoubt("head_pose", ("theta",), description, expected, "deg", True)]
 
 
 def _lengths(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[UnitDoubt]:
@@ -259,20 +259,22 @@ def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
     steps = np.diff(stamps_s)
     falling = float((steps < 0.0).mean())
     if falling > _FALLING:
-        found, expected = f"stamps of which {falling:.0%} fall", "times that rise"
+        description, expected = f"stamps of which {falling:.0%} fall", "times that rise"
         if falling > _REVERSED:
             return [
-                UnitDoubt("excitation", ("t",), found, expected, "rows from the newest to the oldest", False, _SORT)
+                UnitDoubt(
+                    "excitation", ("t",), description, expected, "rows from the newest to the oldest", False, _SORT
+                )
             ]
-        return [UnitDoubt("excitation", ("t",), found, expected, "another column", False, _NAME_TIME)]
+        return [UnitDoubt("excitation", ("t",), description, expected, "another column", False, _NAME_TIME)]
     if stamps_s.max() > EPOCH_S:
         return []
     spacing = float(np.median(np.abs(steps)))
     # the function `time_ns` has added a second to times that count from an unknown start
     low, high = (days + _START_S for days in _SHEET_DAYS)
     if low <= stamps_s[0] <= high and np.ptp(stamps_s) < 1.0 and spacing < _SHORTEST_SPACING_S:
-        found = f"{stamps_s[0] - _START_S:.6g} and stamps {spacing:.2g} s apart"
-        return [UnitDoubt("excitation", ("t",), found, "seconds", "days of a spreadsheet", False, _WRITE_SECONDS)]
+        description = f"{stamps_s[0] - _START_S:.6g} and stamps {spacing:.2g} s apart"
+        return [UnitDoubt("excitation", ("t",), description, "seconds", "days of a spreadsheet", False, _WRITE_SECONDS)]
     load = load[np.isfinite(load).all(axis=1)]
     span = np.ptp(load, axis=0) if len(load) >= _FEW else np.zeros(0)
     if spacing < _SLOW_S or not span.any():
@@ -280,6 +282,6 @@ def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
     change = np.median(np.abs(np.diff(load[:, span > 0.0], axis=0)), axis=0) / span[span > 0.0]
     if not float(change.max()) < _SMOOTH:
         return []
-    found = f"stamps {spacing:.4g} s apart"
+    description = f"stamps {spacing:.4g} s apart"
     likely = next((unit for unit, size in _TIMES.items() if spacing * size < _SLOW_S), "ns")
-    return [UnitDoubt("excitation", ("t",), found, "many samples in each period of such a smooth load", likely)]
+    return [UnitDoubt("excitation", ("t",), description, "many samples in each period of such a smooth load", likely)]

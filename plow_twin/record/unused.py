@@ -47,7 +47,9 @@ class InputCounts:
 
     def facts(self) -> dict[str, dict[str, int]]:
         """Return all counts except zeros."""
-        return {topic: {why: count for why, count in found.items() if count} for topic, found in self.counts.items()}
+        return {
+            topic: {why: count for why, count in reasons.items() if count} for topic, reasons in self.counts.items()
+        }
 
     def _count(self, topic: str, reason: str, count: int) -> None:
         if count:

@@ -191,8 +191,8 @@ class JournalWalk:
     def _whole(self, entries: Entries) -> None:
         stamps, wrench, begin = entries.stamp_ns, entries.wrench, 0
         acting = sorted(place for place, entry in entries.rest.items() if isinstance(entry, self._acting))
-        found = ((place, entry) for place, entry in entries.rest.items() if isinstance(entry, journal.Travel))
-        travels = deque(sorted(found, key=lambda item: item[0]))
+        numbered = ((place, entry) for place, entry in entries.rest.items() if isinstance(entry, journal.Travel))
+        travels = deque(sorted(numbered, key=lambda item: item[0]))
         for place in (*acting, len(entries)):
             samples = begin + np.flatnonzero(entries.sample[begin:place])
             while travels and travels[0][0] < place:

@@ -114,12 +114,15 @@ class _Transforms:
     def __call__(self, settings: Settings, stamp_ns: int, q: Array) -> None:
         from geometry_msgs.msg import TransformStamped
 
-        found = TransformStamped(child_frame_id=settings.child_frame_id)
-        found.header.frame_id = settings.frame_id
-        set_stamp(found.header, stamp_ns)
-        found.transform.translation = Vector3(x=float(q[0]), y=float(q[1]))
-        found.transform.rotation.z, found.transform.rotation.w = float(np.sin(q[2] / 2)), float(np.cos(q[2] / 2))
-        self.publisher.publish(self._message(transforms=[found]))
+        transform = TransformStamped(child_frame_id=settings.child_frame_id)
+        transform.header.frame_id = settings.frame_id
+        set_stamp(transform.header, stamp_ns)
+        transform.transform.translation = Vector3(x=float(q[0]), y=float(q[1]))
+        transform.transform.rotation.z, transform.transform.rotation.w = (
+            float(np.sin(q[2] / 2)),
+            float(np.cos(q[2] / 2)),
+        )
+        self.publisher.publish(self._message(transforms=[transform]))
 
 
 def placed(points: Array, q: Array) -> Array:
@@ -128,8 +131,8 @@ def placed(points: Array, q: Array) -> Array:
     `q` is x, y [m] and theta [rad] of the body.
     """
     c, s = np.cos(q[2]), np.sin(q[2])
-    found: Array = points @ np.array([[c, s], [-s, c]]) + q[:2]
-    return found
+    rotated: Array = points @ np.array([[c, s], [-s, c]]) + q[:2]
+    return rotated
 
 
 def _rectangle(half: Array) -> Array:

@@ -35,8 +35,8 @@ def deviations(covariance: Sequence[float]) -> tuple[float, ...]:
     NaN, so that the message is refused.
     """
     variances = [float(covariance[7 * axis]) for axis in (0, 1, 5)]
-    found = tuple(math.sqrt(variance) if variance >= 0.0 else math.nan for variance in variances)
-    return found if any(found) else ()
+    values = tuple(math.sqrt(variance) if variance >= 0.0 else math.nan for variance in variances)
+    return values if any(values) else ()
 
 
 def set_stamp(header: Header, stamp: int) -> None:

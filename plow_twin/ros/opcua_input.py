@@ -57,8 +57,8 @@ class OpcUaInput:
         """Return messages that have arrived, and whether more messages may be waiting."""
         with suppress(BlockingIOError):
             os.eventfd_read(self.fd)
-        found = self._bridge.poll(0.0)
-        return found, len(found) == BATCH
+        arrived = self._bridge.poll(0.0)
+        return arrived, len(arrived) == BATCH
 
     def receive(self, topic: str, batch: list[Arrived]) -> None:
         """Pass a batch of messages to the twin."""

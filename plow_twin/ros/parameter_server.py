@@ -72,8 +72,8 @@ class ParameterServer:
         self._unconfigured = unconfigured
         self._changed = changed
         self._refusals = refusals
-        found: dict[str, Any] = dict(node.get_parameters_by_prefix(""))
-        given = {name: parameter.value for name, parameter in found.items()}
+        declared: dict[str, Any] = dict(node.get_parameters_by_prefix(""))
+        given = {name: parameter.value for name, parameter in declared.items()}
         self.unknown = dict(parameters.unknown(given))
         for name, nearest in self.unknown.items():
             hint = f"; did you mean {nearest}?" if nearest else ""
@@ -89,9 +89,9 @@ class ParameterServer:
 
     def _before(self, asked: list[Parameter]) -> list[Parameter]:
         """Convert integers to doubles, and log all invalid values. rclpy reports only the first invalid value."""
-        found = parameters.problems({parameter.name: parameter.value for parameter in asked})
-        if found:
-            self._node.get_logger().warning(str(parameters.ParameterError(found, "parameters refused")))
+        problems = parameters.problems({parameter.name: parameter.value for parameter in asked})
+        if problems:
+            self._node.get_logger().warning(str(parameters.ParameterError(problems, "parameters refused")))
         return [_converted(parameter) for parameter in asked]
 
     def _check(self, asked: list[Parameter]) -> SetParametersResult:

@@ -47,8 +47,8 @@ def _quality(profile: Any) -> _Quality:
 def message_class(message_type: str) -> type:
     """Return the class of an installed message type."""
     package, folder, kind = message_type.split("/")
-    found: type = getattr(import_module(f"{package}.{folder}"), kind)
-    return found
+    cls: type = getattr(import_module(f"{package}.{folder}"), kind)
+    return cls
 
 
 class TopicRecorder:
@@ -229,20 +229,20 @@ def schema_of(message_type: str) -> str:
     """
     from ament_index_python.packages import get_package_share_directory
 
-    found: dict[str, str] = {}
+    definitions: dict[str, str] = {}
     waiting = [message_type]
     try:
         while waiting:
             name = waiting.pop(0)
-            if name in found:
+            if name in definitions:
                 continue
             package, _, kind = name.split("/")
             text = (Path(get_package_share_directory(package)) / "msg" / f"{kind}.msg").read_text(encoding="utf-8")
-            found[name] = text
+            definitions[name] = text
             waiting += _used(text, package)
     except (LookupError, OSError):
         return schema_text(message_type)
-    first, *others = found.items()
+    first, *others = definitions.items()
     line = "=" * 80
     return first[1] + "".join(f"\n{line}\nMSG: {name.replace('/msg/', '/')}\n{text}" for name, text in others)
 

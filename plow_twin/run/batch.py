@@ -475,8 +475,8 @@ class _Worker(NamedTuple):
         return _Worker(parts, work, new_records(TOTALS, 1), Pace(state_type(terms), stiff, max_wall_s), None)
 
     def with_lanes(self, batch: TwinBatch, terms: Terms, members: range) -> _Worker:
-        found = LaneTwins(batch._params, terms, members, self.work, batch._max_steps)
-        return self._replace(lanes=found)
+        twins = LaneTwins(batch._params, terms, members, self.work, batch._max_steps)
+        return self._replace(lanes=twins)
 
     def advance(
         self, params: NDArray[np.void], states: NDArray[np.void], first: int, last: int, times: _Array, ends: _Array,
@@ -491,11 +491,11 @@ class _Worker(NamedTuple):
 
 def _kinds(compiled: Sequence[CompiledScene]) -> list[tuple[int, CompiledScene]]:
     """Return the index and the first scene of each combination of terms, implicit steps, kind of head and options."""
-    found: dict[object, tuple[int, CompiledScene]] = {}
+    kinds: dict[object, tuple[int, CompiledScene]] = {}
     for index, one in enumerate(compiled):
         key = one.parts.terms, one.parts.implicit is None, one.scene.head.carries, options(one.scene)
-        found.setdefault(key, (index, one))
-    return list(found.values())
+        kinds.setdefault(key, (index, one))
+    return list(kinds.values())
 
 
 def _merge(compiled: Sequence[CompiledScene]) -> Terms:

@@ -125,11 +125,11 @@ def sensitivity_parameters(scene: Scene) -> dict[str, float]:
         Values of the parameters in the scene. The keys are paths such as `contact.stiffness`.
     """
     contact, clearance = scene.contact, scene.clearance
-    found = {"contact.stiffness": contact.stiffness, "contact.damping": contact.damping or 0.0}
-    found |= {"contact.restitution": contact.restitution or 0.0}
-    found = {path: value for path, value in found.items() if value > 0.0}
-    found |= {f"clearance.{name}": getattr(clearance, name) for name in ("horizontal_m", "vertical_m")}
-    return found | {f"loads.{load.name}.scale": 1.0 for load in scene.loads}
+    values = {"contact.stiffness": contact.stiffness, "contact.damping": contact.damping or 0.0}
+    values |= {"contact.restitution": contact.restitution or 0.0}
+    values = {path: value for path, value in values.items() if value > 0.0}
+    values |= {f"clearance.{name}": getattr(clearance, name) for name in ("horizontal_m", "vertical_m")}
+    return values | {f"loads.{load.name}.scale": 1.0 for load in scene.loads}
 
 
 def _changed(scene: Scene, path: str, value: float) -> Scene:

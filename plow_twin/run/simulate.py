@@ -102,8 +102,8 @@ class Result:
         keys = ("max", "mean_in_contact", "impulse", "time_in_contact", "makes")
         factors = (1e-3, 1e-3, 1e-3, 1.0, 1.0)
         rows = [
-            [pair, *(f"{factor * found[key]:.4g}" for key, factor in zip(keys, factors, strict=True))]
-            for pair, found in self.statistics.items()
+            [pair, *(f"{factor * value[key]:.4g}" for key, factor in zip(keys, factors, strict=True))]
+            for pair, value in self.statistics.items()
         ]
         head = "".join(f"<th>{text}</th>" for text in heads)
         body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
@@ -200,10 +200,10 @@ def simulate(
     result = so_far(len(times), t_end)
     if not sensitivity or t_end == 0.0:
         return result
-    found = sensitivity_of(scene, t_end, tol, () if isinstance(sensitivity, bool) else tuple(sensitivity))
-    if not found.trusted:
-        warnings.warn(str(found), ToleranceWarning, stacklevel=2)
-    return replace(result, sensitivity=found)
+    value = sensitivity_of(scene, t_end, tol, () if isinstance(sensitivity, bool) else tuple(sensitivity))
+    if not value.trusted:
+        warnings.warn(str(value), ToleranceWarning, stacklevel=2)
+    return replace(result, sensitivity=value)
 
 
 class _StoppedError(Exception):

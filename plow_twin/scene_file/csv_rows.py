@@ -37,8 +37,8 @@ def open_csv(path: Path) -> IO[str]:
 
 def tables(folder: Path) -> list[Path]:
     """Return the CSV files of a folder, and the Parquet files without a CSV file of the same name, sorted by name."""
-    found = {path.stem: path for ending in (SUFFIX, ".csv") for path in folder.glob(f"*{ending}")}
-    return [found[name] for name in sorted(found)]
+    files = {path.stem: path for ending in (SUFFIX, ".csv") for path in folder.glob(f"*{ending}")}
+    return [files[name] for name in sorted(files)]
 
 
 #: First bytes of files that may be mistaken for CSV files.

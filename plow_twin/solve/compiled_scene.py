@@ -165,12 +165,12 @@ def compile_scenes(
     alike: dict[tuple[object, ...], list[int]] = {}
     for index, scene in enumerate(scenes):
         alike.setdefault(_kind(scene, sampled), []).append(index)
-    found: dict[int, CompiledScene] = {}
+    compiled: dict[int, CompiledScene] = {}
     for which in alike.values():
         own = [scenes[index] for index in which]
         rows = (params, which) if options(own[0]) == kind else None
-        found.update(zip(which, _compile_alike(own, tol, sampled, shared, rows), strict=True))
-    return params, [found[index] for index in range(len(scenes))]
+        compiled.update(zip(which, _compile_alike(own, tol, sampled, shared, rows), strict=True))
+    return params, [compiled[index] for index in range(len(scenes))]
 
 
 def _is_number(value: object) -> bool:
@@ -339,14 +339,14 @@ def options(scene: Scene) -> Options:
 
 
 def _of_options(scenes: Sequence[Scene]) -> dict[str, Any]:
-    first, found = scenes[0], dict[str, Any]()
+    first, options_of_scene = scenes[0], dict[str, Any]()
     there, contacts = options(first), [scene.contact for scene in scenes]
     if there.corners:
-        found["tumbles"] = float(geometry.tumbles(first))
+        options_of_scene["tumbles"] = float(geometry.tumbles(first))
     if there.rounded:
-        found["roll"] = geometry.roll(first)
+        options_of_scene["roll"] = geometry.roll(first)
     if there.falling:
-        found |= dict(
+        options_of_scene |= dict(
             damping_numbers=damping_numbers(first.contact.law),
             restitution=[contact.restitution for contact in contacts],
             fall=[contact.restitution_fall or 0.0 for contact in contacts],
@@ -354,7 +354,7 @@ def _of_options(scenes: Sequence[Scene]) -> dict[str, Any]:
             fall_mass=[contact.restitution_mass_power or 0.0 for contact in contacts],
             fall_along=[contact.restitution_fall_along_s_m or 0.0 for contact in contacts],
         )
-    return found
+    return options_of_scene
 
 
 @cache
@@ -608,13 +608,16 @@ def _overdamped(scenes: Sequence[Scene], terms: Terms, values: dict[str, Any], l
 
 
 def _rubbing(scene: Scene) -> dict[str, Any]:
-    wear, there, found = scene.wear, _wear_terms(scene.wear), dict[str, Any]()
+    wear, there, options_of_scene = scene.wear, _wear_terms(scene.wear), dict[str, Any]()
     if wear is not None and there.get("sliding"):
-        found["slip_rows"] = geometry.slip_rows(scene)
-        found["speed_per_wear"] = wear.pad_area_m2 / wear.coefficient_m2_n
+        options_of_scene["slip_rows"] = geometry.slip_rows(scene)
+        options_of_scene["speed_per_wear"] = wear.pad_area_m2 / wear.coefficient_m2_n
     if wear is not None and there.get("running_in") and wear.running_in_depth_m is not None:
-        found |= {"running_in": wear.running_in_ratio - 1.0, "running_in_rate": 1.0 / wear.running_in_depth_m}
-    return found
+        options_of_scene |= {
+            "running_in": wear.running_in_ratio - 1.0,
+            "running_in_rate": 1.0 / wear.running_in_depth_m,
+        }
+    return options_of_scene
 
 
 def _slip(scenes: Sequence[Scene]) -> dict[str, Any]:

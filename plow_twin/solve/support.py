@@ -102,5 +102,5 @@ def see_from_frame(w, order, sigma, y) -> None:
 def frame_at(series: NDArray[np.float64], order: int, sigma: float) -> NDArray[np.float64]:
     """Return displacement and rates of the frame at sigma, shape (6,), from its series."""
     lanes = np.asarray(np.polynomial.polynomial.polyval(sigma, series[: order + 1]))
-    found: NDArray[np.float64] = lanes[[FRAME_X, FRAME_Y, FRAME_THETA, FRAME_VX, FRAME_VY, SPIN]]
-    return found
+    row: NDArray[np.float64] = lanes[[FRAME_X, FRAME_Y, FRAME_THETA, FRAME_VX, FRAME_VY, SPIN]]
+    return row

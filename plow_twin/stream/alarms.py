@@ -51,12 +51,12 @@ class Thresholds:
 
     def level(self, value: float, before: Level) -> Level:
         """Return the level of an alarm with the new `value` and the previous level `before`, with hysteresis."""
-        found = Level.NONE
+        level_reached = Level.NONE
         for level, threshold in ((Level.WARN, self.warn), (Level.ERROR, self.error)):
             bound = threshold * HYSTERESIS if before >= level else threshold
             if threshold > 0.0 and value >= bound:
-                found = level
-        return found
+                level_reached = level
+        return level_reached
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Alarm:
 
     def __post_init__(self) -> None:
         thresholds = (self.thresholds.warn, self.thresholds.error)
-        self.lowest = min((found for found in thresholds if found > 0.0), default=math.inf)
+        self.lowest = min((threshold for threshold in thresholds if threshold > 0.0), default=math.inf)
 
     def feed(self, value: float, stamp_ns: int, duration_ns: int) -> bool:
         """Update the level for a new value, and return whether the level has changed.
@@ -154,7 +154,7 @@ class _Model:
             [pose for pose in self._waiting if pose[0] <= stamp_ns],
             [pose for pose in self._waiting if pose[0] > stamp_ns],
         )
-        return [found for pose in due if (found := self.residual(*pose)) is not None]
+        return [residual for pose in due if (residual := self.residual(*pose)) is not None]
 
     def residual(self, stamp_ns: int, x: float, y: float) -> tuple[int, float] | None:
         """Return the stamp [ns] of a measured pose and its distance [m] from the model.
@@ -192,7 +192,7 @@ class Alarms:
     """
 
     def __init__(self, thresholds: Mapping[str, Thresholds], duration_s: float = 0.0) -> None:
-        self.alarms = {name: Alarm(found) for name, found in thresholds.items()}
+        self.alarms = {name: Alarm(threshold) for name, threshold in thresholds.items()}
         self._duration_ns = round(duration_s * NS_PER_S)
         self._model = _Model() if "residual" in self.alarms else None
         self._clearances: deque[tuple[int, float]] = deque()
@@ -207,7 +207,7 @@ class Alarms:
         """
         if len(published.rows) > 1 and self._feed_quiet(published):
             return
-        slow = {int(found["row"]): found for found in published.slow} if len(published.slow) else {}
+        slow = {int(row["row"]): row for row in published.slow} if len(published.slow) else {}
         for number in range(len(published.rows)):
             if self._feed_row(published.rows, number, slow.get(number)):
                 yield number
@@ -261,8 +261,8 @@ class Alarms:
             if all(map(lt, stamps_ns, stamps_ns[1:])) and self._clearances and stamps_ns[0] > self._clearances[-1][0]:
                 self._clearances.extend(zip(stamps_ns, earlier, strict=False))
             else:
-                for found in zip(stamps_ns, earlier, strict=False):
-                    self._growth(*found)
+                for number in zip(stamps_ns, earlier, strict=False):
+                    self._growth(*number)
             rate = self._growth(stamps_ns[-1], clearance)
         # no level changes, so only the newest values matter
         newest = {name: float(found[-1].max()) for name, found in values.items() if len(found)}
@@ -273,11 +273,11 @@ class Alarms:
 
     def feed_pose(self, stamp_ns: int, pose: Sequence[float]) -> bool:
         """Compare a measured pose (x, y [m], theta [rad]) with the model; return whether a level has changed."""
-        found = None if self._model is None else self._model.residual(stamp_ns, pose[0], pose[1])
-        if found is None:
+        residual = None if self._model is None else self._model.residual(stamp_ns, pose[0], pose[1])
+        if residual is None:
             return False
         self.raised = []
-        return self._update("residual", found[1], found[0])
+        return self._update("residual", residual[1], residual[0])
 
     def _update(self, name: str, value: float, stamp_ns: int) -> bool:
         alarm = self.alarms.get(name)

@@ -161,8 +161,8 @@ class Driver:
                 continue
             end = int(ends[np.searchsorted(ends, place, side="right")])
             here = slice(place, end)
-            found = self.session.apply_series(stamps[here], wrench[here], each=self.every_sample)
-            if found is None:
+            applied = self.session.apply_series(stamps[here], wrench[here], each=self.every_sample)
+            if applied is None:
                 rows = zip(stamps[here].tolist(), map(tuple, wrench[here].tolist()), strict=True)
                 yield from self.samples(rows, now_ns)
             else:
@@ -173,7 +173,7 @@ class Driver:
                 self._advanced(now_ns)
                 self.failed.end()
                 self.state = StreamState.RUNNING
-                yield found
+                yield applied
             place = end
         if run or self.newest_ns is None:
             yield from self._use(run, now_ns)

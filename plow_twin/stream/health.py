@@ -78,8 +78,12 @@ class Periods:
 
     def recent(self) -> tuple[float, float, float]:
         """Return mean, standard deviation and maximum of the times [s] since the last call; NaN without iterations."""
-        found, self._recent = np.array(self._recent), []
-        return (float(found.mean()), float(found.std()), float(found.max())) if found.size else (math.nan,) * 3
+        quantiles, self._recent = np.array(self._recent), []
+        return (
+            (float(quantiles.mean()), float(quantiles.std()), float(quantiles.max()))
+            if quantiles.size
+            else (math.nan,) * 3
+        )
 
 
 class RealTimeFactor:

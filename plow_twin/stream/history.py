@@ -158,7 +158,10 @@ class History:
         if kept and not (self._kept_ns and stamp_ns <= self._kept_ns[-1]):
             self._keep(np.array([stamp_ns]))
         if resumed:
-            self._resumed_ns = [*(found for found in self._resumed_ns if found > self._kept_ns[0]), stamp_ns]
+            self._resumed_ns = [
+                *(resumed_ns for resumed_ns in self._resumed_ns if resumed_ns > self._kept_ns[0]),
+                stamp_ns,
+            ]
 
     def correction_limit_ns(self, stamp_ns: int) -> int:
         """Return the earliest stamp [ns] at which a correction may begin if it inserts a sample at `stamp_ns`.

@@ -55,13 +55,13 @@ def changed_twin(twin: Driven, scene: Scene, changes: Mapping[str, float]) -> Dr
     ArgumentError
         As for `changed_scene`, or if the changed scene needs new compiled code. A live twin has no time to compile.
     """
-    found = twin.like(changed_scene(scene, changes))
-    if found.signature != twin.signature:
+    twin_changed = twin.like(changed_scene(scene, changes))
+    if twin_changed.signature != twin.signature:
         raise ArgumentError(
             f"{', '.join(changes)}: got {', '.join(map(repr, changes.values()))}, which adds or removes a "
             "term of the equations, expected a change of numbers only: configure the node again"
         )
-    return found
+    return twin_changed
 
 
 def read_changes(text: str) -> dict[str, float]:

@@ -143,11 +143,11 @@ def clearances(scene: Scene, wear_depth: Array) -> Array:
     pads.
     """
     moved = 0.5 * (wear_depth[..., _ON_SIDES[:, 0]] + wear_depth[..., _ON_SIDES[:, 1]])
-    found = np.empty((*wear_depth.shape[:-1], len(_CLEARANCES)))
-    found[..., 0] = scene.clearance.horizontal_m + moved[..., 0] + moved[..., 1]
-    found[..., 1] = scene.clearance.vertical_m + moved[..., 2] + moved[..., 3]
-    found[..., 2:] = wear_depth
-    return found
+    clearance = np.empty((*wear_depth.shape[:-1], len(_CLEARANCES)))
+    clearance[..., 0] = scene.clearance.horizontal_m + moved[..., 0] + moved[..., 1]
+    clearance[..., 1] = scene.clearance.vertical_m + moved[..., 2] + moved[..., 3]
+    clearance[..., 2:] = wear_depth
+    return clearance
 
 
 def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
@@ -315,11 +315,11 @@ class Outputs:
         best, points = clearances(self.scene, wear_depth), prior_points(self.scene, wear_depth)
         low, high = (best if depth is wear_depth else clearances(self.scene, depth) for depth in points)
         count = len(_CLEARANCES)
-        found = np.empty((*wear_depth.shape[:-1], 3 * count))
-        found[..., :count], found[..., count::2], found[..., count + 1 :: 2] = best, low, high
+        clearance = np.empty((*wear_depth.shape[:-1], 3 * count))
+        clearance[..., :count], clearance[..., count::2], clearance[..., count + 1 :: 2] = best, low, high
         if self._shift is not None:
-            found += self._shift
-        return found
+            clearance += self._shift
+        return clearance
 
     def modelled(self, wear_depth: Array) -> Array:
         """Return the clearances of the model without a shift, shape (6,) [m], in the order of `set_shift`."""

@@ -291,13 +291,11 @@ class Session:
         digest_after = np.arange(first, count + 1, DIGEST_INTERVAL)
         taken = np.arange(count) if each else NONE
         try:
-            found = self._advance(
-                stamps, wrench, self._stock.new(count), taken, digest_after, undo=self.twin.snapshot()
-            )
+            rows = self._advance(stamps, wrench, self._stock.new(count), taken, digest_after, undo=self.twin.snapshot())
         except _UndoneError:
             return None
         self._advances += count
-        return Series(stamps, wrench, found.published, found.digests, digest_after)
+        return Series(stamps, wrench, rows.published, rows.digests, digest_after)
 
     @property
     def wear_depth(self) -> NDArray[np.float64]:
@@ -331,9 +329,9 @@ class Session:
                 f"stamp: got {stamps[0]} ns first, expected stamps after {self.stamp_ns} ns that do not decrease"
             )
         advance = self._advance_in_pieces if self.held or self._travels else self._advance
-        found = advance(stamps, wrench, rows, taken, digest_after)
+        applied = advance(stamps, wrench, rows, taken, digest_after)
         self._advances += len(stamps)
-        return found
+        return applied
 
     def _advance_in_pieces(
         self,
@@ -650,10 +648,10 @@ class Session:
 
         Raise `ArgumentError` if the changes, or a present or waiting travel speed in the changed scene, are impossible.
         """
-        found = changed_twin(self.twin, self._scene, changes)
+        twin = changed_twin(self.twin, self._scene, changes)
         for speed in (self.travel_speed_m_s, *(travel.speed_m_s for travel in self._travels)):
-            check_travel_speed(found.scene, speed)
-        return found
+            check_travel_speed(twin.scene, speed)
+        return twin
 
     def _carry(self, before: Driven) -> None:
         now = before.advance(before.time)

@@ -44,18 +44,18 @@ class Silences:
         self._newest_ns = int(reached[-1])
         intervals = np.diff(reached)
         moved = np.flatnonzero(intervals)
-        found, done = list[tuple[int, int, int]](), 0
+        silences, done = list[tuple[int, int, int]](), 0
         for place in np.flatnonzero(intervals[moved] > self.timeout_s * NS_PER_S).tolist():
             if place > done:
                 self._interval_ns = int(intervals[moved[place - 1]])
             end = int(moved[place])
             if self._is_silence(int(intervals[end])):
-                found.append((end, int(reached[end]), int(reached[end + 1])))
-                self._count(*found[-1][1:])
+                silences.append((end, int(reached[end]), int(reached[end + 1])))
+                self._count(*silences[-1][1:])
             done = place + 1
         if done < len(moved):
             self._interval_ns = int(intervals[moved[-1]])
-        return found
+        return silences
 
     def _is_silence(self, interval_ns: int) -> bool:
         before_ns = self._interval_ns

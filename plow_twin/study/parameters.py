@@ -98,8 +98,8 @@ def parameter_of(scene: Scene, path: str) -> Value | None:
         return -1.0 if next((x for x in vector if x != 0.0), 1.0) < 0.0 else 1.0
     name, index = _split(field_name)
     value = getattr(owner, name)
-    found = value if index is None else value[index]
-    return found if found is None or isinstance(found, str) else float(found)
+    number = value if index is None else value[index]
+    return number if number is None or isinstance(number, str) else float(number)
 
 
 def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:

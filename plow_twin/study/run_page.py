@@ -107,10 +107,10 @@ class _Log:
 def _estimate_row(end_ns: int, facts: dict[str, Any]) -> dict[str, str]:
     row = {"until": time_text(end_ns)}
     for name in ("horizontal", "vertical"):
-        found = facts[name]
-        low, high = 1e3 * found["p05_m"], 1e3 * found["p95_m"]
-        state = found["state"].replace("_", " ")
-        row[f"{name} [mm]"] = f"{1e3 * found['mean_m']:.2f} ({low:.2f} to {high:.2f}), {state}"
+        clearance_facts = facts[name]
+        low, high = 1e3 * clearance_facts["p05_m"], 1e3 * clearance_facts["p95_m"]
+        state = clearance_facts["state"].replace("_", " ")
+        row[f"{name} [mm]"] = f"{1e3 * clearance_facts['mean_m']:.2f} ({low:.2f} to {high:.2f}), {state}"
     reasons = "; ".join(facts["reasons"])
     row["trust"] = f"model {facts['model']}, sensor {facts['sensor']}" + (f": {reasons}" if reasons else "")
     return row
@@ -172,7 +172,7 @@ def _plots(reader: RunReader, curves: RunCurves) -> list[dict[str, Any]]:
     alarms = alarms_of(reader.header.parameters).alarms
     force, clearance = alarms["force"].thresholds, alarms["clearance"].thresholds
     directions = ("horizontal", "vertical")
-    found: list[dict[str, Any]] = [
+    charts: list[dict[str, Any]] = [
         {
             "title": "Largest force of each pad [kN]",
             "names": list(PAIR_NAMES),
@@ -195,7 +195,7 @@ def _plots(reader: RunReader, curves: RunCurves) -> list[dict[str, Any]]:
             "data": _columns(curves.clearance, [(column, int(column % 3 != 1)) for column in range(6)]),
         },
     ]
-    return [plot for plot in found if plot["data"][0]]
+    return [plot for plot in charts if plot["data"][0]]
 
 
 def _columns(rows: Envelope, chosen: list[tuple[int, int]]) -> list[list[float | None]]:

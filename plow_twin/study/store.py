@@ -101,10 +101,10 @@ class Store:
 
     def table(self) -> Table:
         """Return the whole table, or raise a `StudyError` if a chunk is missing."""
-        found = [self.read(index) for index in range(len(self.chunks))]
-        parts = [part for part in found if part is not None]
-        if len(parts) < len(found):
-            raise StudyError(f"{self.folder}: got {len(parts)} chunks, expected {len(found)}")
+        chunks = [self.read(index) for index in range(len(self.chunks))]
+        parts = [part for part in chunks if part is not None]
+        if len(parts) < len(chunks):
+            raise StudyError(f"{self.folder}: got {len(parts)} chunks, expected {len(chunks)}")
         whole = np.concatenate([table for table, _ in parts])
         builds = tuple(sorted({build for _, build in parts}))
         return Table(self.sweep, whole[:, 0].astype(np.int64), whole[:, 1:], builds)

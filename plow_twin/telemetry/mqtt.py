@@ -174,5 +174,5 @@ class MqttOut:
 
 def _payload(name: str, group: Group) -> bytes:
     unit = {"unit": UNITS[name]} if name in UNITS else {}
-    found = {"t": group.time_s or None, **unit, "held": group.held, "values": group.values}
-    return json.dumps(found, separators=(",", ":"), allow_nan=False).encode()
+    content = {"t": group.time_s or None, **unit, "held": group.held, "values": group.values}
+    return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()

@@ -143,7 +143,7 @@ class Sparkplug:
             asked = Payload.FromString(message.payload)
         except DecodeError:
             return
-        self._rebirth |= any(found.name == REBIRTH and found.boolean_value for found in asked.metrics)
+        self._rebirth |= any(metric.name == REBIRTH and metric.boolean_value for metric in asked.metrics)
 
 
 def _payload(groups: Mapping[str, Group], *, with_units: bool) -> Any:

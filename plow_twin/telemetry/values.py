@@ -64,14 +64,14 @@ class Newest:
             changed |= self._motion(motion)
         for name, (level, message, values) in update.get("parts", {}).items():
             changed |= _part(name, level, message, values)
-        found = {name: Group(self._time_s, values, self._held) for name, values in changed.items()}
-        self.groups |= found
-        return found
+        groups = {name: Group(self._time_s, values, self._held) for name, values in changed.items()}
+        self.groups |= groups
+        return groups
 
     def _motion(self, motion: Mapping[str, Any]) -> dict[str, dict[str, Value]]:
         names = [pad["name"] for pad in self.facts["pads"]]
         count, points = len(names), motion.get("points") or ()
-        found: dict[str, dict[str, Value]] = {
+        groups_of: dict[str, dict[str, Value]] = {
             "peaks": {
                 **dict(zip(names, motion["peak"], strict=True)),
                 **{
@@ -84,9 +84,9 @@ class Newest:
         clearance = motion.get("clearance")
         if clearance is not None:
             pads = {name.removeprefix("pad_"): value for name, value in clearance.items() if name.startswith("pad_")}
-            found["wear"] = pads
-            found["clearance"] = {name: value for name, value in clearance.items() if not name.startswith("pad_")}
-        return found
+            groups_of["wear"] = pads
+            groups_of["clearance"] = {name: value for name, value in clearance.items() if not name.startswith("pad_")}
+        return groups_of
 
 
 def _unknown(names: list[str]) -> dict[str, dict[str, Value]]:
@@ -117,11 +117,11 @@ def _part(name: str, level: int, message: str, values: Mapping[str, str]) -> dic
 
 
 def _alarms(level: int, message: str, values: Mapping[str, str]) -> dict[str, Value]:
-    found: dict[str, Value] = {"level": level, "message": message}
+    alarm: dict[str, Value] = {"level": level, "message": message}
     for name in _ALARMS:
         stamp = number_of(values.get(f"{name}_stamp_ns", ""))
-        found[name] = number_of(values.get(name, ""))
-        found |= {f"{name}_{key}": values.get(f"{name}_{key}", "") for key in _ALARM_TEXTS}
-        found |= {f"{name}_{key}": number_of(values.get(f"{name}_{key}", "")) for key in ("raised", "threshold")}
-        found[f"{name}_time"] = None if stamp is None else stamp * 1e-9
-    return found
+        alarm[name] = number_of(values.get(name, ""))
+        alarm |= {f"{name}_{key}": values.get(f"{name}_{key}", "") for key in _ALARM_TEXTS}
+        alarm |= {f"{name}_{key}": number_of(values.get(f"{name}_{key}", "")) for key in ("raised", "threshold")}
+        alarm[f"{name}_time"] = None if stamp is None else stamp * 1e-9
+    return alarm

@@ -194,19 +194,19 @@ class Drawing:
             self._axis.first_ns = int(stamps[np.flatnonzero(advance)[0]])
         before = (self.step, self._wrench)
         self._entries(entries, stamps, steps, advance)
-        found = rows_by_topic(batch.outputs, self._topics, self._templates)
+        by_topic = rows_by_topic(batch.outputs, self._topics, self._templates)
         bounds = np.maximum.accumulate(entries.sequence) if len(entries) else entries.sequence
 
         def places(rows: Rows) -> Indexes:
             return np.asarray(np.searchsorted(bounds, rows.sequence, side="right"), np.int64)
 
         steps_before = np.concatenate(([before[0]], steps))
-        for name, rows in found.items():
+        for name, rows in by_topic.items():
             self._rows(name, rows, np.maximum(steps_before[places(rows)], 0))
-        if "contact_peaks" in found:
-            self._along_face(entries, found["contact_peaks"], places(found["contact_peaks"]))
+        if "contact_peaks" in by_topic:
+            self._along_face(entries, by_topic["contact_peaks"], places(by_topic["contact_peaks"]))
         self.what_if.add(entries, stamps, steps)
-        contact, head = found.get("contact_forces"), found.get("head_state")
+        contact, head = by_topic.get("contact_forces"), by_topic.get("head_state")
         if contact is not None and head is not None:
             at, loads = places(head), np.concatenate((before[1][None], self._loads(entries, advance, before[1])))
             self._section(contact, head, steps_before[at], loads[np.searchsorted(np.flatnonzero(advance), at)])

@@ -122,10 +122,10 @@ class FaceChart:
 
 
 def _halved(one: dict[int, float]) -> dict[int, float]:
-    found: dict[int, float] = {}
+    halved: dict[int, float] = {}
     for piece, force in one.items():
-        found[piece // 2] = max(found.get(piece // 2, 0.0), force)
-    return found
+        halved[piece // 2] = max(halved.get(piece // 2, 0.0), force)
+    return halved
 
 
 def _round_up(value: float) -> float:

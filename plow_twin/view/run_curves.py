@@ -192,27 +192,27 @@ class RunCurves:
             return
         result, values = json.loads(self._estimate[1]), self._clearance.copy()
         for place, axis in enumerate(("horizontal", "vertical")):
-            found = result.get(axis, {})
-            if found.get("state") in _KNOWN_STATES:
-                values[3 * place : 3 * place + 3] = [1e3 * found[f"{point}_m"] for point in ("mean", "p05", "p95")]
+            facts = result.get(axis, {})
+            if facts.get("state") in _KNOWN_STATES:
+                values[3 * place : 3 * place + 3] = [1e3 * facts[f"{point}_m"] for point in ("mean", "p05", "p95")]
         self.clearance.add(self._seconds(np.array([self._newest_ns])), values[None])
 
-    def _messages(self, found: dict[str, Rows]) -> None:
-        if "contact_peaks" in found:
-            rows = found["contact_peaks"]
+    def _messages(self, rows_of_topic: dict[str, Rows]) -> None:
+        if "contact_peaks" in rows_of_topic:
+            rows = rows_of_topic["contact_peaks"]
             peaks = rows.numbers[:, 2 * PAIR_COUNT :] / 1e3
             self.force.add(self._seconds(rows.stamp_ns), peaks)
             self.peak = max(self.peak, float(peaks.max()))
-        if "clearance" in found:
-            rows = found["clearance"]
+        if "clearance" in rows_of_topic:
+            rows = rows_of_topic["clearance"]
             values = 1e3 * rows.numbers[:, _CLEARANCE_COLUMNS]
             self.clearance.add(self._seconds(rows.stamp_ns), values)
             self._clearance = values[-1]
             if self._estimate is not None and rows.sequence[-1] > self._estimate[0]:
                 # publications after an estimate already contain its clearances
                 self._estimate = None
-        if "contact_forces" in found and "head_state" in found:
-            for instant in _largest(found["contact_forces"], found["head_state"]):
+        if "contact_forces" in rows_of_topic and "head_state" in rows_of_topic:
+            for instant in _largest(rows_of_topic["contact_forces"], rows_of_topic["head_state"]):
                 if self.instant is None or instant.force.max() > self.instant.force.max():
                     self.instant = instant
 

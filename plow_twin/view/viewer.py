@@ -27,8 +27,8 @@ _START_S: Final = 60.0
 def viewer_program() -> str:
     """Return the path of the rerun program, or raise `RecordingError` if it is not installed."""
     # the end of the wrapper script `rerun` on PATH would not end its child process
-    found = find_spec("rerun_cli")
-    beside = Path(found.origin).with_name("rerun") if found is not None and found.origin is not None else None
+    spec = find_spec("rerun_cli")
+    beside = Path(spec.origin).with_name("rerun") if spec is not None and spec.origin is not None else None
     program = str(beside) if beside is not None and beside.exists() else shutil.which("rerun")
     if program is None:
         raise RecordingError("the program `rerun` is not installed: pip install 'plow_twin[view]'")

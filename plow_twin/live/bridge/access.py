@@ -79,9 +79,9 @@ def read_access(url: str, path: Path | None) -> Access:
     """
     if path is None:
         return Access(url, password=password(None, "OPCUA"))
-    given, found = read_yaml(path, "credentials", _CREDENTIALS["description"])
-    if problems := found or validate(given, _CREDENTIALS, "credentials"):
+    document, found = read_yaml(path, "credentials", _CREDENTIALS["description"])
+    if problems := found or validate(document, _CREDENTIALS, "credentials"):
         raise InputError(problems, str(path))
-    files: dict[str, Any] = {key: path.parent / given[key] for key in _FILES if key in given}
+    files: dict[str, Any] = {key: path.parent / document[key] for key in _FILES if key in document}
     secret = password(files.pop("password_file", None), "OPCUA")
-    return Access(url, given.get("user", ""), secret, plain=given.get("plain", False), **files)
+    return Access(url, document.get("user", ""), secret, plain=document.get("plain", False), **files)

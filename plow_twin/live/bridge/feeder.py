@@ -84,7 +84,7 @@ class Feeder:
         The start time is the first stamp after which the stamps do not jump back.
         """
         read = (role.read(arrived) for arrived in messages for _, role in self._by_topic.get(arrived.topic, ()))
-        stamps = (found[0] for found in read if found is not None)
+        stamps = (signal[0] for signal in read if signal is not None)
         back_ns = round(self._runtime.settings.jump_back * 1e9)
         first_ns = next(stamps, 0)
         goes_on = (first for first, second in pairwise(chain([first_ns], stamps)) if second >= first - back_ns)
@@ -126,14 +126,14 @@ class Feeder:
             return False
         if inputs.senders.followed != self._name:
             return False
-        found = table.read(role)
-        if found is None or not role.plausible(dict(zip(role.fields, found[1].T, strict=True))):
+        rows = table.read(role)
+        if rows is None or not role.plausible(dict(zip(role.fields, rows[1].T, strict=True))):
             return False
         for arrived in table if len(roles) > 1 else ():
             for name, other in roles:
                 if name in self._optional and not other.empty(arrived):
                     self._measured(name, other, arrived)
-        stamps, values = found
+        stamps, values = rows
         inputs.senders.count_arrival(self._name, self._number + 1, len(stamps))
         self._number += len(stamps)
         self._follow_times(stamps)
@@ -244,20 +244,20 @@ class Feeder:
         self._runtime.inputs.senders.alive([self._name])
 
     def _measured(self, name: str, role: Role, arrived: Arrived) -> None:
-        found, intake, inputs = role.read(arrived), self._optional[name], self._runtime.inputs
+        values, intake, inputs = role.read(arrived), self._optional[name], self._runtime.inputs
         inputs.arriving = (name, arrived.topic.encode())
-        if found is None:
+        if values is None:
             intake.refuse(Verdict.MALFORMED)
         elif arrived.retained and name != "travel":
             # a retained message is old: its speed is still valid, but its pose or gap is not
-            intake.refuse(Verdict.INACTIVE, found[0], tuple(found[1].values()))
-        elif not role.plausible(found[1]):
-            intake.refuse(Verdict.IMPLAUSIBLE, found[0], tuple(found[1].values()))
+            intake.refuse(Verdict.INACTIVE, values[0], tuple(values[1].values()))
+        elif not role.plausible(values[1]):
+            intake.refuse(Verdict.IMPLAUSIBLE, values[0], tuple(values[1].values()))
         elif name == "travel":
-            self._runtime.add_travel(found[0], found[1]["speed"])
+            self._runtime.add_travel(values[0], values[1]["speed"])
         elif name == "gaps":
-            gaps = {PAIR_NAMES.index(pair): gap for pair, gap in found[1].items() if not math.isnan(gap)}
-            self._runtime.add_gaps(found[0], gaps)
+            gaps = {PAIR_NAMES.index(pair): gap for pair, gap in values[1].items() if not math.isnan(gap)}
+            self._runtime.add_gaps(values[0], gaps)
         else:
-            x, y, theta = (found[1].get(name, math.nan) for name in ROLES["head_pose"])
-            self._runtime.add_pose(found[0], (x, y, theta))
+            x, y, theta = (values[1].get(name, math.nan) for name in ROLES["head_pose"])
+            self._runtime.add_pose(values[0], (x, y, theta))

@@ -64,12 +64,12 @@ class _Tail:
                     if grows and not line.endswith(b"\n") and len(line) < _BLOCK:
                         break
                     if len(line) == _BLOCK:
-                        found = f"a first line of more than {_BLOCK} bytes"
-                        raise ExcessError(f"{self.path}: got {found}, expected a header")
+                        content = f"a first line of more than {_BLOCK} bytes"
+                        raise ExcessError(f"{self.path}: got {content}, expected a header")
                     rows.read(line)
                     if len(rows.columns or ()) > MOST_COLUMNS:
-                        found = f"{len(rows.columns or ())} columns"
-                        raise ExcessError(f"{self.path}: got {found}, expected at most {MOST_COLUMNS} columns")
+                        content = f"{len(rows.columns or ())} columns"
+                        raise ExcessError(f"{self.path}: got {content}, expected at most {MOST_COLUMNS} columns")
         except FileNotFoundError:
             return None
         return rows.columns
@@ -116,11 +116,11 @@ class _Tail:
         if isinstance(self._file, ParquetLines):  # a Parquet file is never followed
             return False
         try:
-            found = self.path.stat()
+            status = self.path.stat()
         except FileNotFoundError:
             return False  # the file was renamed and may still grow until a new file has its path
         ours = os.fstat(self._file.fileno())
-        return (found.st_dev, found.st_ino) != (ours.st_dev, ours.st_ino) or self._is_anew()
+        return (status.st_dev, status.st_ino) != (ours.st_dev, ours.st_ino) or self._is_anew()
 
     @property
     def place(self) -> int:
@@ -169,9 +169,9 @@ class _Dated:
         return sorted(self._pattern.parent.glob(self._pattern.name), key=_numbered)
 
     def read(self) -> list[Arrived]:
-        found = [arrived for tail in self._tails for arrived in tail.read()]
-        if found or time.monotonic() < self._look_s:
-            return found
+        arrived_rows = [arrived for tail in self._tails for arrived in tail.read()]
+        if arrived_rows or time.monotonic() < self._look_s:
+            return arrived_rows
         self._look_s = time.monotonic() + _LOOK_FOR_FILES_S
         there = self.files()
         new = [file for file in there if file not in self._known]
@@ -185,7 +185,7 @@ class _Dated:
                 left += tail.lines.begun
                 tail.close()
             self._tails = [*self._tails[-1:], _Tail(file, self.topic, rows=rows, left=left)]
-        return self.read() if new else found
+        return self.read() if new else arrived_rows
 
     def close(self) -> None:
         for tail in self._tails:
@@ -228,14 +228,14 @@ class Files(Bridge):
 
     def topics(self) -> dict[str, TopicType]:
         """Return the columns of each topic. With `follow`, the method waits for the first line of each file."""
-        found: dict[str, TopicType] = {}
+        types: dict[str, TopicType] = {}
         for tail in self._tails:
             columns = tail.columns(grows=not self.ends)
             while columns is None and not self.ends:
                 time.sleep(_LOOK_FOR_FILES_S)
                 columns = tail.columns(grows=True)
-            found[tail.topic] = columns_of(str(tail.path), columns or ())
-        return found
+            types[tail.topic] = columns_of(str(tail.path), columns or ())
+        return types
 
     def awaited(self) -> list[Path]:
         """Return the files and patterns for which no complete line exists."""
@@ -261,10 +261,10 @@ class Files(Bridge):
             return messages
         give_up = time.monotonic() + timeout_s
         while True:
-            found = [arrived for tail in self._tails for arrived in tail.read()]
+            arrived_rows = [arrived for tail in self._tails for arrived in tail.read()]
             left_s = give_up - time.monotonic()
-            if found or left_s <= 0.0:
-                return found
+            if arrived_rows or left_s <= 0.0:
+                return arrived_rows
             time.sleep(min(_LOOK_S, left_s))
 
     @property
@@ -287,11 +287,11 @@ class Files(Bridge):
             while begin < len(lines):
                 end = begin + (BATCH if tail.rows.columns is not None else 1)
                 here, rows = lines[begin:end], tail.rows
-                found: Messages = Table(tail.topic, here, rows)
+                table: Messages = Table(tail.topic, here, rows)
                 if not rows.under_header:
-                    found = list(found)
-                if len(found):
-                    yield found
+                    table = list(table)
+                if len(table):
+                    yield table
                 begin = end
             if not data:
                 return

@@ -40,8 +40,8 @@ def use_tls(client: Any, ca: Path | str | None, certificate: Path | str | None, 
 
 def is_resumed(flags: Any) -> bool:
     """Return whether the broker has resumed the session. `flags` is the argument of the callback `on_connect`."""
-    found = flags["session present"] if isinstance(flags, dict) else flags.session_present
-    return bool(found)
+    session_present = flags["session present"] if isinstance(flags, dict) else flags.session_present
+    return bool(session_present)
 
 
 def refusal(reason: Any) -> str:

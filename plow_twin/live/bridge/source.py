@@ -94,13 +94,13 @@ class Lines:
     def add(self, data: bytes) -> list[bytes | None]:
         """Add bytes, and return the lines that are complete."""
         *whole, self._rest = (self._rest + data).split(b"\n")
-        found: list[bytes | None] = []
+        lines: list[bytes | None] = []
         for line in whole:
-            found.append(None if self._skipping or len(line) > LONGEST else line)
+            lines.append(None if self._skipping or len(line) > LONGEST else line)
             self._skipping = False
         if len(self._rest) > LONGEST:
             self._rest, self._skipping = b"", True
-        return found
+        return lines
 
     @property
     def begun(self) -> bool:

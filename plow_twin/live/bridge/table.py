@@ -51,11 +51,13 @@ class Table:
             return None
         numbers = [self._numbers(columns[names.index(column)]) for column in role.fields.values()]
         stamps = times_ns(columns[names.index(stamp)], role.stamp_unit)
-        found = [number for number in numbers if number is not None]
-        if stamps is None or len(found) < len(numbers):
+        numbers_found = [number for number in numbers if number is not None]
+        if stamps is None or len(numbers_found) < len(numbers):
             return None
         with np.errstate(all="ignore"):  # a number that overflows becomes infinite, and the intake drops the sample
-            values = np.stack([role.in_si(name, number) for name, number in zip(role.fields, found, strict=True)], 1)
+            values = np.stack(
+                [role.in_si(name, number) for name, number in zip(role.fields, numbers_found, strict=True)], 1
+            )
         return stamps + role.clock_offset_ns, values
 
     def _columns(self) -> list[tuple[bytes, ...]] | None:

@@ -174,14 +174,14 @@ def turn(out, first, second) -> None:
 @kernel()
 def _part(sums, lanes, lane) -> bool:
     """Set the pairs that separate from their walls within a lane's step to OFF, and return whether there are any."""
-    found = False
+    any_found = False
     for pair in range(PAIR_COUNT):
         if lanes.parted[pair, lane] < lanes.step[lane]:
             lanes.mode[pair, lane] = OFF
             lanes.counts[EVENTS, lane] += 1
             sums.logged += 1
-            found = True
-    return found
+            any_found = True
+    return any_found
 
 
 @kernel()

@@ -131,7 +131,7 @@ def _look_at_pairs(lanes):
 @kernel()
 def _release(lanes) -> None:
     """Set the pairs that are too shallow for a series of d^n to RELEASED."""
-    found = False
+    any_found = False
     for lane in range(WIDTH):
         if lanes.member[lane] < 0:
             continue
@@ -139,8 +139,8 @@ def _release(lanes) -> None:
             rests_on_power = lanes.taken[slot] & ~lanes.touching[slot]
             if rests_on_power >> lane & 1 and not lanes.depth[slot, 0, lane] > SHALLOW * lanes.release[lane]:
                 lanes.mode[lanes.slot[slot, lane], lane] = RELEASED
-                found = True
-    if found:
+                any_found = True
+    if any_found:
         note_modes(lanes)
 
 

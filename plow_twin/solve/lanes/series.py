@@ -429,17 +429,17 @@ def _multiply(lanes, slot, k, hysteretic):
     """
     depth, square, power, exponent = lanes.depth[slot], lanes.base[slot], lanes.power[slot], lanes.exponent
     set_row(square, k, _product(depth, depth, k))
-    found = exact_row(square, k)
+    result = exact_row(square, k)
     higher = below(exact_splat(2.5), exact_row(exponent, 0))
     if higher != 0:
         # d^3 is d^2 times d, and d^4 is the square of d^2
         fourth = below(exact_splat(3.5), exact_row(exponent, 0))
-        found = choose(higher, choose(fourth, _product(square, square, k), _product(square, depth, k)), found)
+        result = choose(higher, choose(fourth, _product(square, square, k), _product(square, depth, k)), result)
     damped = exact_splat(0.0)
     if hysteretic is not None:
         for j in range(k):
             damped = fused(exact_row(power, j), exact_row(lanes.rate[slot], k - j), damped)
-    return found, damped
+    return result, damped
 
 
 @kernel(inline="code")
@@ -473,22 +473,22 @@ def _raise(lanes, w, slot, k, hysteretic):
         _invert(lanes, slot, here, ~touching)
         # the powers of lanes without a pair in the slot remain zero
         return choose(lanes.taken[slot] & ~touching, _first_power(lanes, here), zero), zero
-    found = damped = zero
+    result = damped = zero
     for j in range(1, k):
         lower = exact_row(power, k - j)
         weight = weight + above
-        found = fused(lower, exact_row(base, j) * weight, found)
+        result = fused(lower, exact_row(base, j) * weight, result)
         if hysteretic is not None:
             damped = fused(lower, exact_row(rate, j), damped)
     first = exact_row(power, 0)
-    found = fused(first, here * (weight + above), found)
+    result = fused(first, here * (weight + above), result)
     damped = fused(first, exact_row(rate, k), damped)
-    found = found * (per * exact_row(lanes.per_base, slot))
+    result = result * (per * exact_row(lanes.per_base, slot))
     if touching != 0 and k <= 3:
-        found = choose(touching, zero, found)
+        result = choose(touching, zero, result)
         if k == 3:
-            found = choose(touching, _first_power(lanes, exact_row(base, 0)), found)
-    return found, damped
+            result = choose(touching, _first_power(lanes, exact_row(base, 0)), result)
+    return result, damped
 
 
 @kernel(inline="code")
@@ -514,14 +514,14 @@ def _first_power(lanes, value):
     """Return value^n of each lane for exponents that are not integers, or 0 for negative values."""
     zero, half = exact_splat(0.0), exact_splat(1.5)
     value = choose(below(zero, value), value, zero)
-    found = value * square_root(value)
+    result = value * square_root(value)
     others = below(exact_row(lanes.exponent, 0), half) | below(half, exact_row(lanes.exponent, 0))
     if others != 0:
         set_row(lanes.root, 0, value)
         for lane in range(WIDTH):
             lanes.root[lane] = lanes.root[lane] ** lanes.exponent[lane]
-        found = choose(others, exact_row(lanes.root, 0), found)
-    return found
+        result = choose(others, exact_row(lanes.root, 0), result)
+    return result
 
 
 @kernel(inline="code")

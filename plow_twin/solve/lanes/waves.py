@@ -47,20 +47,20 @@ _POWER = (
 def coarse_log2(value):
     """Return the binary logarithm of the positive number in each lane, with an error of 1.2e-4."""
     part = significand_of(value)
-    found = exact_splat(_LOGARITHM[0])
+    polynomial = exact_splat(_LOGARITHM[0])
     for i in range(1, 5):
-        found = fused(found, part, exact_splat(_LOGARITHM[i]))
-    return found + exponent_of(value)
+        polynomial = fused(polynomial, part, exact_splat(_LOGARITHM[i]))
+    return polynomial + exponent_of(value)
 
 
 @kernel(inline="code")
 def coarse_exp2(value):
     """Return 2 to the power of the number in each lane, with a relative error of 3.5e-6, for |number| <= 1e3."""
     whole = (value - 0.5 + _ROUNDS) - _ROUNDS
-    part, found = value - whole, exact_splat(_POWER[0])
+    part, polynomial = value - whole, exact_splat(_POWER[0])
     for i in range(1, 5):
-        found = fused(found, part, exact_splat(_POWER[i]))
-    return found * power_of_two(whole)
+        polynomial = fused(polynomial, part, exact_splat(_POWER[i]))
+    return polynomial * power_of_two(whole)
 
 
 @kernel()

@@ -199,15 +199,15 @@ class Analysis:
         """Counts of lost data. A signal counts as lost if all its stamps lie outside the time of the load."""
         counts = ((self.predictions[0].outside(signal), signal.rows) for signal in self.measured.signals.values())
         outside = sum(count for count, rows in counts if count == rows)
-        found = {"measured_implausible": self.measured.implausible, "measured_outside_the_load": outside}
-        return self.losses | {name: count for name, count in found.items() if count}
+        facts = {"measured_implausible": self.measured.implausible, "measured_outside_the_load": outside}
+        return self.losses | {name: count for name, count in facts.items() if count}
 
     def comparisons(self, prediction: Prediction) -> dict[str, Comparison]:
         """Compare each measured signal with the prediction of one scene."""
         stamps, columns = prediction.series()
         if not len(stamps):
             return {}
-        found = {}
+        compared = {}
         times = (stamps - stamps[0]) * 1e-9
         rising = np.concatenate(([True], np.diff(times) > 0.0))
         for name, column in columns.items():
@@ -217,8 +217,8 @@ class Analysis:
             (at, rows), ours = signal.series(), prediction.is_of_longest(signal)
             one = compare(times[rising], column[rising], (at[ours] - stamps[0]) * 1e-9, rows[ours, 0])
             if one is not None:
-                found[name] = one
-        return found
+                compared[name] = one
+        return compared
 
     def facts(self) -> dict[str, Any]:
         """Return the whole result for JSON. The first prediction is at the top level, and further predictions are under
@@ -260,7 +260,7 @@ class Analysis:
     def _confusion(self, prediction: Prediction) -> dict[str, dict[str, int]] | None:
         """Return for each pair how often contact was predicted and measured, or None without measured forces."""
         stamps, columns = prediction.series()
-        found = {}
+        counts = {}
         for name in PAIR_NAMES:
             key = f"force_{name}"
             if key not in self.measured.signals or not len(stamps):
@@ -272,13 +272,13 @@ class Analysis:
             place = np.minimum(np.searchsorted(stamps, at[inside]), len(stamps) - 1)
             predicted = columns[key][place] > 0.0
             measured = values[inside] > 0.01 * max(1.0, float(np.max(np.abs(values))))
-            found[name] = {
+            counts[name] = {
                 "both": int((predicted & measured).sum()),
                 "predicted_only": int((predicted & ~measured).sum()),
                 "measured_only": int((~predicted & measured).sum()),
                 "neither": int((~predicted & ~measured).sum()),
             }
-        return found or None
+        return counts or None
 
 
 def analyse(
@@ -338,11 +338,11 @@ def analyse(
     if reader is not None:
         if units:
             raise RecordingError(f"{path}: got units, expected no units: a run of plow_twin is in SI")
-        found = _walk_own(reader, path, mapping, predictions, on_progress, on_caught_up)
+        walked = _walk_own(reader, path, mapping, predictions, on_progress, on_caught_up)
     else:
-        found = _walk_other(path, mapping, units, predictions, out)
-    found.wall_s = time.perf_counter() - begin
-    return found
+        walked = _walk_other(path, mapping, units, predictions, out)
+    walked.wall_s = time.perf_counter() - begin
+    return walked
 
 
 def _walker(prediction: Prediction, session: Session, writer: Any = None) -> Walker:
@@ -440,9 +440,9 @@ def _walk_other(
     source = open_source(path)
     roles = with_units(read_map(mapping, source.topics()), units)
     if "excitation" not in roles:
-        found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(source.topics().items())) or "no topic"
+        topic_list = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(source.topics().items())) or "no topic"
         raise RecordingError(
-            f"{path}: excitation: got {found}, expected a topic with the load, or a mapping that names it"
+            f"{path}: excitation: got {topic_list}, expected a topic with the load, or a mapping that names it"
         )
     check_units(messages_of(open_source(path), roles), roles, predictions[0].scene, path)
     writer = _writer(out, predictions[0], roles) if out is not None else None

@@ -206,12 +206,12 @@ class LoadTotals:
         """Return the rainflow counts (ASTM E1049) of each pair's force: upper end [N] and count of each bin."""
         import rainflow
 
-        found = {}
+        by_pair = {}
         for pair, kept in enumerate(self._reversals):
             if kept.high > kept.low:
                 bins = rainflow.count_cycles(kept, binsize=(kept.high - kept.low) / CYCLE_BINS)
-                found[PAIR_NAMES[pair]] = [{"range_n": float(size), "count": float(count)} for size, count in bins]
-        return found
+                by_pair[PAIR_NAMES[pair]] = [{"range_n": float(size), "count": float(count)} for size, count in bins]
+        return by_pair
 
     def facts(self) -> dict[str, Any]:
         """Return all sums for JSON."""

@@ -52,10 +52,10 @@ def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
     RecordingError
         A folder has no recording.
     """
-    found: list[Path] = []
+    recordings: list[Path] = []
     for path in paths:
         if not path.is_dir() or _is_recording(path, results):
-            found.append(path)
+            recordings.append(path)
             continue
         inside = [
             item
@@ -68,8 +68,8 @@ def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
             inside = [path]
         if not inside:
             raise RecordingError(f"{path}: got a folder without recordings, expected some{packed(path)}")
-        found += inside
-    return found
+        recordings += inside
+    return recordings
 
 
 def counted_once(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:

@@ -132,8 +132,8 @@ def _lag(t: Array, predicted: Array, times: Array, values: Array) -> float | Non
     thin = max(1, len(times) // 50_000)
 
     def badness(lag_s: float) -> float:
-        found = _correlation(_at(times[::thin] - lag_s, t, predicted), values[::thin])
-        return 1.0 if found is None else -found
+        correlation = _correlation(_at(times[::thin] - lag_s, t, predicted), values[::thin])
+        return 1.0 if correlation is None else -correlation
 
     bounds = max(best - 1.5 * step, -LARGEST_LAG_S), min(best + 1.5 * step, LARGEST_LAG_S)
     near = minimize_scalar(badness, bounds=bounds, method="bounded")

@@ -107,11 +107,11 @@ class Task:
         """Return the files of an earlier analysis, beginning with `_INPUTS`."""
         if self.out is None or not self.out.is_dir():
             return []
-        found = sorted(path for path in self.out.iterdir() if path.name in _FILES or _TABLE.fullmatch(path.name))
+        old_files = sorted(path for path in self.out.iterdir() if path.name in _FILES or _TABLE.fullmatch(path.name))
         run = self.out / "run"
         if run.is_dir() and all(map(_is_ours, run.iterdir())):
-            found.append(run)
-        return sorted(found, key=lambda path: path.name != _INPUTS)
+            old_files.append(run)
+        return sorted(old_files, key=lambda path: path.name != _INPUTS)
 
     def _keep(self, old: Sequence[Path], inputs: Sequence[Path]) -> None:
         for path in inputs:
@@ -134,12 +134,12 @@ class Task:
         """Do the analysis, write its files and return its result, or raise a `PlowTwinError`."""
         self.clear()
         asked = self._asked()  # the files may change during the analysis
-        found = self.analyse(on_progress=on_progress)
-        found.left_out = self.left_out
+        analysis = self.analyse(on_progress=on_progress)
+        analysis.left_out = self.left_out
         if self.out is not None:
-            write_report(found, self.out)
+            write_report(analysis, self.out)
             write_whole(self.out / _INPUTS, json.dumps(asked, indent=1).encode(), sync=True)
-        return {**found.facts(), "lossy": found.lossy}
+        return {**analysis.facts(), "lossy": analysis.lossy}
 
     def _asked(self) -> dict[str, Any]:
         """Return the inputs that determine the result."""

@@ -160,8 +160,8 @@ def _screened(space: Space, objective: Objective, points: Array, keep: int) -> A
     values = np.zeros(0)
     for begin in range(0, len(points), batch):
         cut = np.inf if len(values) < keep else float(np.sort(values)[keep - 1])
-        found = _sums(objective.residuals(space.values_of(points[begin : begin + batch]), cut))
-        values = np.concatenate([values, found])
+        sums = _sums(objective.residuals(space.values_of(points[begin : begin + batch]), cut))
+        values = np.concatenate([values, sums])
     return values
 
 

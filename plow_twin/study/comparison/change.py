@@ -134,7 +134,7 @@ def changes(before: Drawn, after: Drawn) -> list[Change | None]:
     if fewest < FEWEST:
         return result
     mean = before.mean[:, known]
-    found = _tested(after.mean[:, known] - mean, mean, fewest)
+    effect = _tested(after.mean[:, known] - mean, mean, fewest)
     at_equal_load = None
     if not _apart(before, after):
         rest = _at_equal_load(before, after)[:, known]
@@ -143,7 +143,7 @@ def changes(before: Drawn, after: Drawn) -> list[Change | None]:
             at_equal_load = _tested(rest[left], mean[left], fewest)
     for place, cell in enumerate(known.tolist()):
         machine = (None,) * 4 if at_equal_load is None else (part[place].item() for part in at_equal_load)
-        result[cell] = Change(*(part[place].item() for part in found), *machine)
+        result[cell] = Change(*(part[place].item() for part in effect), *machine)
     return result
 
 

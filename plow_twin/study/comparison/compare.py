@@ -76,7 +76,8 @@ class Comparison:
 
 def _facts(changes: Mapping[str, Change | None]) -> dict[str, Any]:
     return {
-        name: None if found is None else {**vars(found), "verdict": found.verdict} for name, found in changes.items()
+        name: None if change_found is None else {**vars(change_found), "verdict": change_found.verdict}
+        for name, change_found in changes.items()
     }
 
 
@@ -184,15 +185,15 @@ def _rates_apart(runs: Sequence[tuple[str, Windows]]) -> list[str]:
     rates = {name: float(windows.rate_hz.mean()) for name, windows in runs if len(windows.rate_hz)}
     if not rates or min(rates.values()) >= FULL * max(rates.values()):
         return []
-    found = ", ".join(f"{name} {rate:.4g} Hz" for name, rate in rates.items())
-    return [f"the sample rates differ, and peaks, impacts and contact depend on them: {found}"]
+    text = ", ".join(f"{name} {rate:.4g} Hz" for name, rate in rates.items())
+    return [f"the sample rates differ, and peaks, impacts and contact depend on them: {text}"]
 
 
 def _scenes_apart(scenes: Mapping[str, tuple[str, str]]) -> list[str]:
     if len({contents for _, contents in scenes.values()}) < 2:
         return []
-    found = ", ".join(f"{run} {name or 'without a name'}" for run, (name, _) in scenes.items())
-    return [f"the runs have different scenes, so a change of the machine may be a change of its description: {found}"]
+    text = ", ".join(f"{run} {name or 'without a name'}" for run, (name, _) in scenes.items())
+    return [f"the runs have different scenes, so a change of the machine may be a change of its description: {text}"]
 
 
 @dataclass(frozen=True)

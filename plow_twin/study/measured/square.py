@@ -211,14 +211,14 @@ def _row_times(rows: Array, gravity: float) -> Array:
 def _fit_line(way: Array, values: Array, noise: float) -> tuple[Array, Array]:
     rows: Array = np.stack([np.ones_like(way), way], axis=1)
     weight: Array = np.ones_like(way)
-    found: Array = np.zeros(2)
+    coefficients: Array = np.zeros(2)
     for _ in range(6):
         solved = np.linalg.lstsq(rows * weight[:, None], values * weight, rcond=None)[0]
-        found = np.asarray(solved, dtype=np.float64)
-        weight = 1.0 / np.sqrt(1.0 + ((values - rows @ found) / (3.0 * noise)) ** 2)
+        coefficients = np.asarray(solved, dtype=np.float64)
+        weight = 1.0 / np.sqrt(1.0 + ((values - rows @ coefficients) / (3.0 * noise)) ** 2)
     spread = np.linalg.inv((rows * weight[:, None] ** 2).T @ rows)
     covariance = np.asarray(noise**2 * spread, dtype=np.float64)
-    return found, covariance
+    return coefficients, covariance
 
 
 def draw(
@@ -256,14 +256,14 @@ def ensemble(
     ahead = max(n_rows - given + 1, 1)
     states, blocks, touches = draw(flight, members, seed, block, scatter)
     tossed = marker.measured(toss(marker.state_of_block(states), ahead, blocks, touches)[:, :, :3])
-    found = np.empty((members, max(n_rows, given), 3))
-    found[:, given - 1 : given - 1 + ahead] = tossed
+    paths = np.empty((members, max(n_rows, given), 3))
+    paths[:, given - 1 : given - 1 + ahead] = tossed
     for j in range(3):
         way, fall = _free_flight(block, j, flight.times[:-1])
-        found[:, : given - 1, j] = states[:, j, None] + states[:, 3 + j, None] * way + fall
-    noise = np.random.default_rng([seed, 1]).standard_normal(found.shape)
-    found += noise * [scatter.place, scatter.place, scatter.angle]
-    return found[:, :n_rows]
+        paths[:, : given - 1, j] = states[:, j, None] + states[:, 3 + j, None] * way + fall
+    noise = np.random.default_rng([seed, 1]).standard_normal(paths.shape)
+    paths += noise * [scatter.place, scatter.place, scatter.angle]
+    return paths[:, :n_rows]
 
 
 def bands(first_flight: ArrayLike, n_rows: int) -> Array:

@@ -35,8 +35,8 @@ class Condition:
     @property
     def event_id(self) -> bytes:
         """Identifier of the newest event, with which a client acknowledges the event."""
-        found = self.events.event.EventId
-        return bytes(found.Value) if isinstance(found, ua.Variant) else b""
+        condition = self.events.event.EventId
+        return bytes(condition.Value) if isinstance(condition, ua.Variant) else b""
 
 
 class Conditions:

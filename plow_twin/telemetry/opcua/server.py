@@ -50,7 +50,7 @@ class OneUser(UserManager):
     ) -> User | None:
         """Return a user with read access, or None if the credentials are wrong."""
         given = zip((self._user, self._password), (username or "", password or ""), strict=True)
-        right = all([hmac.compare_digest(own.encode(), found.encode("utf-8", "replace")) for own, found in given])
+        right = all([hmac.compare_digest(own.encode(), value.encode("utf-8", "replace")) for own, value in given])
         return User(UserRole.User, username) if right or not self._user else None
 
 

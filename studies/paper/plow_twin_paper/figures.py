@@ -30,14 +30,14 @@ def draw_all(runs: PaperRuns, scene: str, folder: Path, on_progress: Callable[[f
     """Draw all figures into a folder as PNG. Return them in the order of the paper."""
     from plow_twin_paper.style import save
 
-    found = []
+    pictures = []
     plans = _plans(runs)
     for index, (name, heading, paper, here, draw) in enumerate(plans):
         path = folder / f"{name}.png"
         save(draw(), path, heading, scene)
-        found.append(Picture(path, heading, paper, here))
+        pictures.append(Picture(path, heading, paper, here))
         on_progress((index + 1) / len(plans))
-    return found
+    return pictures
 
 
 def _plans(runs: PaperRuns) -> list[tuple[str, str, str, str, Callable[[], Figure]]]:

@@ -54,9 +54,9 @@ def fig13(runs: PaperRuns) -> Figure:
             panels[column].plot(run.t[rows], 1e-3 * run.face_n[rows, column], color=FACE_STYLE[face][0])
             panels[column].set_ylabel(f"{face} [kN]")
         for level, mark in enumerate(FACE_MARKS):
-            found = longest_faces(runs, mark, since)
-            if found is not None:
-                _mark(panels, found, f"{mark.number}: {mark.sense}, {mark.faces} face{'s'[: mark.faces - 1]}", level)
+            faces = longest_faces(runs, mark, since)
+            if faces is not None:
+                _mark(panels, faces, f"{mark.number}: {mark.sense}, {mark.faces} face{'s'[: mark.faces - 1]}", level)
         panels[3].set_xlabel("time [s]")
         panels[3].set_xlim(since, end)
         panels[3].set_ylim(bottom=0.0)

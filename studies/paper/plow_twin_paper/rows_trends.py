@@ -97,21 +97,21 @@ def longest_faces(runs: PaperRuns, mark: FaceMark, since_s: float = 0.0) -> tupl
     assert len(set(faces)) == len(faces) == PAIR_COUNT // 2
     end = float(runs.faces.t[-1])
     timeline = paper_sets.holds(runs.scene, runs.case, mark.sense)
-    found = [
+    durations = [
         (hold.start_s, min(hold.end_s, end) - hold.start_s)
         for hold in timeline
         if len(hold.corners) == mark.faces and since_s <= hold.start_s < end
     ]
-    return max(found, key=lambda hold: hold[1], default=None)
+    return max(durations, key=lambda hold: hold[1], default=None)
 
 
 def _mark(runs: PaperRuns, mark: FaceMark) -> Row:
-    found = longest_faces(runs, mark)
-    text = "never" if found is None else f"longest {1e3 * found[1]:.1f} ms, at {found[0]:.2f} s"
+    faces = longest_faces(runs, mark)
+    text = "never" if faces is None else f"longest {1e3 * faces[1]:.1f} ms, at {faces[0]:.2f} s"
     many = "one inner face" if mark.faces == 1 else f"{('two', 'three')[mark.faces - 2]} inner faces"
     return Row(
         _FACES, f"section 5, Fig. 13, mark {mark.number}", f"{SENSE_NAMES[mark.sense]}: {many} in contact", "occurs",
-        text, Verdict.of(found is not None and found[1] >= SHORTEST_HOLD_S),
+        text, Verdict.of(faces is not None and faces[1] >= SHORTEST_HOLD_S),
         f"held for {1e3 * SHORTEST_HOLD_S:g} ms or more in the first 20 s", CHECK,
     )  # fmt: skip
 

@@ -58,17 +58,17 @@ def holds(scene: Scene, result: Result, sense: Sense) -> list[Hold]:
     """Return the sets of one direction of swing in order of time, without gaps, to the end of the run."""
     letters, chosen = letters_of_pairs(scene), of_sense(sense)
     carries = result.force[0] > 0.0  # a pair that penetrates at t = 0 is in contact without a contact event
-    found: list[Hold] = []
+    intervals: list[Hold] = []
     start, now = 0.0, _name(letters, carries & chosen)
     for event in result.events:
         carries[event["pair"]] = event["mode_to"] == _CARRIES
         name, time = _name(letters, carries & chosen), float(event["time"])
         if name != now:
             if time > start:
-                found.append(Hold(start, time, now))
+                intervals.append(Hold(start, time, now))
             start, now = time, name
-    found.append(Hold(start, float(result.t[-1]), now))
-    return found
+    intervals.append(Hold(start, float(result.t[-1]), now))
+    return intervals
 
 
 def _name(letters: Sequence[str], carries: NDArray[np.bool_]) -> str:
@@ -99,9 +99,9 @@ def at(timeline: Sequence[Hold], time_s: float) -> str:
 
 def nearest(timeline: Sequence[Hold], time_s: float, corners: str) -> tuple[float, Hold] | None:
     """Return the nearest hold of a set to a time, and its distance [s] from this time; earlier holds are negative."""
-    found = [hold for hold in timeline if hold.corners == corners]
-    if not found:
+    matching = [hold for hold in timeline if hold.corners == corners]
+    if not matching:
         return None
-    distance = [min(max(time_s, hold.start_s), hold.end_s) - time_s for hold in found]
+    distance = [min(max(time_s, hold.start_s), hold.end_s) - time_s for hold in matching]
     best = int(np.argmin(np.abs(distance)))
-    return distance[best], found[best]
+    return distance[best], matching[best]

@@ -295,14 +295,14 @@ class OpcUa(Bridge):
     async def _read_history(self, ends_ns: Mapping[int, int]) -> None:
         """Read the history until each node has reached its stamp in `ends_ns`."""
         end_ns = max(ends_ns.values(), default=time.time_ns())
-        reached_ns, found = 0, 0
+        reached_ns, count = 0, 0
         give_up = time.monotonic() + _HISTORY_LAG_S
         while any(self._newest_ns(number) < end for number, end in ends_ns.items()):
             newest_ns = max(self._newest_ns(number) for number in range(len(self._nodes)))
             reached_ns = max(reached_ns, newest_ns - _OVERLAP_NS)
             piece_ns = min(reached_ns + _PIECE_NS, end_ns)
             new = await self._take_piece(reached_ns, piece_ns)
-            found += new
+            count += new
             if piece_ns < end_ns:
                 reached_ns = piece_ns
             elif new:
@@ -311,7 +311,7 @@ class OpcUa(Bridge):
                 break
             else:
                 await asyncio.sleep(0.2)
-        if not found and any(self._newest_ns(number) < end for number, end in ends_ns.items()):
+        if not count and any(self._newest_ns(number) < end for number, end in ends_ns.items()):
             self._no_history = "the history of the server is empty"
 
     async def _take_piece(self, begin_ns: int, end_ns: int) -> int:

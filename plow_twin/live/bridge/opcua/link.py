@@ -55,10 +55,10 @@ class Revised:
     def complaint(self, sampling_ms: float) -> str:
         """Return a text about requests that the server does not grant, or an empty string if it grants all requests."""
         slow = self.sampling_ms > max(1.01 * sampling_ms, self.publishing_ms if sampling_ms == 0.0 else 0.0)
-        found = [f"samples every {self.sampling_ms:g} ms, requested every {sampling_ms:g} ms"] * slow
+        revised = [f"samples every {self.sampling_ms:g} ms, requested every {sampling_ms:g} ms"] * slow
         needed = self.publishing_ms / sampling_ms if sampling_ms else 1.0
-        found += [f"queues {self.queue} values, but {needed:.0f} arrive between two messages"] * (self.queue < needed)
-        return f"the server {'; '.join(found)}" if found else ""
+        revised += [f"queues {self.queue} values, but {needed:.0f} arrive between two messages"] * (self.queue < needed)
+        return f"the server {'; '.join(revised)}" if revised else ""
 
 
 class Link:
@@ -157,7 +157,7 @@ class Link:
             NumValuesPerNode=0,
             ReturnBounds=False,
         )
-        found: list[tuple[int, Any]] = []
+        values_read: list[tuple[int, Any]] = []
         reached = [details.StartTime] * len(self._nodes)
         wanted = [(number, ua.HistoryReadValueId(NodeId=node)) for number, node in enumerate(self._nodes)]
         while wanted:
@@ -167,17 +167,17 @@ class Link:
             for (number, read), result in zip(wanted, results, strict=True):
                 result.StatusCode.check()
                 values = getattr(result.HistoryData, "DataValues", None) or []
-                found += [(number, value) for value in values]
+                values_read += [(number, value) for value in values]
                 if result.ContinuationPoint:
                     newest = values[-1].SourceTimestamp or values[-1].ServerTimestamp if values else None
-                    if newest is None or newest <= reached[number] or len(found) > _MOST_HISTORY:
+                    if newest is None or newest <= reached[number] or len(values_read) > _MOST_HISTORY:
                         raise UaError("history: got an endless answer")
                     reached[number] = newest
                     more.append(
                         (number, ua.HistoryReadValueId(read.NodeId, ContinuationPoint=result.ContinuationPoint))
                     )
             wanted = more
-        return found
+        return values_read
 
     async def _subscribe(self) -> Revised:
         asked = ua.CreateSubscriptionParameters(

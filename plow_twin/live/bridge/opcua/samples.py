@@ -62,16 +62,16 @@ class Samples:
 
         A sample is a stamp [ns] and the values of all nodes.
         """
-        found = []
+        samples = []
         while self._stamps_ns and self._is_due(self._stamps_ns[0], now_s):
             stamp_ns = self._stamps_ns.pop(0)
             late = stamp_ns <= self._released_ns
             values = self._waiting.pop(stamp_ns)[1] if late else self._with_held(stamp_ns)
             if len(values) == len(self.newest_ns):
-                found.append((stamp_ns, values))
+                samples.append((stamp_ns, values))
             else:  # an incomplete sample at the start is not a loss
                 self._incomplete += late
-        return found + self._take_strays(now_s)
+        return samples + self._take_strays(now_s)
 
     def _take_strays(self, now_s: float) -> list[tuple[int, dict[str, Value]]]:
         due = sorted(
@@ -79,17 +79,17 @@ class Samples:
             for stamp_ns, (arrived_s, values) in self._strays.items()
             if len(values) == len(self.newest_ns) or now_s - arrived_s > self._wait_s
         )
-        found = []
+        samples = []
         for stamp_ns in due:
             values = self._held | self._strays.pop(stamp_ns)[1]
             if len(values) == len(self.newest_ns):
-                found.append((stamp_ns, values))
-        return found
+                samples.append((stamp_ns, values))
+        return samples
 
     def take_incomplete(self) -> int:
         """Return the number of late samples that were dropped since the last call."""
-        found, self._incomplete = self._incomplete, 0
-        return found
+        sample, self._incomplete = self._incomplete, 0
+        return sample
 
     def _is_due(self, stamp_ns: int, now_s: float) -> bool:
         arrived_s, values = self._waiting[stamp_ns]

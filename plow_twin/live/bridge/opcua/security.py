@@ -119,7 +119,7 @@ def _hosts(certificate: x509.Certificate) -> list[str]:
     names = _names(certificate)
     if names is None:
         return []
-    addresses = [str(found) for found in names.get_values_for_type(x509.IPAddress)]
+    addresses = [str(name) for name in names.get_values_for_type(x509.IPAddress)]
     return [*names.get_values_for_type(x509.DNSName), *addresses]
 
 
