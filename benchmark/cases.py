@@ -195,5 +195,5 @@ def machine_name() -> str:
         pass
     name = facts.get("model name", "unknown cpu")
     # virtual machines often hide the model number of the CPU
-    known = name if re.search(r"\d", name) else f"{name} f{facts.get('cpu family', 0)}m{facts.get('model', 0)}"
-    return re.sub(r"[^a-z0-9]+", "_", f"{known} {os.cpu_count()}core".lower()).strip("_")
+    model = name if re.search(r"\d", name) else f"{name} f{facts.get('cpu family', 0)}m{facts.get('model', 0)}"
+    return re.sub(r"[^a-z0-9]+", "_", f"{model} {os.cpu_count()}core".lower()).strip("_")

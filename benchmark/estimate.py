@@ -73,21 +73,23 @@ def summary(name: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     out["as_expected"] = np.mean([(row["model"], row["sensor"]) == (expected.model, expected.sensor) for row in rows])
     out["withdrawn"] = np.mean([row["h_state"] == State.WITHDRAWN.value for row in rows])
     for axis in ("h", "v"):
-        known = [row for row in rows if row[f"{axis}_state"] == State.ESTIMATED.value]
-        errors = np.array([row[f"{axis}_error_m"] for row in known])
-        out[f"{axis}_rmse_mm"] = 1e3 * float(np.sqrt(np.mean(errors**2))) if len(known) else float("nan")
-        out[f"{axis}_coverage"] = float(np.mean([row[f"{axis}_inside"] for row in known])) if known else float("nan")
-        widths = [2.0 * NORMAL_P95 * row[f"{axis}_sd_m"] for row in known]
-        out[f"{axis}_width_mm"] = 1e3 * float(np.median(widths)) if known else float("nan")
+        estimated = [row for row in rows if row[f"{axis}_state"] == State.ESTIMATED.value]
+        errors = np.array([row[f"{axis}_error_m"] for row in estimated])
+        out[f"{axis}_rmse_mm"] = 1e3 * float(np.sqrt(np.mean(errors**2))) if len(estimated) else float("nan")
+        out[f"{axis}_coverage"] = (
+            float(np.mean([row[f"{axis}_inside"] for row in estimated])) if estimated else float("nan")
+        )
+        widths = [2.0 * NORMAL_P95 * row[f"{axis}_sd_m"] for row in estimated]
+        out[f"{axis}_width_mm"] = 1e3 * float(np.median(widths)) if estimated else float("nan")
         simple = np.array([row[f"{axis}_range_error_m"] for row in rows])
         out[f"{axis}_range_rmse_mm"] = 1e3 * float(np.sqrt(np.mean(simple**2)))
-    known = [row for row in rows if row["h_state"] == State.ESTIMATED.value and "stiffness_mean" in row]
-    ratios = np.array([row["stiffness_mean"] / row["stiffness"] for row in known])
-    out["k_rmse"] = float(np.sqrt(np.mean((ratios - 1.0) ** 2))) if known else float("nan")
-    inside = [row["stiffness_p05"] <= row["stiffness"] <= row["stiffness_p95"] for row in known]
-    out["k_coverage"] = float(np.mean(inside)) if known else float("nan")
-    widths = [(row["stiffness_p95"] - row["stiffness_p05"]) / row["stiffness"] for row in known]
-    out["k_width"] = float(np.median(widths)) if known else float("nan")
+    estimated = [row for row in rows if row["h_state"] == State.ESTIMATED.value and "stiffness_mean" in row]
+    ratios = np.array([row["stiffness_mean"] / row["stiffness"] for row in estimated])
+    out["k_rmse"] = float(np.sqrt(np.mean((ratios - 1.0) ** 2))) if estimated else float("nan")
+    inside = [row["stiffness_p05"] <= row["stiffness"] <= row["stiffness_p95"] for row in estimated]
+    out["k_coverage"] = float(np.mean(inside)) if estimated else float("nan")
+    widths = [(row["stiffness_p95"] - row["stiffness_p05"]) / row["stiffness"] for row in estimated]
+    out["k_width"] = float(np.median(widths)) if estimated else float("nan")
     out["cpu_s"] = float(np.mean([row["cpu_s"] for row in rows]))
     out["cpu_s_most"] = float(np.max([row["cpu_s"] for row in rows]))
     return out
@@ -151,8 +153,8 @@ def main(groups: tuple[str, ...], truths: int, seed: int, periods: float | None,
     # the groups alternate, so that a run that is stopped early has groups of equal size
     cases = ((name, number) for number in seeds for name in names)
     rows = completed(out, ("group", "seed"), cases, partial(run_one, periods=periods))
-    asked = [row for row in rows if row["seed"] in seeds and "not_drawn" not in row]
-    click.echo(as_markdown([summary(name, [row for row in asked if row["group"] == name]) for name in names]))
+    chosen_rows = [row for row in rows if row["seed"] in seeds and "not_drawn" not in row]
+    click.echo(as_markdown([summary(name, [row for row in chosen_rows if row["group"] == name]) for name in names]))
 
 
 if __name__ == "__main__":

@@ -45,9 +45,9 @@ def shares(truth: Truth, load: Load, members: int) -> list[float]:
         if window is None or window.end_ns - window.start_ns < 0.9e9 * WINDOW_S:
             continue
         begin = time.process_time()
-        told = answer(truth.nominal, window, guess, Requests(members, INTERVAL_S))
+        reply = answer(truth.nominal, window, guess, Requests(members, INTERVAL_S))
         found.append((time.process_time() - begin) / INTERVAL_S)
-        guess = told.following
+        guess = reply.following
     return found
 
 

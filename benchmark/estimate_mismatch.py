@@ -216,7 +216,7 @@ def _draw(kind: Kind, rng: np.random.Generator) -> Mismatch:
     nominal = load_scene(ROOT / "config" / "paper.yaml")
     end = kind.periods * PERIOD
     fine = np.arange(0.0, end + _FINE, _FINE)
-    believed = _believed(kind, nominal, rng, fine)
+    nominal_load = _believed(kind, nominal, rng, fine)
     if kind.shape == "vertical":
         nominal = replace(nominal, gravity=replace(nominal.gravity, arm_m=0.0))
     scene = _true_scene(kind, nominal, rng)
@@ -228,10 +228,10 @@ def _draw(kind: Kind, rng: np.random.Generator) -> Mismatch:
         kind.spring,
         **_further(kind, rng),
     )
-    wrench = _true_load(kind, rng, fine, believed)
+    wrench = _true_load(kind, rng, fine, nominal_load)
     t = np.arange(0.0, end, 1.0 / kind.rate_hz)
     poses, _ = Poses.of(*_measured(kind, rng, t, fine, poses_of(scene, machine, fine, wrench, fine)))
-    load, _ = Load.of(*_telemetry(kind, fine, (not kind.load_missing) * believed))
+    load, _ = Load.of(*_telemetry(kind, fine, (not kind.load_missing) * nominal_load))
     return Mismatch(scene, nominal, load, poses)
 
 
@@ -301,10 +301,10 @@ def _by_wall(rng: np.random.Generator) -> Array:
     return np.asarray(signs[wall], np.float64)
 
 
-def _true_load(kind: Kind, rng: np.random.Generator, t: Array, believed: Array) -> Array:
-    size = np.ptp(believed, axis=0) / 2.0
+def _true_load(kind: Kind, rng: np.random.Generator, t: Array, nominal_load: Array) -> Array:
+    size = np.ptp(nominal_load, axis=0) / 2.0
     slow = _correlated(rng, t)
-    wrench = believed * (1.0 + kind.gain * rng.standard_normal(3)) + kind.correlated * size * slow
+    wrench = nominal_load * (1.0 + kind.gain * rng.standard_normal(3)) + kind.correlated * size * slow
     phase = rng.uniform(0.0, 2.0 * np.pi, 3)
     wrench = wrench + kind.harmonic * size * np.sin(3.0 * 2.0 * np.pi / PERIOD * t[:, None] + phase)
     return np.asarray(wrench + kind.constant * size * rng.choice([-1.0, 1.0], 3))
@@ -352,18 +352,18 @@ def _measured(kind: Kind, rng: np.random.Generator, t: Array, fine: Array, motio
     return t * (1.0 + kind.clock), q
 
 
-def _telemetry(kind: Kind, fine: Array, believed: Array) -> tuple[Array, Array]:
+def _telemetry(kind: Kind, fine: Array, nominal_load: Array) -> tuple[Array, Array]:
     if kind.load_steps:
-        step = kind.load_steps * np.ptp(believed, axis=0)
-        believed = np.round(believed / step) * step
+        step = kind.load_steps * np.ptp(nominal_load, axis=0)
+        nominal_load = np.round(nominal_load / step) * step
     if not kind.averaged_s:
         knots = np.arange(0.0, fine[-1] + kind.sampled_s, kind.sampled_s)
-        return knots + kind.late_s, np.stack([np.interp(knots, fine, column) for column in believed.T], axis=1)
+        return knots + kind.late_s, np.stack([np.interp(knots, fine, column) for column in nominal_load.T], axis=1)
     rows = round(kind.averaged_s / _FINE)
     count = len(fine) // rows
     # the stamp of an average is the middle of its interval
     middle = fine[: count * rows].reshape(count, rows).mean(axis=1)
-    return middle, believed[: count * rows].reshape(count, rows, 3).mean(axis=1)
+    return middle, nominal_load[: count * rows].reshape(count, rows, 3).mean(axis=1)
 
 
 def run_one(name: str, seed: int) -> dict[str, Any]:
@@ -395,18 +395,18 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
     both = [
         {key: row[f"{axis}_{key}"] for key in ("error_m", "sd_m", "inside", "state")} for row in rows for axis in "hv"
     ]
-    known = [one for one in both if one["state"] in PUBLISHED]
-    errors, all_errors = (np.array([one["error_m"] for one in some]) for some in (known, both))
-    deviations = np.array([one["sd_m"] for one in known])
-    useful = sum(2.0 * NORMAL_P95 * one["sd_m"] < USEFUL_M for one in known)
+    published = [one for one in both if one["state"] in PUBLISHED]
+    errors, all_errors = (np.array([one["error_m"] for one in some]) for some in (published, both))
+    deviations = np.array([one["sd_m"] for one in published])
+    useful = sum(2.0 * NORMAL_P95 * one["sd_m"] < USEFUL_M for one in published)
     return {
         "clearances": len(both),
-        "published": len(known) / len(both),
+        "published": len(published) / len(both),
         "useful": useful / len(both),
-        "rmse_mm": 1e3 * float(np.sqrt(np.mean(errors**2))) if known else np.nan,
-        "coverage": float(np.mean([one["inside"] for one in known])) if known else np.nan,
-        "width_mm": 1e3 * 2.0 * NORMAL_P95 * float(np.median(deviations)) if known else np.nan,
-        "far_off": float(np.mean(np.abs(errors) > 3.0 * deviations)) if known else 0.0,
+        "rmse_mm": 1e3 * float(np.sqrt(np.mean(errors**2))) if published else np.nan,
+        "coverage": float(np.mean([one["inside"] for one in published])) if published else np.nan,
+        "width_mm": 1e3 * 2.0 * NORMAL_P95 * float(np.median(deviations)) if published else np.nan,
+        "far_off": float(np.mean(np.abs(errors) > 3.0 * deviations)) if published else 0.0,
         "all_rmse_mm": 1e3 * float(np.sqrt(np.mean(all_errors**2))),
         "withdrawn": float(np.mean([one["state"] == State.WITHDRAWN.value for one in both])),
         "cpu_s": float(np.mean([row["cpu_s"] for row in rows])),
@@ -436,9 +436,9 @@ def main(kinds: tuple[str, ...], truths: int, seed: int, out: Path) -> None:
     warm_up(load_scene(ROOT / "config" / "paper.yaml"))
     names, seeds = kinds or tuple(KINDS), range(seed, seed + truths)
     rows = completed(out, ("kind", "seed"), ((name, number) for number in seeds for name in names), run_one)
-    asked = [row for row in rows if row["seed"] in seeds and row["kind"] in names]
-    groups = {KINDS[name].title: summary([row for row in asked if row["kind"] == name]) for name in names}
-    click.echo(as_markdown(groups | {"all": summary(asked)}))
+    chosen_rows = [row for row in rows if row["seed"] in seeds and row["kind"] in names]
+    groups = {KINDS[name].title: summary([row for row in chosen_rows if row["kind"] == name]) for name in names}
+    click.echo(as_markdown(groups | {"all": summary(chosen_rows)}))
 
 
 if __name__ == "__main__":

@@ -48,9 +48,9 @@ _LEVEL = 0.95
 
 def truths(group: str, seeds: Sequence[tuple[int, int]]) -> list[dict[str, Any]]:
     """Return the newest row of each truth in a group."""
-    wanted = {seed for first, count in seeds for seed in range(first, first + count)}
+    chosen_seeds = {seed for first, count in seeds for seed in range(first, first + count)}
     rows = load_rows(RESULTS / "estimate.jsonl")
-    newest = {row["seed"]: row for row in rows if row["group"] == group and row["seed"] in wanted}
+    newest = {row["seed"]: row for row in rows if row["group"] == group and row["seed"] in chosen_seeds}
     return [row for row in newest.values() if "not_drawn" not in row]
 
 
@@ -66,13 +66,15 @@ def right_models() -> str:
         if (GROUPS[group].model, GROUPS[group].sensor) != ("ok", "ok"):
             continue
         rows = truths(group, seeds)
-        one, asked = summary(group, rows), ASKED.get(group)
+        one, target = summary(group, rows), ASKED.get(group)
         flagged, total = flagged + sum(map(_flagged, rows)), total + len(rows)
-        known = [[row for row in rows if row[f"{axis}_state"] == State.ESTIMATED.value] for axis in "hv"]
-        held = [coverage([bool(row[f"{axis}_inside"]) for row in own]) for axis, own in zip("hv", known, strict=True)]
+        estimated = [[row for row in rows if row[f"{axis}_state"] == State.ESTIMATED.value] for axis in "hv"]
+        held = [
+            coverage([bool(row[f"{axis}_inside"]) for row in own]) for axis, own in zip("hv", estimated, strict=True)
+        ]
         lines.append(
             f"| {GROUPS[group].title} | {len(rows)} | {one['h_rmse_mm']:.3f}, {one['v_rmse_mm']:.3f} | "
-            f"{'' if asked is None else asked} | {len(known[0])}, {len(known[1])} | {held[0]} | {held[1]} | "
+            f"{'' if target is None else target} | {len(estimated[0])}, {len(estimated[1])} | {held[0]} | {held[1]} | "
             f"{one['h_width_mm']:.2f}, {one['v_width_mm']:.2f} | {sum(map(_flagged, rows))} | "
             f"{one['h_range_rmse_mm']:.1f}, {one['v_range_rmse_mm']:.1f} | "
             f"{one['cpu_s']:.1f}, {one['cpu_s_most']:.1f} |"
@@ -116,8 +118,8 @@ def wrong_models() -> str:
     for group, seeds in TRUTHS.items():
         if (GROUPS[group].model, GROUPS[group].sensor) != ("ok", "ok"):
             rows = truths(group, seeds)
-            told = [_flagged(row) for row in rows]
-            lines.append(f"| {GROUPS[group].title} | {len(rows)} | {sum(told)} | {coverage(told)} |")
+            flagged = [_flagged(row) for row in rows]
+            lines.append(f"| {GROUPS[group].title} | {len(rows)} | {sum(flagged)} | {coverage(flagged)} |")
     return "\n".join(lines)
 
 

@@ -157,13 +157,13 @@ def draw(group: Group, seed: int) -> Truth:
     nominal = load_scene(ROOT / "config" / "paper.yaml")
     end = group.periods * PERIOD
     fine = np.arange(0.0, end + _FINE, _FINE)
-    believed = compile_loads(nominal.loads).at(fine)
+    nominal_load = compile_loads(nominal.loads).at(fine)
     if group.stochastic:
-        believed = believed + cutting(rng, fine) * np.array([8e3, 4e3, 1.1e4])
+        nominal_load = nominal_load + cutting(rng, fine) * np.array([8e3, 4e3, 1.1e4])
     gain = group.load_scale * (1.0 + group.load_error * rng.standard_normal(3))
-    true_load = believed * gain
+    true_load = nominal_load * gain
     if group.third_harmonic:
-        size = group.third_harmonic * np.abs(believed).max(axis=0)
+        size = group.third_harmonic * np.abs(nominal_load).max(axis=0)
         true_load = true_load + size * np.sin(3.0 * 2.0 * np.pi / PERIOD * fine + 1.0)[:, None]
     scene = replace(
         nominal,
@@ -181,7 +181,7 @@ def draw(group: Group, seed: int) -> Truth:
     measured = _sensor(group, rng, t, q)
     keep = _kept(group, rng, t, measured)
     knots = np.arange(0.0, end + group.load_step, group.load_step)
-    wrench = np.stack([np.interp(knots, fine, column) for column in believed.T], axis=1)
+    wrench = np.stack([np.interp(knots, fine, column) for column in nominal_load.T], axis=1)
     poses, _ = Poses.of(t[keep], measured[keep])
     load, _ = Load.of(knots, wrench)
     forces = _cells(group, rng, force, end) if group.forces_hz else None

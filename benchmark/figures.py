@@ -90,17 +90,17 @@ def missed() -> str:
             peer = verdict.work.partition(", against ")[2]
             groups.setdefault((f"against {peer}" if peer else verdict.work, verdict.wanted), []).append(verdict)
     lines = []
-    for (work, wanted), rows in groups.items():
+    for (work, target), rows in groups.items():
         shown = sorted(map(_short, rows), key=lambda text: float(text.rstrip("x")) if text.endswith("x") else 0.0)
-        lines.append([work, str(len(rows)), " to ".join(dict.fromkeys((shown[0], shown[-1]))), wanted])
+        lines.append([work, str(len(rows)), " to ".join(dict.fromkeys((shown[0], shown[-1]))), target])
     return table(["target not reached", "cases", "measured", "wanted"], lines)
 
 
 def random_scenes() -> str:
     rows = [verdict for verdict in targets.verdicts(solver_rows()) if "random scenes" in verdict.work]
-    asked = [re.search(r"tol=([\d.e-]+)", row.work) for row in rows]
+    tolerances = [re.search(r"tol=([\d.e-]+)", row.work) for row in rows]
     texts = [row.measured.replace("worst", "largest").replace(" 0 failed", " no scene failed") for row in rows]
-    return "\n".join(f"- tolerance {tol[1]}: {text}" for tol, text in zip(asked, texts, strict=True) if tol)
+    return "\n".join(f"- tolerance {tol[1]}: {text}" for tol, text in zip(tolerances, texts, strict=True) if tol)
 
 
 def stored(name: str) -> Callable[[], str]:

@@ -80,14 +80,14 @@ class Motion:
 
 def _forces(stretch: Stretch, true: Motion, nominal: Motion) -> dict[str, float]:
     count = min(len(stretch.rows.t), len(true.force))
-    told, force = stretch.rows, true.force[:count]
-    late = told.t[:count] >= FIRST_PERIOD * PERIOD
+    rows, force = stretch.rows, true.force[:count]
+    late = rows.t[:count] >= FIRST_PERIOD * PERIOD
     size = np.sqrt((force[late] ** 2).sum())
-    inside = (told.low[:count] <= force) & (force <= told.high[:count])
+    inside = (rows.low[:count] <= force) & (force <= rows.high[:count])
     touching = force > 0.0
-    width = (told.high[:count] - told.low[:count])[touching & late[:, None]]
+    width = (rows.high[:count] - rows.low[:count])[touching & late[:, None]]
     return {
-        "rms": float(np.sqrt(((told.force[:count] - force)[late] ** 2).sum()) / size),
+        "rms": float(np.sqrt(((rows.force[:count] - force)[late] ** 2).sum()) / size),
         "rms_nominal": float(np.sqrt(((nominal.force[:count] - force)[late] ** 2).sum()) / size),
         "coverage": float(inside[touching].mean()),
         "coverage_late": float(inside[touching & late[:, None]].mean()),
@@ -97,27 +97,29 @@ def _forces(stretch: Stretch, true: Motion, nominal: Motion) -> dict[str, float]
 
 def _spans(stretch: Stretch, true: Motion, nominal: Motion) -> dict[str, float]:
     out: dict[str, float] = {}
-    for what in ("peak", "impulse"):
-        truth, other = getattr(true, what), getattr(nominal, what)
-        told = np.stack([getattr(span, what) for span in stretch.spans])
-        count = min(len(told), len(truth))
+    for quantity in ("peak", "impulse"):
+        truth, other = getattr(true, quantity), getattr(nominal, quantity)
+        followed = np.stack([getattr(span, quantity) for span in stretch.spans])
+        count = min(len(followed), len(truth))
         counts = true.impulse[:count] > LEAST_SHARE * true.impulse.max()
         counts[:FIRST_PERIOD] = False
-        known, low, high = told[:count].transpose(1, 0, 2)
-        error = np.abs(known - truth[:count])[counts] / truth[:count][counts]
+        mean, low, high = followed[:count].transpose(1, 0, 2)
+        error = np.abs(mean - truth[:count])[counts] / truth[:count][counts]
         inside = (low <= truth[:count]) & (truth[:count] <= high)
-        out[what] = float(np.median(error))
-        out[f"{what}_nominal"] = float(np.median(np.abs(other[:count] - truth[:count])[counts] / truth[:count][counts]))
-        out[f"{what}_coverage"] = float(inside[counts].mean())
+        out[quantity] = float(np.median(error))
+        out[f"{quantity}_nominal"] = float(
+            np.median(np.abs(other[:count] - truth[:count])[counts] / truth[:count][counts])
+        )
+        out[f"{quantity}_coverage"] = float(inside[counts].mean())
     return out
 
 
 def _clearance(stretch: Stretch, truth: Truth) -> dict[str, float]:
-    told, out = stretch.rows, {}
-    first = next((one.t for one in stretch.taken_over if one.taken), float(told.t[-1]))
+    rows, out = stretch.rows, {}
+    first = next((one.t for one in stretch.taken_over if one.taken), float(rows.t[-1]))
     for axis, name in enumerate(("horizontal", "vertical")):
-        value, low, high = told.clearance[:, axis].T
-        before = told.t < first
+        value, low, high = rows.clearance[:, axis].T
+        before = rows.t < first
         out[f"{name}_coverage"] = float(((low <= truth.clearance[axis]) & (truth.clearance[axis] <= high)).mean())
         out[f"{name}_before"] = float((low <= truth.clearance[axis])[before].mean()) if before.any() else float("nan")
         out[f"{name}_width_before_mm"] = 1e3 * float((high - low)[before][-1]) if before.any() else float("nan")

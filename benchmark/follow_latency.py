@@ -63,12 +63,12 @@ def measured(truth: Truth, follow: str) -> tuple[list[int], list[int]]:
         scene = Path(folder, "believed.yaml")
         scene.write_text(dump_scene(truth.nominal), encoding="utf-8")
         # with these long windows and intervals, the runtime makes no estimate of its own
-        given = parameters.settings(
+        settings = parameters.settings(
             {"scene": str(scene), "estimate": True, "estimate_window": 600.0, "estimate_interval": 600.0}
             | {"follow": follow}
         )
         front: Any = _Front()
-        runtime = Runtime(front, given, Preparation(given).result(lambda: False))
+        runtime = Runtime(front, settings, Preparation(settings).result(lambda: False))
         runtime.start()
         runtime.activate()
         first, whole = _play(runtime, truth)

@@ -29,20 +29,20 @@ def main(group: str, truths: int, seed: int, members: int) -> None:
         true_load = truth.scene.loads[0]
         assert isinstance(true_load, Table)
         t = true_load.t
-        believed = np.stack([np.interp(t, truth.load.t, column) for column in truth.load.wrench.T], axis=1)
+        nominal_load = np.stack([np.interp(t, truth.load.t, column) for column in truth.load.wrench.T], axis=1)
         ensemble = ForceEnsemble(truth.nominal, result, members)
         settled = int(np.searchsorted(t, PERIOD))
-        ensemble.advance(t[:settled], believed[:settled])
+        ensemble.advance(t[:settled], nominal_load[:settled])
         begin = time.process_time()
-        forces = ensemble.advance(t[settled:], believed[settled:])
+        forces = ensemble.advance(t[settled:], nominal_load[settled:])
         share = (time.process_time() - begin) / (t[-1] - t[settled])
         run = Twin(replace(truth.scene, loads=()), excitation="sampled").advance_samples(t, true_load.wrench)
         held = []
-        for true, told in (
+        for true, interval in (
             (run.peak[settled:].max(axis=0), forces.peak),
             (run.impulse[settled:].sum(axis=0), forces.impulse),
         ):
-            held.append(int(((told[0] <= true) & (true <= told[2])).sum()))
+            held.append(int(((interval[0] <= true) & (true <= interval[2])).sum()))
         force = run.force[settled:]
         acting = (forces.force[2] > 0.0) | (force > 0.0)
         inside = ((forces.force[0] <= force) & (force <= forces.force[2]))[acting].mean()

@@ -76,8 +76,8 @@ def contenders(rows: Sequence[Row]) -> set[int]:
                 group = ladders(rows, scene, output_s, member)
                 for level in LEVELS:
                     picked += _contenders_at(group, level)
-    wanted = {id(row) for row in picked}
-    return {index for index, row in enumerate(rows) if id(row) in wanted}
+    identities = {id(row) for row in picked}
+    return {index for index, row in enumerate(rows) if id(row) in identities}
 
 
 def _contenders_at(group: Sequence[Sequence[Row]], level: float) -> list[Row]:

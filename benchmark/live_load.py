@@ -214,8 +214,8 @@ def environment() -> dict[str, str]:
     return os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
 
 
-def _twin(mode: str, folder: str, namespace: str = "/live_load", given: dict[str, str] | None = None) -> list[str]:
-    named = {"publish_mode": mode, "excitation_timeout": 60.0, "record_path": folder} | (given or {})
+def _twin(mode: str, folder: str, namespace: str = "/live_load", parameters: dict[str, str] | None = None) -> list[str]:
+    named = {"publish_mode": mode, "excitation_timeout": 60.0, "record_path": folder} | (parameters or {})
     settings = [word for name, value in named.items() if value != "" for word in ("-p", f"{name}:={value}")]
     return [sys.executable, "-m", "plow_twin.ros.main", "--ros-args", "-r", f"__ns:={namespace}", "-r",
             "excitation:=/live_load/excitation", *settings]  # fmt: skip
@@ -235,8 +235,8 @@ def estimating(seconds: float, repeats: int) -> None:
 
 
 def _one_estimating(on: bool, seconds: float) -> dict[str, float]:
-    given = {"estimate": "true", "estimate_forces": "256"} if on else {}
-    command = _twin("on_sample", "", given=given)
+    options = {"estimate": "true", "estimate_forces": "256"} if on else {}
+    command = _twin("on_sample", "", parameters=options)
     publisher = [sys.executable, "-m", "plow_twin.demo.excitation_publisher", "--sensor", "3", "--seconds",
                  str(seconds + FORMED_S + 10.0), "--ros-args", "-r", "__ns:=/live_load"]  # fmt: skip
     with running(command) as (probe, process_id):

@@ -117,8 +117,8 @@ def _start_row(name: str, cache: str) -> Row:
     if completed.returncode != 0:
         row.status = f"failed: {completed.stderr.strip().splitlines()[-1]}"
         return row
-    said = json.loads(completed.stdout)
-    row.time([said["ready_s"]])
-    row.value = float(said["compiled"])
-    row.setting += f", import {said['import_s']:.2f} s, {said['read']} kernels read from the cache"
+    report = json.loads(completed.stdout)
+    row.time([report["ready_s"]])
+    row.value = float(report["compiled"])
+    row.setting += f", import {report['import_s']:.2f} s, {report['read']} kernels read from the cache"
     return row

@@ -53,14 +53,14 @@ def truth(rng: np.random.Generator) -> tuple[Scene, float, life.Path]:
     clearance = Clearance(*rng.uniform(0.020, 0.030, 2))
     nominal = replace(paper, clearance=clearance, wear=Wear(1e-15, 0.015, 2.0, prior_m2_n=PRIOR))
     low, high = np.log(PRIOR)
-    known = float(np.exp(rng.normal(0.5 * (low + high), (high - low) / 3.2897)))
+    true_coefficient = float(np.exp(rng.normal(0.5 * (low + high), (high - low) / 3.2897)))
     jump = tuning.JUMP
     tuning.JUMP = (jump[0] / 4.0, jump[1])
     try:
         path = life.wear_path(replace(nominal, loads=loads), limits(nominal), np.inf)
     finally:
         tuning.JUMP = jump
-    return nominal, known, path
+    return nominal, true_coefficient, path
 
 
 def limits(scene: Scene) -> tuple[float, float]:
@@ -74,34 +74,36 @@ def one_life(seed: int) -> list[dict[str, Any]]:
     scene, k_s, path = truth(rng)
     wear = scene.wear
     assert wear is not None
-    grown = path.clearance_growth()
-    end = min(float(np.interp(GROWTH, column, path.exposure, right=np.inf)) for column in grown.T)
+    growth = path.clearance_growth()
+    end = min(float(np.interp(GROWTH, column, path.exposure, right=np.inf)) for column in growth.T)
     hours = end * wear.pad_area_m2 / (k_s * wear.travel_speed_m_s) / HOUR_S
     rows = []
     for share in SHARES:
         exposure = np.linspace(0.0, share * end, max(3, round(share * VISITS)))
-        true = np.stack([np.interp(exposure, path.exposure, column) for column in grown.T], axis=1)
+        true = np.stack([np.interp(exposure, path.exposure, column) for column in growth.T], axis=1)
         start = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
         history = History(
             exposure * wear.pad_area_m2 / k_s,
             start + true + NOISE * rng.standard_normal(true.shape),
             np.full(true.shape, NOISE),
         )
-        known = coefficient(scene, history)
-        now = with_clearances(scene, float(known.clearance[0]), float(known.clearance[1]), known.depth)
+        estimated = coefficient(scene, history)
+        now = with_clearances(scene, float(estimated.clearance[0]), float(estimated.clearance[1]), estimated.depth)
         plan = Plan(*limits(scene), horizon_h=50.0 * hours, draws=2000, seed=seed)
-        ordered = np.sort(forecast(now, plan, (float(known.deviation[0]), float(known.deviation[1])), known).hours)
-        left = (1.0 - share) * hours
+        ordered = np.sort(
+            forecast(now, plan, (float(estimated.deviation[0]), float(estimated.deviation[1])), estimated).hours
+        )
+        remaining = (1.0 - share) * hours
         median, low, high, low_90, high_90 = np.quantile(ordered, [0.5, *_INNER, *_INNER_90])
         spread = np.abs(ordered - ordered[rng.permutation(len(ordered))]).mean()
         rows.append(
             {
-                "seed": seed, "share": share, "life_h": hours, "error": float(median / left - 1.0),
-                "inside_80": bool(low <= left <= high), "width": float((high - low) / left),
-                "inside_90": bool(low_90 <= left <= high_90), "width_90": float((high_90 - low_90) / left),
-                "crps": float((np.abs(ordered - left).mean() - 0.5 * spread) / hours),
-                "coefficient_ratio": float(known.interval().mean / k_s),
-                "coefficient_p95_ratio": float(known.interval().p95 / k_s),
+                "seed": seed, "share": share, "life_h": hours, "error": float(median / remaining - 1.0),
+                "inside_80": bool(low <= remaining <= high), "width": float((high - low) / remaining),
+                "inside_90": bool(low_90 <= remaining <= high_90), "width_90": float((high_90 - low_90) / remaining),
+                "crps": float((np.abs(ordered - remaining).mean() - 0.5 * spread) / hours),
+                "coefficient_ratio": float(estimated.interval().mean / k_s),
+                "coefficient_p95_ratio": float(estimated.interval().p95 / k_s),
             }
         )  # fmt: skip
     return rows

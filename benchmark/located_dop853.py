@@ -136,8 +136,8 @@ def _interpolate(y: Array, new: Array, h: float, k: Array, f: Array) -> None:
 @compiled
 def _first_change(y: Array, f: Array, mode: Indexes, p: Array, at: Array, guards: Array):  # type: ignore[no-untyped-def]
     """Return the share of the step at which a guard first becomes negative, and the index of the guard, or (2, -1)."""
-    for look in range(_LOOKS):
-        low, high = look / _LOOKS, (look + 1) / _LOOKS
+    for index in range(_LOOKS):
+        low, high = index / _LOOKS, (index + 1) / _LOOKS
         _dense(f, y, high, at)
         _guards(at, mode, p, guards)
         if guards.min() >= 0.0:

@@ -216,12 +216,12 @@ def anitescu_potra_newton(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-unt
 
 def newton(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
     """Return impulses that stop the slip or lie on the friction cone, with Newton's restitution (Whittaker, 1904)."""
-    wanted = -(1.0 + e) * rate
+    change_of_rate = -(1.0 + e) * rate
     determinant = tt * nn - tn**2
-    away, along = (tt * wanted + tn * slip) / determinant, (-nn * slip - tn * wanted) / determinant
+    away, along = (tt * change_of_rate + tn * slip) / determinant, (-nn * slip - tn * change_of_rate) / determinant
     slides = np.abs(along) > mu * away
     side = np.sign(along)
-    limited = wanted / (nn + tn * mu * side)
+    limited = change_of_rate / (nn + tn * mu * side)
     return np.where(slides, mu * side * limited, along), np.where(slides, limited, away)
 
 
@@ -481,15 +481,15 @@ def of_drops(drops: Drops) -> dict[str, Any]:
         inside: list[list[np.ndarray]] = [[], []]
         scores = []
         for index in square.usable:
-            pose, given, lows = drops.pose[index], int(drops.flight_rows[index]), drops.bounces[index]
+            pose, flight_rows, lows = drops.pose[index], int(drops.flight_rows[index]), drops.bounces[index]
             until = drops.until(index, 2) + 1
             members = ensemble(
-                pose[:given], until, members=200, seed=index, block=block, scatter=SCATTER, marker=marker
+                pose[:flight_rows], until, members=200, seed=index, block=block, scatter=SCATTER, marker=marker
             )
             low, high = np.quantile(members, [0.05, 0.95], axis=0)
             holds = (pose[:until] >= low) & (pose[:until] <= high)
-            scores.append(crps(members[:, given:], pose[given:until]).mean(axis=0))
-            for bounce, (first, last) in enumerate(pairwise([given - 1, *lows[1:3]])):
+            scores.append(crps(members[:, flight_rows:], pose[flight_rows:until]).mean(axis=0))
+            for bounce, (first, last) in enumerate(pairwise([flight_rows - 1, *lows[1:3]])):
                 inside[bounce].append(holds[first:last].mean(axis=0))
         results[name] = {
             **medians([square.errors(block, marker, every, bounces) for bounces in (1, 2, 3)]),
@@ -507,18 +507,18 @@ def of_table(drops: Drops) -> dict[str, Any]:
     marks["clearance.vertical_m"] = replace(marks["clearance.vertical_m"], deviation=0.01)
     true, t = square.clearance.vertical_m, np.arange(drops.pose.shape[1]) / RATE_HZ
     nothing = Load.unmeasured(t[-1], t[0])
-    known = []
+    heights = []
     for pose in drops.pose:
         clearance = replace(square.clearance, vertical_m=true + 0.01 * rng.standard_normal())
         result = estimate(replace(square, clearance=clearance, marks=marks), nothing, Poses(t, pose - [0.0, 1.0, 0.0]))
         if result.vertical_state.known:
             rough = result.vertical_state is State.ROUGH
-            known.append((result.vertical.mean, result.vertical.p05, result.vertical.p95, rough))
-    mean, low, high, rough = np.array(known).T
+            heights.append((result.vertical.mean, result.vertical.p05, result.vertical.p95, rough))
+    mean, low, high, rough = np.array(heights).T
     off = 0.5 * np.abs(mean - true)
     return {
         "drops": len(drops.pose),
-        "estimated": len(known),
+        "estimated": len(heights),
         "median_mm": round(1e3 * float(np.median(off)), 2),
         "rms_mm": round(1e3 * float(np.sqrt((off**2).mean())), 2),
         "within_half_mm": round(float((off < 5e-4).mean()), 2),
@@ -571,9 +571,9 @@ def plot(results: dict[str, Any], drops: Drops) -> None:
     axis.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
     figure.savefig(IMAGES / "measured_laws.png", dpi=110, bbox_inches="tight")
     index = next(i for i in drops.usable() if len(drops.bounces[i]) > 2)
-    pose, given = drops.pose[index], int(drops.flight_rows[index])
+    pose, flight_rows = drops.pose[index], int(drops.flight_rows[index])
     rows = drops.until(index, 2) + 1
-    points = np.quantile(ensemble(pose[:given], rows), [0.05, 0.5, 0.95], axis=0)
+    points = np.quantile(ensemble(pose[:flight_rows], rows), [0.05, 0.5, 0.95], axis=0)
     figure, axes = plt.subplots(3, 1, figsize=(9, 7), sharex=True)
     t = np.arange(rows) / 250.0
     units = (("x [mm]", 1e3), ("z [mm]", 1e3), ("angle [degrees]", float(np.degrees(1.0))))
@@ -583,7 +583,7 @@ def plot(results: dict[str, Any], drops: Drops) -> None:
         )
         axis.plot(t, unit * points[1, :, j], color="tab:blue", label="median")
         axis.plot(t, unit * pose[:rows, j], "k.", markersize=3, label="measured")
-        axis.axvline((given - 1) / 250.0, color="0.6", label="end of the first flight")
+        axis.axvline((flight_rows - 1) / 250.0, color="0.6", label="end of the first flight")
         axis.set_ylabel(name)
     axes[0].set_title(f"Measured drop {index} of a square, predicted from its first flight")
     axes[0].legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))

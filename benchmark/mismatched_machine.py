@@ -53,8 +53,8 @@ class Machine:
     drag: float = 0.0
 
 
-def poses_of(scene: Scene, machine: Machine, t: Array, wrench: Array, asked: Array) -> Array:
-    """Return the poses at the times `asked` [s], shape (k, 3), under a load (n, 3) at evenly spaced times `t` [s]."""
+def poses_of(scene: Scene, machine: Machine, t: Array, wrench: Array, pose_times: Array) -> Array:
+    """Return the poses at `pose_times` [s], shape (k, 3), under a load (n, 3) at evenly spaced times `t` [s]."""
     contact = scene.contact
     stiff = contact.stiffness * max(1.0, 0.01 ** (contact.exponent - 1.0) * contact.exponent)
     lever = 1.0 / scene.head.mass_kg + 0.05 / scene.head.inertia_kg_m2
@@ -78,18 +78,18 @@ def poses_of(scene: Scene, machine: Machine, t: Array, wrench: Array, asked: Arr
     normals = np.stack([NORMAL_X, NORMAL_Y]).astype(np.float64)
     stiffness = contact.stiffness * machine.stiffness_share
     pads = np.stack([walls, stiffness, (contact.damping or 0.0) * machine.damping_share, machine.recess])
-    out: Array = _run(numbers, corners, normals, pads, t, wrench, asked, step)
+    out: Array = _run(numbers, corners, normals, pads, t, wrench, pose_times, step)
     return out
 
 
 @numba.njit(cache=True)
-def _run(numbers, corners, normals, pads, t, wrench, asked, step):  # type: ignore[no-untyped-def]
-    out = np.zeros((len(asked), 3))
+def _run(numbers, corners, normals, pads, t, wrench, pose_times, step):  # type: ignore[no-untyped-def]
+    out = np.zeros((len(pose_times), 3))
     state, now = np.zeros(10), t[0]
     state[0], state[1] = numbers[10], numbers[11]
-    for row in range(len(asked)):
-        steps = int(np.ceil((asked[row] - now) / step)) if asked[row] > now else 0
-        h = (asked[row] - now) / steps if steps else 0.0
+    for row in range(len(pose_times)):
+        steps = int(np.ceil((pose_times[row] - now) / step)) if pose_times[row] > now else 0
+        h = (pose_times[row] - now) / steps if steps else 0.0
         for _ in range(steps):
             a = _rates(numbers, corners, normals, pads, t, wrench, now, state)
             b = _rates(numbers, corners, normals, pads, t, wrench, now + 0.5 * h, state + 0.5 * h * a)

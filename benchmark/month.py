@@ -57,12 +57,12 @@ class Machine:
 
 def machine(rng: np.random.Generator) -> Machine:
     low, high = np.log(PRIOR)
-    known = float(np.exp(rng.normal(0.5 * (low + high), (high - low) / 3.2897)))
-    believed = replace(load_scene("paper"), wear=Wear(1e-15, PAD_AREA_M2, SPEED_M_S, prior_m2_n=PRIOR))
+    true_coefficient = float(np.exp(rng.normal(0.5 * (low + high), (high - low) / 3.2897)))
+    nominal = replace(load_scene("paper"), wear=Wear(1e-15, PAD_AREA_M2, SPEED_M_S, prior_m2_n=PRIOR))
     contact = Contact("hunt_crossley", float(np.exp(rng.uniform(*np.log([5e6, 3e7])))), damping=0.72)
-    scene = replace(believed, clearance=Clearance(*rng.uniform(0.018, 0.034, 2)), contact=contact)
+    scene = replace(nominal, clearance=Clearance(*rng.uniform(0.018, 0.034, 2)), contact=contact)
     bias = 1e-3 * rng.standard_normal(3) * np.array([1.0, 1.0, 3.0])
-    return Machine(believed, scene, known, 1.0 + 0.05 * rng.standard_normal(3), bias, 0.05 * rng.uniform())
+    return Machine(nominal, scene, true_coefficient, 1.0 + 0.05 * rng.standard_normal(3), bias, 0.05 * rng.uniform())
 
 
 def load_of(one: Machine, rng: np.random.Generator, span: float) -> tuple[Array, Array]:
@@ -73,12 +73,12 @@ def load_of(one: Machine, rng: np.random.Generator, span: float) -> tuple[Array,
 
 def visit(one: Machine, worn: Scene, rng: np.random.Generator) -> tuple[Load, Poses]:
     """Return the measurements of a worn machine: the load for the estimate, and the poses of the sensor."""
-    t, believed = load_of(one, rng, _SPAN)
-    motion = simulate(replace(worn, loads=(Table("cutting", t, believed * one.gain),)), _SPAN, _FINE, 1e-6)
+    t, wrench = load_of(one, rng, _SPAN)
+    motion = simulate(replace(worn, loads=(Table("cutting", t, wrench * one.gain),)), _SPAN, _FINE, 1e-6)
     at = np.arange(0.0, _SPAN, _POSE_STEP)
     q = np.stack([np.interp(np.maximum(at - one.delay_s, 0.0), motion.t, column) for column in motion.q.T], axis=1)
     knots = np.arange(0.0, _SPAN + _LOAD_STEP, _LOAD_STEP)
-    load, _ = Load.of(knots, np.stack([np.interp(knots, t, column) for column in believed.T], axis=1))
+    load, _ = Load.of(knots, np.stack([np.interp(knots, t, column) for column in wrench.T], axis=1))
     poses, _ = Poses.of(at, q + one.bias + _NOISE * rng.standard_normal(q.shape))
     return load, poses
 
@@ -96,13 +96,13 @@ def one_month(seed: int, day_m: float) -> dict[str, Any]:
         load, poses = visit(one, worn, rng)
         result = estimate(one.believed, load, poses)
         if State.ESTIMATED is result.horizontal_state is result.vertical_state:
-            told = [[value.mean, value.deviation] for value in result.in_scene_frame()]
-            rows.append((float(day), told, clearances(worn, depth)[:2]))
+            estimates = [[value.mean, value.deviation] for value in result.in_scene_frame()]
+            rows.append((float(day), estimates, clearances(worn, depth)[:2]))
             under = under_load(with_estimate(one.believed, result.as_dict())[0], result, load)
     days, values, true = (np.array([row[i] for row in rows]) for i in range(3))
     history = History((days - days[0]) * day_m, values[:, :, 0], values[:, :, 1])
-    known = coefficient(under, history)
-    quantiles = [known.quantile(share) / one.coefficient_m2_n for share in (0.05, 0.5, 0.9, 0.95)]
+    estimated = coefficient(under, history)
+    quantiles = [estimated.quantile(share) / one.coefficient_m2_n for share in (0.05, 0.5, 0.9, 0.95)]
     error = (values[:, :, 0] - true) / values[:, :, 1]
     return {
         "seed": seed, "day_m": day_m, "coefficient_m2_n": one.coefficient_m2_n,
@@ -117,8 +117,8 @@ def true_path(one: Machine, rng: np.random.Generator, day_m: float) -> life.Path
     jump, periods = tuning.JUMP, tuning.MEAN_PERIODS
     tuning.JUMP, tuning.MEAN_PERIODS = (jump[0] / 4.0, jump[1]), (periods[0], 4 * periods[1])
     try:
-        t, believed = load_of(one, rng, (sum(tuning.MEAN_PERIODS) + 1) * PERIOD)
-        scene = replace(one.scene, loads=(Table("cutting", t, believed * one.gain),), wear=one.believed.wear)
+        t, wrench = load_of(one, rng, (sum(tuning.MEAN_PERIODS) + 1) * PERIOD)
+        scene = replace(one.scene, loads=(Table("cutting", t, wrench * one.gain),), wear=one.believed.wear)
         most = one.coefficient_m2_n * float(DAYS[-1]) * day_m / PAD_AREA_M2
         return life.wear_path(scene, (np.inf, np.inf), most)
     finally:
@@ -129,13 +129,13 @@ def summary(rows: list[dict[str, Any]]) -> str:
     ratio = np.array([[row[key] for key in ("p05_ratio", "p50_ratio", "p90_ratio", "p95_ratio")] for row in rows])
     near = (np.abs(np.log(ratio)) <= np.log(FACTOR)).sum(axis=0)
     held = int(((ratio[:, 0] <= 1.0) & (ratio[:, 3] >= 1.0)).sum())
-    grown = 1e3 * np.array([row["grown_m"] for row in rows]).mean(axis=1)
+    growth = 1e3 * np.array([row["grown_m"] for row in rows]).mean(axis=1)
     used, ends = sum(row["visits"] for row in rows), np.median(ratio, axis=0)
     return "\n".join([
         f"| months | growth [mm] | visits used | P50 within a factor {FACTOR} | P90 | 90 % interval contains truth | "
         "P05 and P95 over truth, median |",
         "|---|---|---|---|---|---|---|",
-        f"| {len(rows)} | {grown.min():.2f} to {grown.max():.2f} | {used} of {len(rows) * len(DAYS)} | {near[1]} | "
+        f"| {len(rows)} | {growth.min():.2f} to {growth.max():.2f} | {used} of {len(rows) * len(DAYS)} | {near[1]} | "
         f"{near[2]} | {held} | {ends[0]:.2f}, {ends[3]:.2f} |",
     ])  # fmt: skip
 

@@ -93,9 +93,9 @@ async def hear(port: int) -> None:
         subscription = await client.create_subscription(PUBLISHING_MS, Heard())
         nodes = [client.get_node(ua.NodeId.from_string(f"ns={NAMESPACE};s={name}")) for name in NODES]
         await subscription.subscribe_data_change(nodes, queuesize=QUEUE, sampling_interval=ua.Double(0.0))
-        heard = -1
-        while len(ages) != heard or heard <= len(NODES):
-            heard = len(ages)
+        count = -1
+        while len(ages) != count or count <= len(NODES):
+            count = len(ages)
             await asyncio.sleep(SILENCE_S)
     ordered = ages[len(NODES) :]
     print(json.dumps({"values": len(ordered)} | quantiles(ordered)))

@@ -51,10 +51,10 @@ def fresh(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _draw_errors(panel: Any, rows: Sequence[dict[str, Any]], axis: str, color: str, title: str) -> None:
-    known = [row for row in rows if row[f"{axis}_state"] == State.ESTIMATED.value]
-    stiffness = [row["stiffness"] for row in known]
-    errors = np.array([1e3 * row[f"{axis}_error_m"] for row in known])
-    bars = np.array([1e3 * NORMAL_P95 * row[f"{axis}_sd_m"] for row in known])
+    estimated = [row for row in rows if row[f"{axis}_state"] == State.ESTIMATED.value]
+    stiffness = [row["stiffness"] for row in estimated]
+    errors = np.array([1e3 * row[f"{axis}_error_m"] for row in estimated])
+    bars = np.array([1e3 * NORMAL_P95 * row[f"{axis}_sd_m"] for row in estimated])
     panel.errorbar(stiffness, errors, bars, fmt=".", color=color, label=title, linewidth=0.8, markersize=4)
     unknown = [row["stiffness"] for row in rows if row[f"{axis}_state"] != State.ESTIMATED.value]
     # a truth without an estimate is marked at the lower edge
@@ -62,7 +62,7 @@ def _draw_errors(panel: Any, rows: Sequence[dict[str, Any]], axis: str, color: s
 
 
 def _draw_coverage(panel: Any, rows: Sequence[dict[str, Any]]) -> None:
-    asked = np.linspace(0.02, 0.98, 49)
+    levels_drawn = np.linspace(0.02, 0.98, 49)
     for group, color in STYLES.items():
         errors = [
             abs(row[f"{axis}_error_m"]) / row[f"{axis}_sd_m"]
@@ -70,8 +70,8 @@ def _draw_coverage(panel: Any, rows: Sequence[dict[str, Any]]) -> None:
             if row["group"] == group and row[f"{axis}_state"] == State.ESTIMATED.value
         ]  # fmt: skip
         levels = [math.erf(error / math.sqrt(2.0)) for error in errors]
-        held = [np.mean(np.array(levels) <= level) for level in asked] if levels else []
-        panel.plot(100.0 * asked[: len(held)], 100.0 * np.array(held), color=color)
+        held = [np.mean(np.array(levels) <= level) for level in levels_drawn] if levels else []
+        panel.plot(100.0 * levels_drawn[: len(held)], 100.0 * np.array(held), color=color)
     panel.plot([0, 100], [0, 100], color="0.4", linewidth=0.8)
     panel.set(xlabel="level of the interval [%]", xlim=(0, 100), ylim=(0, 100))
     panel.set_title("intervals that hold the true clearance [%]")

@@ -82,10 +82,10 @@ def damped(ratio: float, ramp: float, stiffness: float, mass: float, speed: floa
     return Contact("ramped_damping", stiffness, damping=damping, ramp_m=ramp * speed * math.sqrt(mass / stiffness))
 
 
-def measure(law: str, asked: Iterable[float], ramp: float = 0.0) -> list[Row]:
+def measure(law: str, nominal: Iterable[float], ramp: float = 0.0) -> list[Row]:
     """Measure one law for nominal restitutions, or for damping ratios if it adds C d'. Hertz contacts have neither."""
     rows = []
-    for value in asked:
+    for value in nominal:
         if LAWS[law].takes_restitution:
             exponent = LAWS[law].exponent or EXPONENT
             contact = Contact(law, STIFFNESS, exponent, restitution=value, impact_speed_floor_m_s=FLOOR)
@@ -154,12 +154,12 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     styles = ["-", "--", "-.", (0, (5, 1)), (0, (3, 1, 1, 1)), "--", "-.", (0, (1, 1)), (0, (5, 1))]
     for index, law in enumerate(restitution_laws()):
         own = [row for row in rows if row.law == law]
-        asked, delivered = [row.asked for row in own], [row.delivered for row in own]
+        nominal, delivered = [row.asked for row in own], [row.delivered for row in own]
         exact = law == "exact_restitution"
-        look = {"color": "#d62728" if exact else f"C{index if index < 3 else index + 1}", "lw": 2.6 if exact else 1.6}
-        panel.plot(asked, delivered, ls=styles[index % len(styles)], label=LAWS[law].title, **look)
-        percent = [100.0 * (d / a - 1.0) for a, d in zip(asked[1:], delivered[1:], strict=True)]
-        share.plot(asked[1:], percent, ls=styles[index % len(styles)], **look)
+        style = {"color": "#d62728" if exact else f"C{index if index < 3 else index + 1}", "lw": 2.6 if exact else 1.6}
+        panel.plot(nominal, delivered, ls=styles[index % len(styles)], label=LAWS[law].title, **style)
+        percent = [100.0 * (d / a - 1.0) for a, d in zip(nominal[1:], delivered[1:], strict=True)]
+        share.plot(nominal[1:], percent, ls=styles[index % len(styles)], **style)
     panel.plot([0.0, 1.0], [0.0, 1.0], color="#888888", lw=0.8, label="delivered = asked", zorder=0)
     panel.set(xlabel="restitution asked for", ylabel="restitution delivered", xlim=(0, 1), ylim=(0, 1))
     share.axhspan(-100.0 * VALID, 100.0 * VALID, color="#dddddd", zorder=0)

@@ -79,25 +79,25 @@ def _of_ratio(rows: Sequence[Row], ratio: Ratio) -> Iterator[Verdict]:
     peer = fastest(*where, PEERS[ratio.peer])
     output = "0.1 s" if ratio.output_s == 0.1 else "1 ms"
     work = f"{ratio.scene.upper()}, 20 s, output each {output}, error {ratio.level:g}, against {ratio.peer}"
-    wanted = f"{ratio.times:g}x"
+    target_text = f"{ratio.times:g}x"
     if bare is None:
         return
     if peer is not None:
         times = peer.wall_ms / bare.wall_ms
         also = "" if full is None else f", {peer.wall_ms / full.wall_ms:.3g}x with forces and penetrations"
         measured = f"{bare.wall_ms:.3g} ms against {peer.wall_ms:.4g} ms of {peer.solver}: **{times:.3g}x**{also}"
-        yield Verdict(work, measured, wanted, times >= ratio.times)
+        yield Verdict(work, measured, target_text, times >= ratio.times)
     elif any(PEERS[ratio.peer](row.solver) and row.wall_ms is not None for row in rows):
-        yield Verdict(work, f"{bare.wall_ms:.3g} ms; no setting of the peer reaches the error", wanted, True)
+        yield Verdict(work, f"{bare.wall_ms:.3g} ms; no setting of the peer reaches the error", target_text, True)
 
 
 def _of_ensemble(rows: Sequence[Row]) -> Iterator[Verdict]:
     row = core_row(rows)
     if row is not None and row.wall_ms is not None and row.error is not None:
         measured = f"{1e-3 * row.wall_ms:.2f} s at {row.setting}, worst error {row.error:.2g}"
-        wanted = f"{ENSEMBLE_S:g} s on one core, every pair within {LISTED:g}"
+        target_text = f"{ENSEMBLE_S:g} s on one core, every pair within {LISTED:g}"
         reached = row.wall_ms <= 1e3 * ENSEMBLE_S and row.error <= LISTED and row.scene == PAIRS
-        yield Verdict(row.scene + ", 20 s", measured, wanted, reached)
+        yield Verdict(row.scene + ", 20 s", measured, target_text, reached)
         batch = batch_row(rows)
         if batch is not None and batch.wall_ms is not None:
             times = batch.wall_ms / row.wall_ms
@@ -124,11 +124,11 @@ def _of_sampled_load(rows: Sequence[Row]) -> Iterator[Verdict]:
     for row in rows:
         if row.section == "sampled_load" and row.value is not None and row.status == "ok":
             if "256" in row.scene:
-                wanted, reached = f"{CORE_SHARE:g} of a core", row.value <= CORE_SHARE
-                yield Verdict(f"{row.scene}, {row.setting}", f"{row.value:.2f} of a core", wanted, reached)
+                target_text, reached = f"{CORE_SHARE:g} of a core", row.value <= CORE_SHARE
+                yield Verdict(f"{row.scene}, {row.setting}", f"{row.value:.2f} of a core", target_text, reached)
             else:
-                wanted, reached = f"{REAL_TIME:g} times real time", row.value >= REAL_TIME
-                yield Verdict(f"{row.scene}, {row.setting}", f"{row.value:.0f} times real time", wanted, reached)
+                target_text, reached = f"{REAL_TIME:g} times real time", row.value >= REAL_TIME
+                yield Verdict(f"{row.scene}, {row.setting}", f"{row.value:.0f} times real time", target_text, reached)
 
 
 def _of_idle_time(rows: Sequence[Row]) -> Iterator[Verdict]:

@@ -125,9 +125,9 @@ def feature_cases() -> Iterator[Case]:
         yield Case(row, call)
     shared = _shared_load_scene()
     paths = tuple(sensitivity_parameters(shared))
-    for name, wanted in (("growth of errors", True), (f"derivatives by {len(paths)} parameters", paths)):
+    for name, sensitivity in (("growth of errors", True), (f"derivatives by {len(paths)} parameters", paths)):
         row = Row("features", f"kv, {name}", OURS, f"tol={TOL:g}", SPARSE, T_END)
-        yield Case(row, partial(prepare_simulate, shared, SPARSE, tol=TOL, sensitivity=wanted, whole_call=True))
+        yield Case(row, partial(prepare_simulate, shared, SPARSE, tol=TOL, sensitivity=sensitivity, whole_call=True))
 
 
 def _shared_load_scene() -> Scene:

@@ -39,7 +39,7 @@ def started(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen
 
 def plow_twin_here(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     """Run a command in this process, which saves the second that the start of a process takes."""
-    given, out, err = [*map(str, arguments)], StringIO(), StringIO()
+    words, out, err = [*map(str, arguments)], StringIO(), StringIO()
     with chdir(cwd or Path.cwd()), redirect_stdout(out), redirect_stderr(err):
-        code = run(given)
-    return subprocess.CompletedProcess(given, code, out.getvalue(), err.getvalue())
+        code = run(words)
+    return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())

@@ -92,8 +92,8 @@ runpy.run_module(name, run_name="__main__", alter_sys=True)
 
 def environment(**changed: str) -> dict[str, str]:
     """Return the environment of the package's programs."""
-    known = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    return known | {"AMENT_PREFIX_PATH": known.get("AMENT_PREFIX_PATH") or sys.prefix} | changed
+    variables = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    return variables | {"AMENT_PREFIX_PATH": variables.get("AMENT_PREFIX_PATH") or sys.prefix} | changed
 
 
 #: Environment at the time of the imports, before tests change variables.
@@ -128,14 +128,14 @@ class Fork:
         self.args, self.returncode = args, None
         with ExitStack() as theirs:
 
-            def stream(number: int, given: Any) -> tuple[int, Any]:
+            def stream(number: int, target: Any) -> tuple[int, Any]:
                 """Return the program's end of a stream, and our end of a pipe."""
-                if given is None:
+                if target is None:
                     return number, None
-                if given == subprocess.DEVNULL:
+                if target == subprocess.DEVNULL:
                     return theirs.enter_context(open(os.devnull, "r+b", buffering=0)).fileno(), None
-                if given != subprocess.PIPE:
-                    return given.fileno(), None
+                if target != subprocess.PIPE:
+                    return target.fileno(), None
                 ends = os.pipe()
                 theirs.callback(os.close, ends[number > 0])
                 mode = ("w" if number == 0 else "r") + ("" if text else "b")

@@ -78,11 +78,11 @@ def make_environment(folder: Path) -> Path:
 def lend(python: Path, *names: str) -> None:
     """Link distributions of this environment, and all that they require, into another one; copies would take long."""
     (site,) = python.parent.parent.glob("lib/python*/site-packages")
-    waiting, known = [*names], set[str]()
+    waiting, linked = [*names], set[str]()
     while waiting:
-        if (name := waiting.pop()) in known:
+        if (name := waiting.pop()) in linked:
             continue
-        known.add(name)
+        linked.add(name)
         package = distribution(name)
         needed = (Requirement(text) for text in package.requires or ())
         waiting += [one.name for one in needed if one.marker is None or one.marker.evaluate({"extra": ""})]

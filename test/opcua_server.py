@@ -34,8 +34,8 @@ class OneUser(UserManager):
 
     def get_user(self, iserver: Any, username: Any = None, password: Any = None, certificate: Any = None) -> Any:
         # without a user token, the certificate is the certificate of the client program
-        known = (username, password) == ("plough", "s3cret") or (username is None and certificate == self._known)
-        return User(UserRole.User) if known else None
+        admitted = (username, password) == ("plough", "s3cret") or (username is None and certificate == self._known)
+        return User(UserRole.User) if admitted else None
 
 
 class Plant:

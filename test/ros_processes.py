@@ -110,16 +110,16 @@ class Probe:
 
     def listen(self, kind: type, topic: str) -> list[Any]:
         """Return a list to which all further messages are appended."""
-        heard: list[Any] = []
-        subscription = self.node.create_subscription(kind, topic, heard.append, QoSProfile(depth=20000))
+        messages: list[Any] = []
+        subscription = self.node.create_subscription(kind, topic, messages.append, QoSProfile(depth=20000))
         self.until(lambda: subscription.get_publisher_count() > 0, f"a publisher of {topic}")
         self.pause(0.1)
-        return heard
+        return messages
 
-    def until(self, reached: Callable[[], Any], what: str, timeout_s: float = WAIT_S) -> None:
+    def until(self, reached: Callable[[], Any], event: str, timeout_s: float = WAIT_S) -> None:
         give_up = time.monotonic() + timeout_s
         while not reached():
-            assert time.monotonic() < give_up, f"{what}: not within {timeout_s} s; last status {self.status[-1:]}"
+            assert time.monotonic() < give_up, f"{event}: not within {timeout_s} s; last status {self.status[-1:]}"
             self._executor.spin_once(timeout_sec=0.05)
 
     def until_lifecycle(self, state: str, timeout_s: float = WAIT_S) -> None:
@@ -201,17 +201,19 @@ class Bench:
     def __init__(self, folder: Path, parameters: dict[str, Any], arguments: Sequence[str] = ()) -> None:
         self.namespace = f"/t{os.getpid()}_{next(_numbers)}"
         # in names of parameters, {ns} is replaced by the namespace
-        named = {name.replace("{ns}", self.namespace): given for name, given in parameters.items()}
+        named = {name.replace("{ns}", self.namespace): value for name, value in parameters.items()}
         self.folder = folder
         self._publishers: list[Process] = []
         self.probe = Probe(self.namespace)
         settings = itertools.chain.from_iterable(("-p", f"{name}:={given}") for name, given in named.items())
-        given = ["--ros-args", "-r", f"__ns:={self.namespace}", *settings, *arguments]
-        self.twin = Process("plow_twin.ros.main", given, folder / "twin.log")
+        ros_arguments = ["--ros-args", "-r", f"__ns:={self.namespace}", *settings, *arguments]
+        self.twin = Process("plow_twin.ros.main", ros_arguments, folder / "twin.log")
 
     def publisher(self, *arguments: str) -> Process:
-        given = [*arguments, "--ros-args", "-r", f"__ns:={self.namespace}"]
-        self._publishers.append(Process("plow_twin.demo.excitation_publisher", given, self.folder / "publisher.log"))
+        ros_arguments = [*arguments, "--ros-args", "-r", f"__ns:={self.namespace}"]
+        self._publishers.append(
+            Process("plow_twin.demo.excitation_publisher", ros_arguments, self.folder / "publisher.log")
+        )
         return self._publishers[-1]
 
     def close(self) -> None:

@@ -69,7 +69,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["estimate", "mm"], 2, "x: got 12, expected less than half the frame or the clearance, 0.165 m; they look"),
         (["estimate", "bars"], 1, "t|fx|fy|m (expected commas, semicolons or tabs between them), expected t, fx, fy"),
         (["estimate", "headless.csv", *MAP], 1, "(no header row?)"),
-        (["estimate", "empty.csv", "--scene", "paper"], 1, "empty.csv: got no load, expected some"),
+        (["estimate", "empty.csv", "--scene", "paper"], 1, "empty.csv: got no load, expected at least one row"),
         (
             ["estimate", "own.csv", "--scene", "papper", *MAP[:2]],
             2,
@@ -155,6 +155,6 @@ def test_a_load_that_seems_to_be_in_kilonewtons_is_reported_before_the_estimate(
     # the estimate fits the gains of the load, so a load in kN causes only a warning, but here no clearance is found
     assert cli(["estimate", "kN", "--json"]) == 0
     shown = capsys.readouterr()
-    assert "fx, fy: got 30, expected some 3.2e+04 N as in the scene; they look like kN: convert the file" in shown.err
+    assert "fx, fy: got 30, expected about 3.2e+04 N as in the scene; they look like kN: convert the file" in shown.err
     found = json.loads(shown.out)
     assert {found[name]["state"] for name in ("horizontal", "vertical")} <= {"withdrawn", "not_observable"}

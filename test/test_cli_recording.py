@@ -31,7 +31,7 @@ SAMPLES = 600
 
 
 @pytest.mark.parametrize(
-    ("given", "expected"),
+    ("words", "expected"),
     [
         (["view", "RUN", "--png", "x.png", "--web"], "--png cannot be combined with --out, --web or --follow"),
         (["view", "RUN", "--png", "x.png", "--follow"], "--png cannot be combined with --out, --web or --follow"),
@@ -43,9 +43,9 @@ SAMPLES = 600
     ],
 )
 def test_options_without_effect_are_refused(
-    given: list[str], expected: str, run: Run, capsys: pytest.CaptureFixture[str]
+    words: list[str], expected: str, run: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli([word.replace("RUN", str(run.folder)) for word in given]) == 2
+    assert cli([word.replace("RUN", str(run.folder)) for word in words]) == 2
     assert expected in " ".join(capsys.readouterr().err.split())
 
 
@@ -61,8 +61,8 @@ def test_an_analysis_without_measurements_shows_only_the_model(
     copy, made = shutil.copytree(run.folder, tmp_path / "copy"), tmp_path / "again"
     assert cli(["replay", str(run.folder), "--write", str(made), "--quiet"]) == 0
     capsys.readouterr()
-    given = [str(run.folder), str(copy), str(made)]
-    assert cli(["analyse", *given, "--workers", "1", "--out", str(tmp_path / "out")]) == 0
+    recordings = [str(run.folder), str(copy), str(made)]
+    assert cli(["analyse", *recordings, "--workers", "1", "--out", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr()
     assert f"{copy}: left out: the same run as {run.folder}" in printed.err
     assert printed.out.count("Contacts computed") == 1 and "plow-twin compare" in printed.out

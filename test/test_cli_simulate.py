@@ -258,9 +258,9 @@ def test_the_energy_balance_closes() -> None:
     balance = json.loads(done.stdout)["energy_balance"]
     start, end = balance["kinetic_j"]
     stored = balance["stored_j"][1] - balance["stored_j"][0]
-    given = balance["load_work_j"] + balance["gravity_work_j"]
-    taken = balance["dissipated_j"] + balance["friction_work_j"] + stored
-    assert end - start == pytest.approx(given - taken, abs=1e-6 * balance["turnover_j"])
+    supplied = balance["load_work_j"] + balance["gravity_work_j"]
+    used = balance["dissipated_j"] + balance["friction_work_j"] + stored
+    assert end - start == pytest.approx(supplied - used, abs=1e-6 * balance["turnover_j"])
     assert balance["dissipated_j"] > 1.0 and balance["friction_work_j"] == 0.0
     assert 0.0 <= balance["relative_imbalance"] < 1e-6 and len(balance["momentum_imbalance"]) == 3
     shown = plow_twin_here(*call).stdout

@@ -172,8 +172,8 @@ def test_an_address_that_cannot_be_offered_is_refused(
 ) -> None:
     (tmp_path / "load.csv").write_text("t,fx,fy,m\n0,1,2,3\n0.001,1,2,3\n")
     (tmp_path / "token").write_text(token + "\n")
-    given = ("--dashboard", "--listen", listen, *(("--token-file", tmp_path / "token") if token else ()))
-    done = plow_twin_here("live", tmp_path / "load.csv", "--scene", "paper", "--quiet", *given)
+    options = ("--dashboard", "--listen", listen, *(("--token-file", tmp_path / "token") if token else ()))
+    done = plow_twin_here("live", tmp_path / "load.csv", "--scene", "paper", "--quiet", *options)
     assert done.returncode == 2 and expected in done.stderr and (not token or token not in done.stderr)
 
 
@@ -227,9 +227,9 @@ def test_requests_without_token_from_other_pages_or_under_other_names_are_refuse
         assert [_status(url, **headers) for headers in foreign] == [403] * 3
         with pytest.raises(InvalidStatus, match="403"):
             _data(url, origin="http://evil.example")
-        for given in ({"token": TOKEN[:-1]}, {"token": ["x"]}, {}, []):
+        for credentials in ({"token": TOKEN[:-1]}, {"token": ["x"]}, {}, []):
             with _data(url) as page, pytest.raises(ConnectionClosed) as closed:
-                page.send(json.dumps(given))
+                page.send(json.dumps(credentials))
                 page.recv(timeout=10)
             assert closed.value.rcvd is not None and closed.value.rcvd.code == 4401
         with ExitStack() as opened:
@@ -242,11 +242,11 @@ def test_requests_without_token_from_other_pages_or_under_other_names_are_refuse
             with pytest.raises(ConnectionClosed) as closed:
                 pages[0].recv(timeout=10)
             assert closed.value.rcvd is not None and closed.value.rcvd.code == TOO_MANY
-        told = (
+        command_line = (
             Path(f"/proc/{screen.process.pid}/cmdline").read_bytes()
             + Path(f"/proc/{screen.process.pid}/environ").read_bytes()
         )
-        assert TOKEN.encode() not in told
+        assert TOKEN.encode() not in command_line
     assert screen.process.returncode == 0
 
 
@@ -354,28 +354,28 @@ def test_slow_frozen_and_killed_pages_and_servers_do_not_affect_the_twin(tmp_pat
         os.kill(server, signal.SIGSTOP)
         _feed(process, COUNT // 2)
         os.kill(server, signal.SIGCONT)
-        told = _stopped(process)
+        report = _stopped(process)
     alone = json.loads(done.stdout)
-    assert told["input"]["samples_used"] == alone["input"]["samples_used"] == str(COUNT)
+    assert report["input"]["samples_used"] == alone["input"]["samples_used"] == str(COUNT)
     assert _digests(tmp_path / "watched") == _digests(tmp_path / "alone") != []
-    assert not told["recorder"]["lost"] and not Path(f"/proc/{server}").exists()
+    assert not report["recorder"]["lost"] and not Path(f"/proc/{server}").exists()
 
 
 def test_acknowledgements_and_marks_of_an_operator_are_journalled(tmp_path: Path) -> None:
     with _twin("--record", tmp_path / "run") as (process, url), _data(url) as page:
         _feed(process)
-        told: dict[str, Any] = {}
+        received: dict[str, Any] = {}
         events: list[dict[str, Any]] = []
 
         def see(reached: Callable[[], bool]) -> None:
             while not reached():
                 message = json.loads(page.recv(timeout=30))
                 events.extend(message.get("events", ()))
-                told.update({name: part[2] for name, part in message.get("parts", {}).items()})
-                told.update({key: message[key] for key in ("motion", "seconds") if message.get(key)})
+                received.update({name: part[2] for name, part in message.get("parts", {}).items()})
+                received.update({key: message[key] for key in ("motion", "seconds") if message.get(key)})
 
-        see(lambda: told.get("motion", {}).get("t", 0) >= 0.999e-3 * COUNT)
-        assert told["alarms"]["force_latched"] == "warn" and told["motion"]["clearance"]["horizontal"] > 0.02
+        see(lambda: received.get("motion", {}).get("t", 0) >= 0.999e-3 * COUNT)
+        assert received["alarms"]["force_latched"] == "warn" and received["motion"]["clearance"]["horizontal"] > 0.02
         page.send("no JSON")
         page.send(json.dumps({"do": "reset"}))  # the page itself never sends such a request
         page.send(json.dumps({"do": "mark", "text": "x" * 1000}))
@@ -387,7 +387,7 @@ def test_acknowledgements_and_marks_of_an_operator_are_journalled(tmp_path: Path
         ]  # fmt: skip
         assert "got 1000 characters, expected 1 to 200" in events[0]["text"]
         _stopped(process)
-    largest = max(max(row[1:9]) for row in told["seconds"])
+    largest = max(max(row[1:9]) for row in received["seconds"])
     assert largest > 1e5
     entries = [record.entry for record in records_of(tmp_path / "run") if isinstance(record, EntryRecord)]
     marks = [entry.text for entry in entries if isinstance(entry, Mark) and not entry.text.startswith("alarm")]
@@ -417,24 +417,24 @@ def test_a_recording_is_shown_during_and_after_the_run_and_accepts_no_requests(t
         _feed(process, 0, 600)
         with started(command, stderr=subprocess.PIPE) as shown, _data(_said(shown, "screen: ").split()[1]) as page:
             seconds: dict[int, list[Any]] = {}
-            told: dict[str, Any] = {}
+            received: dict[str, Any] = {}
 
             def see(reached: Callable[[], bool]) -> None:
                 while not reached():
                     message = json.loads(page.recv(timeout=30))
                     seconds.update({row[0]: row for row in message.get("seconds", ())})
-                    told.update({key: message[key] for key in ("facts", "motion", "events") if message.get(key)})
-                    told.update(message.get("parts", {}))
+                    received.update({key: message[key] for key in ("facts", "motion", "events") if message.get(key)})
+                    received.update(message.get("parts", {}))
 
             see(lambda: bool(seconds))
             _feed(process, 600)
             _stopped(process)
-            see(lambda: any("recording: complete" in event["text"] for event in told.get("events", ())))
+            see(lambda: any("recording: complete" in event["text"] for event in received.get("events", ())))
             shown.send_signal(signal.SIGINT)
             assert shown.wait(20) == 0
     _, peaks = read_recording(tmp_path / "run")["contact_peaks"].numpy()
-    assert told["facts"]["can_ask"] is False and told["input"][2]["samples_used"] == str(COUNT)
-    assert told["alarms"][2]["force_place"] and told["motion"]["clearance"]["vertical"] == pytest.approx(0.03)
+    assert received["facts"]["can_ask"] is False and received["input"][2]["samples_used"] == str(COUNT)
+    assert received["alarms"][2]["force_place"] and received["motion"]["clearance"]["vertical"] == pytest.approx(0.03)
     assert max(max(row[1:9]) for row in seconds.values()) == pytest.approx(peaks[:, 16:].max(), rel=1e-6)
 
 
@@ -512,11 +512,11 @@ def test_a_browser_shows_the_twin_and_names_as_text_and_loads_only_from_the_serv
     name = "<img src=x onerror='window.fooled=1'>"
     scene = tmp_path / f"{name.replace('/', '')}.yaml"
     scene.write_text(dump_scene(load_scene("paper")))
-    given = ("--scene", scene, "--set", f"hardware_id={name}", "--token-file", tmp_path / "token")
-    given += ("--record", tmp_path / "run")  # without a recording, marks are refused
+    options = ("--scene", scene, "--set", f"hardware_id={name}", "--token-file", tmp_path / "token")
+    options += ("--record", tmp_path / "run")  # without a recording, marks are refused
     (tmp_path / "token").write_text(TOKEN + "\n")
-    with _twin(*given) as (process, said), ExitStack() as opened:
-        url = said.partition("#")[0]
+    with _twin(*options) as (process, line), ExitStack() as opened:
+        url = line.partition("#")[0]
         page = opened.enter_context(browser.page(tmp_path / "browser", f"{url}#token={TOKEN.replace(' ', '%20')}"))
 
         def seen(reached: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
@@ -539,13 +539,13 @@ def test_a_browser_shows_the_twin_and_names_as_text_and_loads_only_from_the_serv
         assert page.evaluate("location.hash + location.search") == ""
         _stopped(process)
         seen(lambda found: "ended" in found["banner"] or "lost" in found["banner"])
-        assert not page.errors and {urlsplit(asked).netloc for asked in page.requests} == {urlsplit(url).netloc}
+        assert not page.errors and {urlsplit(request).netloc for request in page.requests} == {urlsplit(url).netloc}
 
 
 @pytest.mark.skipif(browser.FIREFOX is None, reason="no Firefox is installed")
 def test_firefox_shows_the_twin(tmp_path: Path) -> None:
-    with _twin("--scene", "paper") as (process, said):
-        url = said.partition("#")[0].split()[-1]
+    with _twin("--scene", "paper") as (process, line):
+        url = line.partition("#")[0].split()[-1]
         with browser.firefox_page(tmp_path / "firefox", url) as page:
             _feed(process)
             shown: dict[str, Any] = {}

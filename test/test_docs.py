@@ -63,11 +63,11 @@ def test_every_command_on_a_page_has_an_existing_verb_and_valid_options() -> Non
         words = words[2:] if words[0] == "--laws" else words  # all verbs accept the option `--laws`
         while isinstance(command, click.Group) and words and words[0] in command.commands:
             command = command.commands[words.pop(0)]
-        known = {option for one in command.params for option in (*one.opts, *one.secondary_opts)} | {"--help"}
-        given = {word for word in words if word.startswith("--") and not word.startswith("---")}
+        valid = {option for one in command.params for option in (*one.opts, *one.secondary_opts)} | {"--help"}
+        options_given = {word for word in words if word.startswith("--") and not word.startswith("---")}
         required = [{*one.opts} for one in command.params if isinstance(one, click.Option) and one.required]
-        lacking = given != {"--help"} and not all(options & given for options in required)
-        if (isinstance(command, click.Group) and given != {"--help"}) or given - known or lacking:
+        incomplete = options_given != {"--help"} and not all(options & options_given for options in required)
+        if (isinstance(command, click.Group) and options_given != {"--help"}) or options_given - valid or incomplete:
             unknown.append((page, call))
     assert unknown == []
 

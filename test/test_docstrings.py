@@ -36,12 +36,14 @@ def public(package: griffe.Module) -> Iterator[tuple[str, Any]]:
 
 def described(item: Any) -> dict[str, str]:
     """Return the type, shape and text of each parameter and attribute in a docstring."""
-    said = {}
+    descriptions = {}
     for section in item.docstring.parsed:
         if section.kind.value in ("parameters", "attributes"):
             for entry in section.value:
-                said |= {name.strip(): f"{entry.annotation} {entry.description}" for name in entry.name.split(",")}
-    return said
+                descriptions |= {
+                    name.strip(): f"{entry.annotation} {entry.description}" for name in entry.name.split(",")
+                }
+    return descriptions
 
 
 def test_every_public_name_has_a_docstring(package: griffe.Module) -> None:
@@ -51,26 +53,26 @@ def test_every_public_name_has_a_docstring(package: griffe.Module) -> None:
 
 
 def test_every_parameter_is_described_and_every_result(package: griffe.Module) -> None:
-    lacking = []
+    undescribed = []
     for name, function in public(package):
         if not function.is_function:
             continue
         docstring, text = described(function), function.docstring.value
         parameters = [p for p in function.parameters if p.name not in ("self", "cls")]
-        lacking += [f"{name}({p.name})" for p in parameters if p.name not in docstring]
-        lacking += [
+        undescribed += [f"{name}({p.name})" for p in parameters if p.name not in docstring]
+        undescribed += [
             f"{name}({p.name}): no shape"
             for p in parameters
             if ARRAYS.search(str(p.annotation)) and "shape" not in docstring.get(p.name, "")
         ]
         summary = text.partition("\n\n")[0].lower()
         if str(function.returns) != "None" and "Returns\n" not in text and "return" not in summary:
-            lacking.append(f"{name}: what it returns")
-    assert lacking == []
+            undescribed.append(f"{name}: the result")
+    assert undescribed == []
 
 
 def test_every_field_is_described(package: griffe.Module) -> None:
-    lacking = []
+    undescribed = []
     for name, item in public(package):
         if not item.is_class:
             continue
@@ -79,26 +81,26 @@ def test_every_field_is_described(package: griffe.Module) -> None:
             if not field.is_attribute or key.startswith("_") or DECLARED.search(str(field.value)):
                 continue
             if key not in docstring and field.docstring is None:
-                lacking.append(f"{name}.{key}")
+                undescribed.append(f"{name}.{key}")
             elif (
                 ARRAYS.search(str(field.annotation))
                 and "property" not in field.labels
                 and "shape" not in docstring[key]
             ):
-                lacking.append(f"{name}.{key}: no shape")
-    assert lacking == []
+                undescribed.append(f"{name}.{key}: no shape")
+    assert undescribed == []
 
 
 def test_errors_that_a_function_raises_are_documented(package: griffe.Module) -> None:
-    lacking = []
+    undescribed = []
     for name, function in public(package):
         if function.is_function:
             raised = {*re.findall(r"^ +raise (\w+)\(", function.source, re.MULTILINE)}
             docstring = function.docstring.value
             # ArgumentError is a ValueError, so a docstring that names ValueError covers it
             docstring += "ArgumentError" if "ValueError" in docstring else ""
-            lacking += [f"{name}: {error}" for error in raised if error not in docstring]
-    assert lacking == []
+            undescribed += [f"{name}: {error}" for error in raised if error not in docstring]
+    assert undescribed == []
 
 
 def test_no_docstring_begins_with_an_empty_word() -> None:

@@ -48,18 +48,18 @@ def of_drop(drops: Drops, index: int, off: float = 0.0, scene: Scene | None = No
 def test_height_of_the_table_follows_from_measured_drops(drops) -> None:
     rng = np.random.default_rng(4)
     result = [of_drop(drops, index, 0.005 * rng.standard_normal()) for index in range(0, 250, 4)]
-    known = [one for one in result if one.vertical_state.known]
-    assert len(known) > 0.9 * len(result)
+    estimated = [one for one in result if one.vertical_state.known]
+    assert len(estimated) > 0.9 * len(result)
     true = SQUARE.clearance.vertical_m
     # an error of the clearance causes half the error in the height of the table
-    off = 0.5 * np.array([one.vertical.mean - true for one in known])
+    off = 0.5 * np.array([one.vertical.mean - true for one in estimated])
     assert np.median(np.abs(off)) < 5e-4
-    inside = np.mean([one.vertical.p05 < true < one.vertical.p95 for one in known])
+    inside = np.mean([one.vertical.p05 < true < one.vertical.p95 for one in estimated])
     assert 0.8 < inside < 0.99
     # heights that the data do not determine to half a millimetre are marked as rough
-    rough = np.array([one.vertical_state is State.ROUGH for one in known])
+    rough = np.array([one.vertical_state is State.ROUGH for one in estimated])
     assert (rough | (np.abs(off) < 5e-4)).mean() > 0.85
-    for one, flagged in zip(known, rough, strict=True):
+    for one, flagged in zip(estimated, rough, strict=True):
         assert (one.vertical.deviation > 1e-3) == flagged
         assert any(reason.startswith("vertical: rough") for reason in one.reasons) == flagged
 

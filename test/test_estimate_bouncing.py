@@ -79,8 +79,8 @@ def test_the_deviate_of_a_path_is_normal_for_a_correct_model_and_large_for_a_wro
 def test_a_method_that_disagrees_widens_the_interval() -> None:
     values = {"horizontal": Interval.normal(0.03, 3e-5), "vertical": Interval.normal(0.02, 3e-5)}
     fitted = replace(known()[0][1], **values, apparent=None)
-    told, zero, deviation = np.array([0.03003, 0.0204]), np.zeros(3), np.full(2, 4e-5)
-    bounced = Bounced(told, deviation, zero, zero, (-7.0, 0.1), (0.0, 0.1), zero, 0.2, 0.0, 0.0, -np.inf)
+    clearances, zero, deviation = np.array([0.03003, 0.0204]), np.zeros(3), np.full(2, 4e-5)
+    bounced = Bounced(clearances, deviation, zero, zero, (-7.0, 0.1), (0.0, 0.1), zero, 0.2, 0.0, 0.0, -np.inf)
     both = with_bounced(fitted, bounced, 0)
     assert both.horizontal.deviation == pytest.approx(2.4e-5)
     assert both.horizontal.mean == pytest.approx(0.0300108)
@@ -103,9 +103,9 @@ def test_the_bias_of_a_sensor_with_a_hard_contact_is_found(turn: float) -> None:
 def test_a_bias_hardly_changes_the_other_features_of_a_hard_motion() -> None:
     """A remaining angle of 3e-4 rad would separate the measured motion from the simulated motions."""
     truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
-    eye = MotionFeatures(Unknowns(truth.nominal), truth.poses, truth.load.period())
+    motion_features = MotionFeatures(Unknowns(truth.nominal), truth.poses, truth.load.period())
     bias = np.array([1e-4, -1e-4, 6e-4])
-    plain, moved = eye.features(eye.q), eye.features(eye.q + bias)
+    plain, moved = motion_features.features(motion_features.q), motion_features.features(motion_features.q + bias)
     np.testing.assert_allclose(moved[2:5] - plain[2:5], bias, atol=5e-5)
     np.testing.assert_allclose(moved[:2], plain[:2], atol=3e-6)
     np.testing.assert_allclose(moved[5:], plain[5:], rtol=0.02, atol=1e-5)
@@ -120,9 +120,9 @@ def test_the_delay_is_the_lag_at_which_the_measured_path_is_nearest_to_drawn_pat
         path = 1e-2 * np.stack([np.sin(phase), np.cos(2.0 * phase), np.sin(3.0 * phase)], axis=1)
         return np.asarray(path + 1e-3 * rng.standard_normal((len(t), 3)))
 
-    eye = MotionFeatures(Unknowns(preset("paper")), Poses.of(t, seen(0.05))[0], 2.0)
+    motion_features = MotionFeatures(Unknowns(preset("paper")), Poses.of(t, seen(0.05))[0], 2.0)
     features, drawn = rng.standard_normal((40, 3)), [seen(0.0) for _ in range(40)]
-    assert path_delay(eye, features, drawn, np.zeros(3)) == pytest.approx(0.05, abs=3e-3)
+    assert path_delay(motion_features, features, drawn, np.zeros(3)) == pytest.approx(0.05, abs=3e-3)
 
 
 def test_a_classifier_of_drawn_motions_finds_another_law() -> None:
@@ -135,9 +135,9 @@ def test_a_classifier_of_drawn_motions_finds_another_law() -> None:
         rows = 0.1 * rng.standard_normal((count, 6)) + rng.standard_normal((count, 1)) * common
         return np.asarray(rows + 0.4 * label * across)
 
-    believed, other = like(100, 0.0), like(60, 1.0)
-    right = np.array([class_deviate(believed, other, row) for row in like(100, 0.0)])
-    wrong = np.array([class_deviate(believed, other, row) for row in like(100, 1.0)])
+    own, other = like(100, 0.0), like(60, 1.0)
+    right = np.array([class_deviate(own, other, row) for row in like(100, 0.0)])
+    wrong = np.array([class_deviate(own, other, row) for row in like(100, 1.0)])
     assert abs(right.mean()) < 0.4
     assert right.std() == pytest.approx(1.0, abs=0.3)
     assert (right > MOST_OTHER_LAW).mean() < 0.05
@@ -154,10 +154,8 @@ def test_log_odds_find_another_law_even_if_drawn_numbers_have_more_effect() -> N
         like = 2.0 * np.outer(drawn[:, 0], slope) + np.outer(drawn[:, 0] ** 2 + drawn[:, 1], curve)
         return Draws(like + 0.1 * law * apart + 0.1 * rng.standard_normal(like.shape), drawn)
 
-    believed, other = motions(100, 0.0), motions(60, 1.0)
-    right, wrong = (
-        np.array([log_odds(believed, other, row) for row in motions(100, law, 0.6).like]) for law in (0.0, 1.0)
-    )
+    own, other = motions(100, 0.0), motions(60, 1.0)
+    right, wrong = (np.array([log_odds(own, other, row) for row in motions(100, law, 0.6).like]) for law in (0.0, 1.0))
     assert (right > tuning.MOST_ODDS[0]).mean() < 0.03
     assert (wrong > tuning.MOST_ODDS[0]).mean() > 0.97
 
@@ -190,8 +188,8 @@ def test_a_motion_like_those_of_another_law_is_suspect_unless_that_law_is_unlike
 ) -> None:
     moved = np.random.default_rng(1).standard_normal((100, 3))
     two, poses = np.full(2, 1e-3), Poses.of(np.arange(100) * 0.01, 1e-3 * moved)[0]
-    known = (-8.0, 0.5), (0.0, 1.0)
-    bounced = Bounced(two, 0.1 * two, np.zeros(3), np.ones(3), *known, np.ones(3), 1.0, 1.0, deviate, odds)
+    logarithms = (-8.0, 0.5), (0.0, 1.0)
+    bounced = Bounced(two, 0.1 * two, np.zeros(3), np.ones(3), *logarithms, np.ones(3), 1.0, 1.0, deviate, odds)
     assert summarise_bounced(Unknowns(preset("paper")), poses, bounced, 0, 0).model == model
 
 
@@ -199,8 +197,8 @@ def test_quantities_hidden_by_a_hard_motion_widen_the_clearances_and_not_the_twi
     """Corners rounded by 5 mm make the estimated clearances 0.7 mm too large, which is ten standard deviations."""
     truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
     unknowns, period = Unknowns(truth.nominal), truth.load.period()
-    eye = MotionFeatures(unknowns, truth.poses, period)
-    unseen, rounded = hidden_by_geometry(unknowns, truth.poses, period, eye.features(eye.q)[:2])
+    motion_features = MotionFeatures(unknowns, truth.poses, period)
+    unseen, rounded = hidden_by_geometry(unknowns, truth.poses, period, motion_features.features(motion_features.q)[:2])
     assert (unseen > 1.5e-4).all() and (rounded > 3e-4).all()
     zero, narrow = np.zeros(3), np.full(2, 5e-5)
     found = (-12.0, 1.0), (0.0, 1.0), np.ones(3), 1.0, 1.0, 0.0, -np.inf
@@ -217,7 +215,7 @@ def test_quantities_hidden_by_a_hard_motion_widen_the_clearances_and_not_the_twi
     exact = Provenance(Mark.MEASURED, deviation=0.0)
     marks = {**truth.nominal.marks, "frame.width_m": exact, "frame.height_m": exact}
     stated = replace(unknowns, scene=replace(truth.nominal, marks=marks))
-    unseen, rounded = hidden_by_geometry(stated, truth.poses, period, eye.features(eye.q)[:2])
+    unseen, rounded = hidden_by_geometry(stated, truth.poses, period, motion_features.features(motion_features.q)[:2])
     assert not rounded.any() and (unseen > 7e-4).all(), "scales of the sensor and turned walls are left"
 
 
@@ -259,12 +257,12 @@ def test_the_most_likely_clearances_are_found_from_few_drawn_motions() -> None:
         like += 2e-3 * rng.standard_normal((count, 1)) @ (200.0 * late) + rng.standard_normal(like.shape)
         return middle + scale * points, PathFeatures(like, np.tile(200.0 * late, (count, 1)))
 
-    drawn, seen = motions(120)
+    drawn, measured_motions = motions(120)
     fresh, others = motions(60)
     rows = zip(others.like[:, None], others.late[:, None], strict=True)
-    told = np.array([likeliest(drawn, 0.06, seen, PathFeatures(*row))[-1] for row in rows])
-    off = (told - fresh[:, :2]).std(axis=0)
-    of_drawn = (likeliest(drawn, 0.06, seen, motions(1)[1])[:-1] - drawn[:, :2]).std(axis=0)
+    clearances = np.array([likeliest(drawn, 0.06, measured_motions, PathFeatures(*row))[-1] for row in rows])
+    off = (clearances - fresh[:, :2]).std(axis=0)
+    of_drawn = (likeliest(drawn, 0.06, measured_motions, motions(1)[1])[:-1] - drawn[:, :2]).std(axis=0)
     assert (off < 0.15 * scale[:2]).all()
     assert of_drawn == pytest.approx(off, rel=0.25)
 

@@ -139,8 +139,8 @@ def test_a_change_without_effect_on_the_motion_has_no_derivative() -> None:
     moved = problem.evaluate(point.shared, point.states, change=heavier)
     assert moved is not None
     by_mass = np.nan_to_num(moved.predicted - point.predicted)
-    left = by_mass + problem.with_fine_steps().linearise(point).rows[:, :, :SIZE] @ step
-    assert (np.linalg.norm(left, axis=0) < 0.02 * np.linalg.norm(by_mass, axis=0)).all()
+    remaining = by_mass + problem.with_fine_steps().linearise(point).rows[:, :, :SIZE] @ step
+    assert (np.linalg.norm(remaining, axis=0) < 0.02 * np.linalg.norm(by_mass, axis=0)).all()
 
 
 def test_motions_in_lanes_agree_with_motions_alone() -> None:

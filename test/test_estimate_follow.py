@@ -204,8 +204,8 @@ def test_a_rough_estimate_does_not_replace_an_accurate_estimate_of_the_same_moti
 
 
 def test_twins_have_the_friction_that_an_estimate_finds(truth: Truth) -> None:
-    known = replace(_known(truth), differs={"friction.coefficient": (0.9, 0.1, 0.02)})
-    members = Ensemble(truth.nominal, known, FEWEST, np.random.default_rng(0), 0.0, TOLERANCE, np.zeros(PAIR_COUNT))
+    estimate = replace(_known(truth), differs={"friction.coefficient": (0.9, 0.1, 0.02)})
+    members = Ensemble(truth.nominal, estimate, FEWEST, np.random.default_rng(0), 0.0, TOLERANCE, np.zeros(PAIR_COUNT))
     assert members.first.scene.friction == Friction(0.1)
     assert members.others is not None
     drawn = [one.friction.coefficient for one in members.others.scenes if one.friction is not None]
@@ -213,15 +213,15 @@ def test_twins_have_the_friction_that_an_estimate_finds(truth: Truth) -> None:
     follower = Follower(truth.nominal, FEWEST)
     without = follower.signature
     _run(follower, truth, 0.2)
-    assert _take(follower, known) and follower.signature != without
+    assert _take(follower, estimate) and follower.signature != without
     restored = Follower(truth.nominal, FEWEST)
     restored.restore(follower.snapshot())
     assert np.array_equal(_run(restored, truth, 0.4, 0.2), _run(follower, truth, 0.4, 0.2))
     assert restored.digest() == follower.digest()
     # kernels with friction are compiled only for a friction that is more probable than not
-    assert _take(follower, replace(known, differs={"friction.coefficient": (0.4, 0.1, 0.02)}))
+    assert _take(follower, replace(estimate, differs={"friction.coefficient": (0.4, 0.1, 0.02)}))
     assert follower.signature == without
-    assert not rubs(replace(truth.nominal, wear=Wear(1e-14, pad_area_m2=0.02, travel_speed_m_s=0.5)), known)
+    assert not rubs(replace(truth.nominal, wear=Wear(1e-14, pad_area_m2=0.02, travel_speed_m_s=0.5)), estimate)
 
 
 def test_kernels_with_friction_are_compiled_at_the_start_only_without_a_cache(
@@ -308,7 +308,7 @@ def test_intervals_allow_for_the_load_error_of_a_rough_estimate(truth: Truth, fo
         assert _take(follower, estimate)
         off = replace(truth, load=replace(truth.load, wrench=wrench))
         _run(follower, off, 1.995, 1.0)
-        saved, told = follower.snapshot(), np.zeros(201, ROW)
+        saved, rows_given = follower.snapshot(), np.zeros(201, ROW)
         for one in (follower, Follower(truth.nominal, MEMBERS)):
             one.every_row = True
             one.restore(saved)
@@ -316,10 +316,10 @@ def test_intervals_allow_for_the_load_error_of_a_rough_estimate(truth: Truth, fo
             for row, index in enumerate(range(200, 401)):
                 one.add_pose(float(truth.poses.t[index - 1]), truth.poses.q[index - 1])
                 one.advance_rows(off.load.t[index : index + 1], wrench[index : index + 1], rows[row : row + 1])
-            assert one is follower or np.array_equal(rows, told)
-            told = rows
+            assert one is follower or np.array_equal(rows, rows_given)
+            rows_given = rows
         true = forces[there]
-        inside = (told["force_low"] <= true) & (true <= told["force_high"])
+        inside = (rows_given["force_low"] <= true) & (true <= rows_given["force_high"])
         held[name] = float(inside[true > 0.0].mean())
     assert held["plain"] < 0.6 and held["rough"] > 0.8
 

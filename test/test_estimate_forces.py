@@ -89,7 +89,7 @@ def test_a_cell_that_contradicts_the_motion_is_named(
     estimated = summary._with_forces(result, problem, fit, replace(truth.forces, force=force), 1.0)
     assert (estimated.sensor, estimated.model, estimated.horizontal_state) == ("suspect", "ok", State.WITHDRAWN)
     named = {PAIR_NAMES[2], PAIR_NAMES[5]} if fault == "swapped" else {PAIR_NAMES[2]}
-    assert {name for name in PAIR_NAMES if any(f" {name}:" in why for why in estimated.reasons)} == named
+    assert {name for name in PAIR_NAMES if any(f" {name}:" in reason for reason in estimated.reasons)} == named
     assert estimated.stiffness == result.stiffness and estimated.as_dict()["forces_measured"]["rows"] == 0
 
 

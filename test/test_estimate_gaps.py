@@ -59,10 +59,10 @@ def test_gaps_that_do_not_determine_the_clearances_are_not_used_and_the_reason_n
     gap[:, [3, 5]] = np.nan  # there is no gap sensor at the right wall
     gaps, _ = Gaps.of(truth.poses.t, gap)
     names = ", ".join(PAIR_NAMES[pair] for pair in (0, 1, 2, 4, 6, 7))
-    why = f"gaps: got sensors at {names}, expected five pairs that determine theta, or one pair at each wall"
-    assert fit_gaps(truth.nominal, gaps, truth.poses) == why
+    reason = f"gaps: got sensors at {names}, expected five pairs that determine theta, or one pair at each wall"
+    assert fit_gaps(truth.nominal, gaps, truth.poses) == reason
     result = estimate(truth.nominal, truth.load, Poses(truth.poses.t[:0], truth.poses.q[:0]), gaps=gaps)
-    assert result.horizontal_state is State.PRIOR and result.reasons[-1] == why
+    assert result.horizontal_state is State.PRIOR and result.reasons[-1] == reason
     few, _ = Gaps.of(truth.poses.t[:9], gapped[1][:9])
     assert str(fit_gaps(truth.nominal, few, truth.poses)).endswith("expected at least 20")
     late = few.between(1e6, 2e6)

@@ -57,9 +57,9 @@ def test_the_jump_agrees_with_the_direct_run_with_sliding_in_the_plane_and_runni
     early = [np.interp(0.25 * exposure, path.exposure, pad) for pad in path.depth.T]
     assert early == pytest.approx(quarter, rel=0.05, abs=1e-5)
     # larger clearances mean that the pads have worn, so that their running-in is complete
-    grown = with_clearances(scene, scene.clearance.horizontal_m + 2e-3, scene.clearance.vertical_m)
-    assert grown.wear is not None and grown.clearance == scene.clearance
-    assert grown.wear.initial_depth_m == pytest.approx(1e-3 * np.abs(NORMAL_X))
+    worn = with_clearances(scene, scene.clearance.horizontal_m + 2e-3, scene.clearance.vertical_m)
+    assert worn.wear is not None and worn.clearance == scene.clearance
+    assert worn.wear.initial_depth_m == pytest.approx(1e-3 * np.abs(NORMAL_X))
 
 
 def test_constant_force_wears_as_archard_says() -> None:
@@ -185,7 +185,7 @@ def test_a_scene_without_wear_or_period_is_refused() -> None:
     with pytest.raises(LifeError, match=r"wear\.travel_speed_m_s: got 0, expected a speed above 0"):
         forecast(replace(scene, wear=Wear(1e-14, 0.015, 0.0)), Plan(0.03, 0.03, 100.0))
     for unlikely in (0.0, 5e-13):
-        with pytest.raises(LifeError, match=r"expected one within wear\.prior_m2_n, 1e-15 to 1e-13"):
+        with pytest.raises(LifeError, match=r"expected a value within wear\.prior_m2_n, 1e-15 to 1e-13"):
             forecast(replace(scene, wear=Wear(unlikely, 0.015, 2.0)), Plan(0.03, 0.03, 100.0))
     with pytest.raises(LifeError, match="loads: got no harmonic"):
         mean_forces(replace(scene, loads=()), np.zeros(8))
@@ -198,30 +198,30 @@ def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, caps
     worn = replace(scene, wear=replace(FAST, coefficient_m2_n=true_k))
     spans = np.arange(0.0, 25.0, 4.0) * period_of(scene)
     depth = np.array([np.zeros(8), *(simulate(worn, span, span, 1e-6).wear_depth for span in spans[1:])])
-    grown = 0.5 * np.stack([depth @ np.abs(NORMAL_X), depth @ np.abs(NORMAL_Y)], axis=1)
+    growth = 0.5 * np.stack([depth @ np.abs(NORMAL_X), depth @ np.abs(NORMAL_Y)], axis=1)
     noise = 5e-5
     rng = np.random.default_rng(4)
-    clearance = np.array([0.025, 0.030]) + grown + noise * rng.standard_normal(grown.shape)
-    history = History(spans * FAST.travel_speed_m_s, clearance, np.full(grown.shape, noise))
-    known = coefficient(scene, history)
-    interval = known.interval()
+    clearance = np.array([0.025, 0.030]) + growth + noise * rng.standard_normal(growth.shape)
+    history = History(spans * FAST.travel_speed_m_s, clearance, np.full(growth.shape, noise))
+    estimated = coefficient(scene, history)
+    interval = estimated.interval()
     assert interval.p05 < true_k < interval.p95 and interval.p95 / interval.p05 < 1.3**2
     # without noise, the clearances would determine the coefficient exactly, but the interval includes the error of the
     # path
-    sure = replace(known, weight=np.eye(len(known.value))[len(known.value) // 2]).interval()
+    sure = replace(estimated, weight=np.eye(len(estimated.value))[len(estimated.value) // 2]).interval()
     assert sure.p95 / sure.p05 > math.exp(3.2 * tuning.PATH_DEVIATION)
-    assert np.abs(known.clearance - [0.025, 0.030] - grown[-1]).max() < 4.0 * noise
+    assert np.abs(estimated.clearance - [0.025, 0.030] - growth[-1]).max() < 4.0 * noise
     # the forecast begins with the present depths of the pads, which have worn unequally
-    assert known.depth == pytest.approx(depth[-1], rel=0.1, abs=5e-5)
-    ahead = with_clearances(scene, *map(float, known.clearance), known.depth)
-    assert ahead.wear is not None and ahead.wear.initial_depth_m == pytest.approx(known.depth)
+    assert estimated.depth == pytest.approx(depth[-1], rel=0.1, abs=5e-5)
+    ahead = with_clearances(scene, *map(float, estimated.clearance), estimated.depth)
+    assert ahead.wear is not None and ahead.wear.initial_depth_m == pytest.approx(estimated.depth)
     total = np.array([ahead.clearance.horizontal_m, ahead.clearance.vertical_m]) + 0.5 * np.array(
-        [known.depth @ np.abs(NORMAL_X), known.depth @ np.abs(NORMAL_Y)]
+        [estimated.depth @ np.abs(NORMAL_X), estimated.depth @ np.abs(NORMAL_Y)]
     )
-    assert total == pytest.approx(known.clearance)
+    assert total == pytest.approx(estimated.clearance)
     # a narrower posterior gives a narrower forecast
     plan = Plan(0.030, 0.035, 1.0, load_deviation=0.0)
-    prior, posterior = (forecast(scene, plan, known=knowledge) for knowledge in (None, known))
+    prior, posterior = (forecast(scene, plan, known=knowledge) for knowledge in (None, estimated))
     ratios = [life.quantile(0.9) / life.quantile(0.1) for life in (prior, posterior)]  # type: ignore[operator]
     assert ratios[1] < 1.5 < ratios[0]
 
@@ -239,20 +239,22 @@ def test_a_history_of_clearances_determines_the_coefficient(tmp_path: Path, caps
 def test_a_forecast_wears_the_pads_by_the_contact_that_was_estimated() -> None:
     """The forces on the pads depend on the contact, so the forecast must use the estimated contact."""
     wear = Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14))
-    believed = replace(preset("paper"), wear=wear)
-    hard = replace(believed, contact=replace(believed.contact, stiffness=2.4 * believed.contact.stiffness))
+    nominal = replace(preset("paper"), wear=wear)
+    hard = replace(nominal, contact=replace(nominal.contact, stiffness=2.4 * nominal.contact.stiffness))
     facts = {
         name: {"mean_m": mean, "p05_m": mean - 1e-4, "p95_m": mean + 1e-4, "state": "estimated"}
         for name, mean in (("horizontal", 0.025), ("vertical", 0.030))
     } | {name: {"mean": getattr(hard.contact, name)} for name in ("stiffness", "damping")}
     plan, exact = Plan(0.026, 0.040, 1e6, draws=50), (6e-5, 6e-5)
     hours = forecast(hard, plan, exact).quantile(0.5)
-    now, deviation = with_estimate(believed, facts)
+    now, deviation = with_estimate(nominal, facts)
     assert now.contact == hard.contact
     assert forecast(now, plan, deviation).quantile(0.5) == pytest.approx(hours, rel=0.01)
-    assert forecast(believed, plan, exact).quantile(0.5) != pytest.approx(hours, rel=0.05)
-    nothing = {name: told | {"state": "not_observable"} for name, told in facts.items() if "mean_m" in told}
-    assert with_estimate(believed, facts | nothing)[0].contact == believed.contact
+    assert forecast(nominal, plan, exact).quantile(0.5) != pytest.approx(hours, rel=0.05)
+    nothing = {
+        name: axis_facts | {"state": "not_observable"} for name, axis_facts in facts.items() if "mean_m" in axis_facts
+    }
+    assert with_estimate(nominal, facts | nothing)[0].contact == nominal.contact
 
 
 def test_an_unfinished_path_is_an_error_and_not_an_unreached_limit() -> None:

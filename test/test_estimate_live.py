@@ -28,7 +28,7 @@ from plow_twin.cli.app import run as run_cli
 from plow_twin.estimate.answer import Requests
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.window import Window, Windows
-from plow_twin.estimate.worker import Found, Worker, serve
+from plow_twin.estimate.worker import WindowResult, Worker, serve
 from plow_twin.live.estimation import Estimation, entry_of, message_of
 from plow_twin.live.parameters import settings
 from plow_twin.model.pairs import PAIR_NAMES
@@ -191,7 +191,7 @@ def test_the_live_estimate_is_published_and_repeated_by_the_journal(tmp_path: Pa
     run = tmp_path / "run"
     with bench(tmp_path, record_path=run, **settings, **RELIABLE) as running:
         probe = running.probe
-        heard: list[JointState] = probe.listen(JointState, "estimate")
+        estimates: list[JointState] = probe.listen(JointState, "estimate")
         clearances: list[JointState] = probe.listen(JointState, "clearance")
         forces: list[JointState] = probe.listen(JointState, "window_forces")
         forecasts: list[JointState] = probe.listen(JointState, "forecast")
@@ -200,10 +200,10 @@ def test_the_live_estimate_is_published_and_repeated_by_the_journal(tmp_path: Pa
         _play(running, truth, late=True)
         # windows end every 4 s; on a slow machine a window may be skipped, but not the last window
         last_s = (START_NS + round((truth.load.t[-1] - WAIT_S) * 1e9)) // round(INTERVAL_S * 1e9) * round(INTERVAL_S)
-        probe.until(lambda: heard and heard[-1].header.stamp.sec == last_s, "the last window's estimate", 100.0)
+        probe.until(lambda: estimates and estimates[-1].header.stamp.sec == last_s, "the last window's estimate", 100.0)
         probe.until_figure("estimate", "estimates", *map(str, range(1, 9)))
         probe.until(lambda: value(probe.status[-1], "horizontal") == "estimated", "the flag")
-        published = dict(zip(heard[-1].name, heard[-1].position, strict=True))
+        published = dict(zip(estimates[-1].name, estimates[-1].position, strict=True))
         # the hold policy applies the estimate in the next slow publication
         probe.until(lambda: abs(clearances[-1].position[0] - published["horizontal"]) < 1e-9, "the clearance")
         last = dict(zip(clearances[-1].name, clearances[-1].position, strict=True))
@@ -229,9 +229,9 @@ def test_the_live_estimate_is_published_and_repeated_by_the_journal(tmp_path: Pa
     assert group["mean_m"] == pytest.approx(truth.clearance[0], abs=3e-4) and group["p95_m"] - group["p05_m"] > 4e-4
     # forecast and forces are computed from the same estimate
     assert facts["forecast"] == json.loads(answer.message)
-    told = dict(zip(forecasts[-1].name, forecasts[-1].position, strict=True))
-    assert told["seconds/p50"] == pytest.approx(3600.0 * facts["forecast"]["p50"]["hours"])
-    assert told["seconds/p10"] < told["seconds/p50"] and told["not_reached_in_horizon"] < 0.5
+    forecast = dict(zip(forecasts[-1].name, forecasts[-1].position, strict=True))
+    assert forecast["seconds/p50"] == pytest.approx(3600.0 * facts["forecast"]["p50"]["hours"])
+    assert forecast["seconds/p10"] < forecast["seconds/p50"] and forecast["not_reached_in_horizon"] < 0.5
     peaks = dict(zip(forces[-1].name, forces[-1].effort, strict=True))
     assert peaks["top_left_top/p95"] == facts["forces"]["pairs"]["top_left_top"]["peak_n"]["p95"] > 0.0
     assert len(peaks) == len(forces[-1].velocity) == 24 and facts["forces"]["members"] == 20
@@ -245,26 +245,26 @@ def test_without_a_load_the_interval_of_the_rough_clearance_contains_the_truth(t
     settings = {"estimate": "true", "estimate_window": WINDOW_S, "estimate_interval": INTERVAL_S}
     with bench(tmp_path, **settings, **RELIABLE) as running:
         probe = running.probe
-        heard: list[JointState] = probe.listen(JointState, "estimate")
+        estimates: list[JointState] = probe.listen(JointState, "estimate")
         pose = probe.publisher(PoseStamped, "head_pose")
         probe.until_figure("estimate", "ready", "1", timeout_s=100.0)
         for index, (t, q) in enumerate(zip(truth.poses.t, truth.poses.q, strict=True)):
             pose.publish(_pose(t, q))
             probe.pace(index)
-        probe.until(lambda: len(heard) >= 1, "an estimate", 100.0)
+        probe.until(lambda: len(estimates) >= 1, "an estimate", 100.0)
         probe.until(lambda: value(probe.status[-1], "horizontal") == "rough", "the flag")
         assert [value(probe.status[-1], key) for key in ("vertical", "model")] == ["rough", "suspect"]
-    published = dict(zip(heard[-1].name, heard[-1].position, strict=True))
+    published = dict(zip(estimates[-1].name, estimates[-1].position, strict=True))
     for name, true in zip(("horizontal", "vertical"), truth.clearance, strict=True):
         assert published[f"{name}/p05"] < true < published[f"{name}/p95"] < published[f"{name}/p05"] + 5e-3
 
 
-def _found(horizontal: State, vertical: State) -> Found:
+def _found(horizontal: State, vertical: State) -> WindowResult:
     result = Estimate(
         0.0, 1.0, Interval(0.02, 0.019, 0.021), Interval(0.03, 0.028, 0.032), horizontal, vertical,
         stiffness=Interval(1e7, 9e6, 1.1e7),
     )  # fmt: skip
-    return Found(START_NS, START_NS + 1, 2, 3, (), result, 0.1, 0, 0)
+    return WindowResult(START_NS, START_NS + 1, 2, 3, (), result, 0.1, 0, 0)
 
 
 def test_an_estimate_stays_until_it_is_withdrawn_or_the_pads_are_changed() -> None:
@@ -302,12 +302,12 @@ class _Finished:
     """A worker without a process. The test sets its results and its error."""
 
     def __init__(self, *_: Any) -> None:
-        self.found: list[Found] = []
+        self.found: list[WindowResult] = []
         self.error, self.ended = "", None
         self.deviations: list[tuple[float, ...]] = []
         self.closed = False
 
-    def poll(self) -> Found | None:
+    def poll(self) -> WindowResult | None:
         return self.found.pop() if self.found else None
 
     def add_load(self, *_: Any) -> None:
@@ -479,8 +479,8 @@ def test_the_last_window_of_a_file_is_estimated_or_too_few_data_are_reported(
     (tmp_path / "own.yaml").write_text("excitation: {topic: own}\nhead_pose: {topic: own}\n")
     (tmp_path / "scene.yaml").write_text(dump_scene(truth.scene), encoding="utf-8")
     options = ["--map", tmp_path / "own.yaml", "--scene", tmp_path / "scene.yaml", "--record", tmp_path / "run"]
-    given = ["estimate=true", "follow=off", f"estimate_window={WINDOW_S}", f"estimate_interval={INTERVAL_S}"]
-    words = ["live", tmp_path / "own.csv", *options, *(word for text in given for word in ("--set", text))]
+    settings = ["estimate=true", "follow=off", f"estimate_window={WINDOW_S}", f"estimate_interval={INTERVAL_S}"]
+    words = ["live", tmp_path / "own.csv", *options, *(word for text in settings for word in ("--set", text))]
     assert run_cli(list(map(str, words))) == code
     shown = capsys.readouterr()
     estimates = list(live_estimates(RunReader(tmp_path / "run")))

@@ -105,8 +105,8 @@ def test_rare_samples_of_a_rough_load_determine_only_its_oscillation() -> None:
     _, its, of_samples = load._roughness()
     share = (of_samples - its) / (impulse**2).mean(axis=0)
     assert ((share > 0.4) & (share < 1.3)).all(), "samples hardly tell how short the correlation is"
-    known = load.believable()
-    left = np.stack([np.interp(known.t, fine, column) for column in slow.T], axis=1) - known.wrench
+    believable = load.believable()
+    residual = np.stack([np.interp(believable.t, fine, column) for column in slow.T], axis=1) - believable.wrench
     # the samples have errors with standard deviations of 1, 2 and 3; the remaining errors are smaller
-    assert (left.std(axis=0) < [0.4, 0.8, 1.2]).all()
-    assert (np.array(known.unknown) < (impulse**2).mean(axis=0)).all()
+    assert (residual.std(axis=0) < [0.4, 0.8, 1.2]).all()
+    assert (np.array(believable.unknown) < (impulse**2).mean(axis=0)).all()

@@ -225,7 +225,7 @@ for name, words in asked:
 
 def test_absurd_recordings_end_with_one_line(tmp_path: Path) -> None:
     """No command ends by a signal or prints a traceback. Errors have one line, and time and memory are limited."""
-    asked = []
+    commands = []
     for file, make in MADE.items():
         name, _, ending = file.partition(".")
         kind = f".{ending}" if ending != "mcap" else "foreign" if name in FOREIGN else "run"
@@ -236,7 +236,7 @@ def test_absurd_recordings_end_with_one_line(tmp_path: Path) -> None:
         for words in COMMANDS[kind]:
             places = {"FILE": file, "map.yaml": "map.yaml"}
             words = [*words, "--out", "OUT"] if words[0] in ("setup", "study") else words
-            asked.append(
+            commands.append(
                 (
                     name,
                     [
@@ -251,13 +251,13 @@ def test_absurd_recordings_end_with_one_line(tmp_path: Path) -> None:
         [sys.executable, "-c", RUNNER],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "10000"},
-        input=json.dumps([plain, asked]),
+        input=json.dumps([plain, commands]),
         capture_output=True,
         text=True,
         check=False,
     )
     answers = [json.loads(line) for line in completed.stdout.splitlines()]
-    assert len(answers) == len(asked), completed.stderr[-2000:]
+    assert len(answers) == len(commands), completed.stderr[-2000:]
     for name, words, code, text, memory_mb in answers:
         where = (name, words[0], code, memory_mb, text[-500:])
         unread = name == "header_file" and words[0] != "replay"  # these commands need no scene

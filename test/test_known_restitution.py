@@ -61,15 +61,15 @@ def test_impacts_below_the_speed_floor_have_a_higher_restitution() -> None:
 
 @pytest.mark.parametrize("law", DELIVERED)
 def test_the_other_laws_deliver_their_published_restitution(law: str) -> None:
-    for asked, known in zip(ASKED, DELIVERED[law], strict=True):
-        assert restitution.measure(law, [asked])[0].delivered == pytest.approx(known, abs=6e-5)
+    for nominal, published in zip(ASKED, DELIVERED[law], strict=True):
+        assert restitution.measure(law, [nominal])[0].delivered == pytest.approx(published, abs=6e-5)
 
 
 @pytest.mark.parametrize("law", restitution.restitution_laws())
 def test_every_law_delivers_the_restitution_that_the_identity_gives(law: str) -> None:
-    for asked in (0.15, 0.55, 0.85):
-        delivered = restitution.measure(law, [asked])[0].delivered
-        assert exact_damping_number(delivered) == pytest.approx(LAWS[law].damping_number(asked), rel=1e-7)
+    for nominal in (0.15, 0.55, 0.85):
+        delivered = restitution.measure(law, [nominal])[0].delivered
+        assert exact_damping_number(delivered) == pytest.approx(LAWS[law].damping_number(nominal), rel=1e-7)
 
 
 @pytest.mark.parametrize(

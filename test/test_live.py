@@ -85,14 +85,14 @@ STRAY = ("5000000", "1e30", "0", "-7", "nan")
 def _run(path: Path, mapping: Path | None = None, reports: list[Part] | None = None, **values: Any) -> dict[str, Part]:
     """Run a twin on a file and return its diagnostics. Diagnostics during the run are added to `reports`."""
     settings = parameters.settings(values)
-    said: list[str] = []
+    messages: list[str] = []
 
     def say(name: str, part: Part) -> None:
         if name == "state" and reports is not None:
             reports.append(part)
 
     prepared = Preparation(settings).result(lambda: False)
-    front = BridgeFront(Files([path], follow=False), mapping, settings, prepared, say, said.append)
+    front = BridgeFront(Files([path], follow=False), mapping, settings, prepared, say, messages.append)
     assert front.run(lambda: False) == []
     return front.parts()
 
@@ -116,8 +116,8 @@ def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(
     assert (report.samples, report.exit_code, report.first_divergence) == (1000, 0, None)
     assert report.compared["contact_forces"] == 1000
     # the recording contains the unused messages, and their numbers agree with the counters of the twin
-    told = {key.removeprefix("dropped_"): int(count) for key, count in dropped.items()}
-    assert report.inputs == examine(tmp_path / "run").inputs == {"excitation": {"used": 1000, **told}}
+    drops = {key.removeprefix("dropped_"): int(count) for key, count in dropped.items()}
+    assert report.inputs == examine(tmp_path / "run").inputs == {"excitation": {"used": 1000, **drops}}
     unused = {unused_entry["reason"]: unused_entry for unused_entry in unused_messages(tmp_path / "run")}
     assert unused["implausible"]["values"] == (1e9, 0.0, 0.0)
     assert repr(unused["non_finite"]["values"]) == "(nan, 0.0, 0.0)"
@@ -192,9 +192,9 @@ def test_measured_poses_and_gaps_are_journalled_in_order_of_arrival(tmp_path: Pa
 
 
 def test_bounded_work_is_reported_with_its_error_and_repeated_by_the_journal(tmp_path: Path) -> None:
-    given = {"scene": "bench_kv", "max_evaluations": 16, "record_path": str(tmp_path / "run")}
+    settings = {"scene": "bench_kv", "max_evaluations": 16, "record_path": str(tmp_path / "run")}
     reports: list[Part] = []
-    parts = _run(_csv(tmp_path / "load.csv", 1500), reports=reports, **given)
+    parts = _run(_csv(tmp_path / "load.csv", 1500), reports=reports, **settings)
     # a report covers the time since the previous report, so the largest error may be in any report
     largest = max(float(values["error_estimate_m"]) for _, _, values in (*reports, parts["state"]))
     assert int(parts["state"][2]["coarse_advances"]) > 0 and 0.0 < largest < 1e-3
@@ -211,8 +211,8 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
     path.write_text("t,fx,fy,m,x,y,theta\n" + "\n".join(rows) + "\n")
     mapping = tmp_path / "map.yaml"
     mapping.write_text("excitation: {topic: all}\nhead_pose: {topic: all}\n")
-    given = {"alarm_force": [1e3, 1e9], "alarm_residual": [0.015, 0.0], "alarm_duration": 0.002}
-    settings = parameters.settings(given | {"record_path": str(tmp_path / "run")})
+    parameters_of_run = {"alarm_force": [1e3, 1e9], "alarm_residual": [0.015, 0.0], "alarm_duration": 0.002}
+    settings = parameters.settings(parameters_of_run | {"record_path": str(tmp_path / "run")})
     said: list[tuple[str, Part]] = []
     front = BridgeFront(
         Files([path], follow=False), mapping, settings, Preparation(settings).result(lambda: False),
@@ -273,7 +273,7 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
     report = replay(rewrite(file, tmp_path / "cut.mcap", cut))
     assert (report.exit_code, report.compared["alarms"]) == (0, len(recorded) - 1)
     # alarms cannot be compared without recorded outputs
-    few = given | {"record_path": str(tmp_path / "few"), "record_outputs": "none"}
+    few = parameters_of_run | {"record_path": str(tmp_path / "few"), "record_outputs": "none"}
     _run(path, mapping, **few)
     report = replay(tmp_path / "few")
     assert (report.exit_code, report.compared["alarms"]) == (0, 0) and report.not_compared["alarms"] > 0
@@ -420,12 +420,12 @@ def test_a_full_disk_under_the_log_does_not_end_the_twin(tmp_path: Path) -> None
 
 
 def test_a_hanging_reader_of_the_lines_stops_nothing_and_lost_lines_are_counted() -> None:
-    taken: list[str] = []
+    lines: list[str] = []
     hangs, lost_at = threading.Event(), list[int]()
 
     def write(line: str) -> bool:
         hangs.wait(60.0)
-        taken.append(line)
+        lines.append(line)
         return True
 
     outlet = Outlet(write, lambda: lost_at.append(outlet.lost))
@@ -434,8 +434,8 @@ def test_a_hanging_reader_of_the_lines_stops_nothing_and_lost_lines_are_counted(
     assert lost_at == [1] and 99 <= outlet.lost <= 100
     hangs.set()
     # after the line that was being written, the newest lines are written in order
-    assert outlet.close() and len(taken) + outlet.lost == MOST_WAITING + 100
-    assert taken[-MOST_WAITING:] == list(map(str, range(100, MOST_WAITING + 100)))
+    assert outlet.close() and len(lines) + outlet.lost == MOST_WAITING + 100
+    assert lines[-MOST_WAITING:] == list(map(str, range(100, MOST_WAITING + 100)))
 
 
 def test_a_live_twin_with_an_unread_standard_output_continues_and_can_be_stopped(tmp_path: Path) -> None:
@@ -471,17 +471,17 @@ class Live:
         self.heard: dict[str, dict[str, Any]] = {}
         self.alarms: list[dict[str, Any]] = []
 
-    def until(self, reached: Callable[[dict[str, dict[str, Any]]], bool], what: str) -> dict[str, str]:
+    def until(self, reached: Callable[[dict[str, dict[str, Any]]], bool], event: str) -> dict[str, str]:
         """Read the output until a condition is true. Return the values of its part `input`."""
         give_up = time.monotonic() + START_S
         assert self.process.stdout is not None
         while not ("input" in self.heard and reached(self.heard)):
-            assert time.monotonic() < give_up, f"{what}: {self.heard}"
+            assert time.monotonic() < give_up, f"{event}: {self.heard}"
             line = self.process.stdout.readline()
-            assert line, f"{what}: ended: {self.process.communicate()[1].decode()}; {self.heard}"
-            said = json.loads(line)
-            self.heard[said["topic"]] = said
-            self.alarms += [said] if said["topic"] == "alarms" else []
+            assert line, f"{event}: ended: {self.process.communicate()[1].decode()}; {self.heard}"
+            part = json.loads(line)
+            self.heard[part["topic"]] = part
+            self.alarms += [part] if part["topic"] == "alarms" else []
         return {key: str(counts) for key, counts in self.heard["input"]["values"].items()}
 
     def until_count(self, key: str, count: int) -> dict[str, str]:
@@ -540,11 +540,11 @@ def test_an_alarm_is_reported_once_with_value_pad_threshold_and_time_and_acknowl
     with _live(*arguments, "--record", str(tmp_path / "run")) as live:
         live.until_count("samples_used", 5000)
         # within five seconds the force exceeds the threshold repeatedly, but the alarm is reported once
-        (said,) = live.alarms
-        values = said["values"]
+        (alarm,) = live.alarms
+        values = alarm["values"]
         assert values["force_raised"] > values["force_threshold"] == 20e3 and values["force_place"] in PAIR_NAMES
-        assert said["stamp_ns"] >= values["force_stamp_ns"] > 1_000_000_000
-        assert f"kN at {values['force_place']}, warning threshold 20 kN, at 0." in said["message"]
+        assert alarm["stamp_ns"] >= values["force_stamp_ns"] > 1_000_000_000
+        assert f"kN at {values['force_place']}, warning threshold 20 kN, at 0." in alarm["message"]
         again = sum(record.topic == "/alarms" for record in records_of(tmp_path / "run") if hasattr(record, "topic"))
         assert again > 4
         mark, acknowledge = ["call", str(control), "mark", "new pads"], ["call", str(control), "acknowledge_alarms"]
@@ -727,8 +727,12 @@ class Endless:
 @pytest.mark.stress
 def test_the_memory_of_a_long_run_is_bounded_except_for_the_index_of_the_recording(tmp_path: Path) -> None:
     (tmp_path / "map.yaml").write_text("excitation: {topic: load}\nhead_pose: {topic: load}\ntravel: {topic: load}\n")
-    given = {"record_path": str(tmp_path / "run"), "alarm_force": [1e3, 1e9], "alarm_residual": [0.015, 0.0]}
-    settings = parameters.settings(given | {"jump_forward": 3600.0, "excitation_timeout": 3600.0})
+    parameters_of_run = {
+        "record_path": str(tmp_path / "run"),
+        "alarm_force": [1e3, 1e9],
+        "alarm_residual": [0.015, 0.0],
+    }
+    settings = parameters.settings(parameters_of_run | {"jump_forward": 3600.0, "excitation_timeout": 3600.0})
     memory: list[tuple[int, int, int]] = []
 
     def look(index: int) -> bool:
@@ -957,16 +961,16 @@ def test_every_view_reports_a_silence_in_a_file_and_no_loss(tmp_path: Path, caps
     assert f"{named}; in these intervals the load is interpolated linearly" in capsys.readouterr().out.replace("\n", "")
 
 
-@pytest.mark.parametrize(("given", "said"), [("follow=full", True), ("follow=parameters", False)])
+@pytest.mark.parametrize(("setting", "said"), [("follow=full", True), ("follow=parameters", False)])
 def test_a_file_is_read_at_the_speed_of_the_following_twins_and_a_message_says_so(
-    given: str, said: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    setting: str, reported: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = _csv(tmp_path / "load.csv", 50)
-    options = ["--set", "estimate=true", "--set", given, "--set", "follow_members=20"]
+    options = ["--set", "estimate=true", "--set", setting, "--set", "follow_members=20"]
     # exit code 3: there are not enough data for an estimate
     assert run_cli(["live", str(path), "--scene", "paper", *options]) == 3
-    assert ("20 twins follow the machine" in capsys.readouterr().err) == said
-    if not said:
+    assert ("20 twins follow the machine" in capsys.readouterr().err) == reported
+    if not reported:
         assert run_cli(["live", str(path), "--scene", "paper", *options, "--follow", "--seconds", "0.5"]) == 0
         assert "no estimate was made, because the run ended too early" in capsys.readouterr().err
 
@@ -1024,7 +1028,7 @@ def test_utf16_a_used_folder_and_a_threshold_in_kilonewtons_are_reported(
     assert run_cli([*words, "--record", str(tmp_path / "run")]) == 0
     shown = capsys.readouterr().err
     assert f"run is not empty: the recording is written to {tmp_path / 'run_2'}" in shown
-    assert "alarm_force: got 160 N, expected some 3.2e+04 N as in the scene; is it in kN?" in shown
+    assert "alarm_force: got 160 N, expected about 3.2e+04 N as in the scene; is it in kN?" in shown
     path.write_text(path.read_text(), encoding="utf-16")
     assert run_cli(words) == 1
     assert "load.csv: got UTF-16 text, expected UTF-8" in capsys.readouterr().err
@@ -1083,9 +1087,9 @@ def _recorded(run: Path) -> tuple[list[Any], list[Any]]:
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("given", [{}, {"record_outputs": "decimated"}])
+@pytest.mark.parametrize("parameters_of_run", [{}, {"record_outputs": "decimated"}])
 def test_a_file_gives_the_same_journal_outputs_and_counts_in_batches_as_row_by_row(
-    seed: int, given: dict[str, Any], tmp_path: Path
+    seed: int, parameters_of_run: dict[str, Any], tmp_path: Path
 ) -> None:
     columns = "t,fx,fy,m" if seed % 2 else "t,fx,fy,m,x,y,theta"
     rows = [line.removesuffix(",,,\n") + "\n" if seed % 2 else line for line in _troubled_rows(seed, 4000)]
@@ -1093,7 +1097,7 @@ def test_a_file_gives_the_same_journal_outputs_and_counts_in_batches_as_row_by_r
     path.write_text(f"{columns}\n{''.join(rows)}")
     runs = []
     for name in ("together", "single"):
-        values = given | {"record_path": str(tmp_path / name), "alarm_force": [1e3, 1e5]}
+        values = parameters_of_run | {"record_path": str(tmp_path / name), "alarm_force": [1e3, 1e5]}
         settings = parameters.settings(values)
         prepared = Preparation(settings).result(lambda: False)
         front = BridgeFront(Files([path], follow=False), None, settings, prepared, lambda *_: None, pytest.fail)
@@ -1124,6 +1128,6 @@ def test_a_stop_before_the_end_of_a_file_is_a_loss(tmp_path: Path) -> None:
     path = _csv(tmp_path / "load.csv", 3000)
     prepared = Preparation(parameters.settings({})).result(lambda: False)
     front = BridgeFront(Files([path], follow=False), None, parameters.settings({}), prepared, lambda *_: None, str)
-    asked = iter([False, False, True])
-    assert front.run(lambda: next(asked, True)) == ["stopped before the end of load"]
+    stops = iter([False, False, True])
+    assert front.run(lambda: next(stops, True)) == ["stopped before the end of load"]
     assert 0 < int(front.parts()["input"][2]["samples_used"]) < 3000

@@ -149,8 +149,10 @@ class Live:
     def clearance(self) -> Array:
         """Return the newest published clearances, each with the ends of its interval, shape (2, 3)."""
         slow = next(one.slow for one in reversed(self.published) if len(one.slow))
-        told = dict(zip(CLEARANCE_NAMES, slow["clearance"][-1].tolist(), strict=True))
-        return np.array([[told[f"{axis}{end}"] for end in ("", "/p05", "/p95")] for axis in ("horizontal", "vertical")])
+        published = dict(zip(CLEARANCE_NAMES, slow["clearance"][-1].tolist(), strict=True))
+        return np.array(
+            [[published[f"{axis}{end}"] for end in ("", "/p05", "/p95")] for axis in ("horizontal", "vertical")]
+        )
 
 
 def _error(force: Array, true: Array) -> float:
@@ -166,8 +168,8 @@ def test_a_valid_estimate_is_adopted_and_undone_after_its_withdrawal(truth: Trut
     live.take([_known(truth)])
     live.published.clear()
     live.take(_in_turn(truth, 3.0, 6.0))
-    known = live.clearance()
-    assert known[:, 0] == pytest.approx(truth.clearance, abs=1e-6) and (np.ptp(known, axis=1) < 2e-4).all()
+    adopted = live.clearance()
+    assert adopted[:, 0] == pytest.approx(truth.clearance, abs=1e-6) and (np.ptp(adopted, axis=1) < 2e-4).all()
     fine = simulate(truth.scene, 6.0, 1e-3, 1e-6).force
     assert _error(nominal, fine[:3000:10][: len(nominal)]) > (0.3 if how == "parameters" else 0.1)
     # a single twin starts with a wrong pose and needs some load periods to forget it; twins steered by poses do not
@@ -235,10 +237,10 @@ def test_wear_continues_from_its_depth_and_widens_the_estimate(truth: Truth) -> 
     at_first = live.clearance()
     assert at_first[0, 0] == pytest.approx(truth.clearance[0], abs=2e-6)
     live.take(_in_turn(truth, 2.011, 4.0))
-    grown = live.session.wear_depth - before
-    assert (grown >= 0.0).all() and grown.max() > 1e-6
+    growth = live.session.wear_depth - before
+    assert (growth >= 0.0).all() and growth.max() > 1e-6
     # the last message is 0.1 s old, so it does not contain the wear of the last 0.1 s
-    assert live.clearance()[0, 0] - at_first[0, 0] == pytest.approx(0.5 * grown[[1, 3, 5, 7]].sum(), rel=0.2)
+    assert live.clearance()[0, 0] - at_first[0, 0] == pytest.approx(0.5 * growth[[1, 3, 5, 7]].sum(), rel=0.2)
 
 
 def test_intervals_of_peaks_and_impulses_belong_to_the_published_span(truth: Truth) -> None:
@@ -407,9 +409,9 @@ def test_a_restored_motion_continues_with_the_present_estimate(truth: Truth, wea
     live.take(_in_turn(truth, 0.0, 0.5))
     before = live.session.snapshot()
     live.take([_known(truth), *_in_turn(truth, 0.5, 0.7)])
-    known = live.clearance()
+    adopted = live.clearance()
     live.take([Restore(_stamp(0.7), before.data), *_in_turn(truth, 0.7, 0.9)])
-    assert live.twin.estimate is not None and live.clearance() == pytest.approx(known, abs=1e-7)
+    assert live.twin.estimate is not None and live.clearance() == pytest.approx(adopted, abs=1e-7)
     known_then = live.session.snapshot()
     live.take([_known(truth, State.WITHDRAWN), Restore(_stamp(0.9), known_then.data), *_in_turn(truth, 0.9, 1.0)])
     assert live.twin.estimate is None
@@ -558,28 +560,28 @@ def test_a_real_node_publishes_the_forces_of_its_machine(tmp_path: Path) -> None
     with bench(tmp_path, record_path=tmp_path / "run", **settings) as running:
         probe = running.probe
         send, poses = probe.excitation(), probe.publisher(PoseStamped, "head_pose")
-        heard: dict[str, list[JointState]] = {
+        by_topic: dict[str, list[JointState]] = {
             topic: probe.listen(JointState, topic) for topic in ("contact_forces", "force_intervals", "clearance")
         }
         assert value(probe.status[-1], "follow") == "prior"
-        _play(probe, send, poses, truth, 0.0, 13.0, heard["contact_forces"])
+        _play(probe, send, poses, truth, 0.0, 13.0, by_topic["contact_forces"])
         probe.until(lambda: value(probe.status[-1], "follow") == "estimate", "an estimate that is taken over", 100.0)
-        _play(probe, send, poses, truth, 13.0, 17.0, heard["contact_forces"])
-        probe.until(lambda: _seconds(heard["force_intervals"][-1]) > 16.98, "the last forces")
+        _play(probe, send, poses, truth, 13.0, 17.0, by_topic["contact_forces"])
+        probe.until(lambda: _seconds(by_topic["force_intervals"][-1]) > 16.98, "the last forces")
         assert probe.figures("follow")["members"] == str(MEMBERS)
         assert running.twin.stop() == 0
-    forces = {_seconds(one): np.array(one.effort) for one in heard["contact_forces"]}
+    forces = {_seconds(one): np.array(one.effort) for one in by_topic["contact_forces"]}
     t = np.array([time for time in forces if time > 14.0])
-    told = np.array([forces[time] for time in t.tolist()])
+    published = np.array([forces[time] for time in t.tolist()])
     there = np.round(100.0 * t).astype(int)
     true, nominal = (simulate(one, 17.0, 0.01, 1e-6).force[there] for one in (truth.scene, truth.nominal))
-    assert _error(told, true) < 0.08 and _error(nominal, true) > 0.2
-    assert [_seconds(one) for one in heard["force_intervals"]] == list(forces)
-    last = dict(zip(heard["force_intervals"][-1].name, heard["force_intervals"][-1].effort, strict=True))
+    assert _error(published, true) < 0.08 and _error(nominal, true) > 0.2
+    assert [_seconds(one) for one in by_topic["force_intervals"]] == list(forces)
+    last = dict(zip(by_topic["force_intervals"][-1].name, by_topic["force_intervals"][-1].effort, strict=True))
     assert all(last[f"{pair}/p05"] <= last[pair] <= last[f"{pair}/p95"] for pair in PAIR_NAMES)
-    assert [last[pair] for pair in PAIR_NAMES] == list(heard["contact_forces"][-1].effort)
+    assert [last[pair] for pair in PAIR_NAMES] == list(by_topic["contact_forces"][-1].effort)
     first, newest = (
-        dict(zip(heard["clearance"][0].name, heard["clearance"][at].position, strict=True)) for at in (0, -1)
+        dict(zip(by_topic["clearance"][0].name, by_topic["clearance"][at].position, strict=True)) for at in (0, -1)
     )
     assert first["horizontal/p05"] < truth.clearance[0] < first["horizontal/p95"]
     assert first["horizontal/p95"] - first["horizontal/p05"] > 0.02
@@ -625,10 +627,10 @@ def test_a_runtime_reports_its_twins_and_follows_with_parameters_if_samples_wait
     scene = tmp_path / "believed.yaml"
     scene.write_text(dump_scene(truth.nominal), encoding="utf-8")
     values = {"scene": str(scene), "estimate": True, "follow_members": MEMBERS, "excitation_timeout": 3600.0}
-    given = parameters.settings(values | {"publish_mode": mode, "record_path": str(tmp_path / "run")})
+    settings = parameters.settings(values | {"publish_mode": mode, "record_path": str(tmp_path / "run")})
     front = Front()
-    prepared = Preparation(given).result(lambda: False)
-    runtime = Runtime(front, given, prepared)
+    prepared = Preparation(settings).result(lambda: False)
+    runtime = Runtime(front, settings, prepared)
     runtime.start()
     runtime.activate()
 
@@ -658,11 +660,11 @@ def test_a_runtime_reports_its_twins_and_follows_with_parameters_if_samples_wait
     assert diagnostics.summary("active", "", runtime)[2]["follow"] == "estimate"
     sent = front.sent.copy()
     assert sent["force_intervals"] == sent["peak_intervals"] == sent["contact_forces"] > 40
-    look = next(do for rate, do in runtime.periodic() if rate == 1.0)
+    task = next(do for rate, do in runtime.periodic() if rate == 1.0)
     for waits in (True, True, False, True, True, True, True, True):
         runtime.inputs.waited(1, 1.0 if waits else 0.0)
         assert not runtime.reduced
-        look()
+        task()
     level, message, _ = diagnostics.summary("active", "", runtime)
     assert runtime.reduced and level == diagnostics.WARN and "too slow" in message
     play(1.5, 2.0)
@@ -688,8 +690,8 @@ def test_forces_are_sent_before_the_other_twins_are_advanced(
 ) -> None:
     scene = tmp_path / "believed.yaml"
     scene.write_text(dump_scene(truth.nominal), encoding="utf-8")
-    given = parameters.settings({"scene": str(scene), "estimate": True, "follow_members": MEMBERS})
-    runtime = Runtime(Front(), given, Preparation(given).result(lambda: False))
+    settings = parameters.settings({"scene": str(scene), "estimate": True, "follow_members": MEMBERS})
+    runtime = Runtime(Front(), settings, Preparation(settings).result(lambda: False))
     advance, done = TwinBatch.advance_samples, list[float]()
 
     def counted(twins: TwinBatch, t: Array, wrench: Array) -> Any:

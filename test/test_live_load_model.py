@@ -50,8 +50,8 @@ def test_absurd_telemetry_is_counted_and_has_no_small_deviation(tmp_path: Path) 
     (below, wide), (_, same) = (MODEL.cutting_force({"depth": depth}) for depth in (-0.08, 0.08))  # type: ignore[misc]
     assert (below, wide) == (0.0, same)
     (tmp_path / "map.yaml").write_text(MAP)
-    told = {5: "1e200,2,,0", 7: "200,1e-300,8,0"}
-    rows = [f"{0.1 * k:.1f},{told.get(k, '200,2,8,0')}" for k in range(10)]
+    absurd_rows = {5: "1e200,2,,0", 7: "200,1e-300,8,0"}
+    rows = [f"{0.1 * k:.1f},{absurd_rows.get(k, '200,2,8,0')}" for k in range(10)]
     (tmp_path / "drive.csv").write_text("\n".join(["t,p,v,d,s", *rows]) + "\n")
     settings = parameters.settings({"record_path": str(tmp_path / "run")})
     files = Files([tmp_path / "drive.csv"], follow=False)

@@ -235,9 +235,9 @@ def test_samples_have_source_stamps_and_bad_values_are_counted(server: Plant, ro
         )
         assert all(np.isnan(values["fx"]) for values in bad) and np.isfinite(good["fx"])
         assert last == good | {"fy": 7.0}
-        level, said, facts = bridge.part()
+        level, message, facts = bridge.part()
         assert (facts["bad"], facts["uncertain"], facts["breaks"]) == ("1", "1", "0") and bridge.lost == 0
-        assert facts["publishing_ms"] == "10" and (level, said) == (0, "")
+        assert facts["publishing_ms"] == "10" and (level, message) == (0, "")
         assert facts.keys() == SOURCE_KEYS.keys()
 
 

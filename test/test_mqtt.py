@@ -337,8 +337,8 @@ def test_a_run_that_ends_without_its_broker_is_an_error(tmp_path: Path) -> None:
     port, client, broker = _free_port(), make_client("", clean=True), ExitStack()
     broker.enter_context(_open_broker(tmp_path, port))
 
-    def connected(heard: dict[str, dict[str, Any]]) -> bool:
-        return "status" in heard and heard["status"]["values"]["publishers_excitation"] == 1
+    def connected(parts: dict[str, dict[str, Any]]) -> bool:
+        return "status" in parts and parts["status"]["values"]["publishers_excitation"] == 1
 
     with broker, _live(f"mqtt://127.0.0.1:{port}", "--map", str(tmp_path / "map.yaml")) as live:
         live.until(connected, "connected")

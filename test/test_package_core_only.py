@@ -92,8 +92,8 @@ def test_pip_install_brings_the_command_and_the_presets(environment: Path, wheel
     assert answer["pairs"]["top_right_top"]["max"] > 1e4
     facts = json.loads(run(programs / "plow-twin", "info", "--json", cwd=tmp_path))
     assert (facts["mcap"], facts["rclpy"]) == ("not installed", "not installed")
-    said = run(programs / "plow-twin", "demo", cwd=tmp_path, code=1)
-    assert "pip install 'plow_twin[ros]'" in said
+    output = run(programs / "plow-twin", "demo", cwd=tmp_path, code=1)
+    assert "pip install 'plow_twin[ros]'" in output
     assert "pip install ./studies/paper" in run(programs / "plow-twin", "study", "paper", cwd=tmp_path, code=1)
     (tmp_path / "run.mcap").write_bytes(mcap_bytes.beginning())
     assert "pip install 'plow_twin[record]'" in run(programs / "plow-twin", "replay", "run.mcap", cwd=tmp_path, code=1)

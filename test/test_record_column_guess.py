@@ -89,8 +89,8 @@ def test_units_follow_from_names_or_magnitudes(
 def test_for_undecided_columns_the_option_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = _file(tmp_path / "own.csv", "t;a;b;c;d", step=1e-3, size=1.0)
     assert cli(["setup", str(file), "--out", str(tmp_path / "out")]) == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert "fx, fy, m cannot be determined from the columns t, a, b, c, d" in said and "--column fx=COLUMN" in said
+    errors = " ".join(capsys.readouterr().err.split())
+    assert "fx, fy, m cannot be determined from the columns t, a, b, c, d" in errors and "--column fx=COLUMN" in errors
     assert not (tmp_path / "out").exists()
     stated = {"fx": "a", "fy": "b", "m": "c"}
     guess = guess_columns(file, PAPER, stated, {"m": "kN m"})
@@ -127,7 +127,7 @@ def _in_terminal(folder: Path, *expected: bytes) -> tuple[int, str]:
         command, cwd=folder, stdin=far, stdout=far, stderr=far, start_new_session=True, preexec_fn=own_terminal
     )
     os.close(far)
-    screen, answers, seen = b"", list(expected), 0
+    screen, answers, answered_to = b"", list(expected), 0
     with suppress(OSError):  # reading fails after the program has closed its side of the terminal
         while True:
             # readline may miss a signal just before it waits, so the key is pressed again
@@ -137,8 +137,8 @@ def _in_terminal(folder: Path, *expected: bytes) -> tuple[int, str]:
             if not data:
                 break
             screen += data
-            if answers and screen[seen:].rstrip().endswith(b":"):
-                seen = len(screen)
+            if answers and screen[answered_to:].rstrip().endswith(b":"):
+                answered_to = len(screen)
                 os.write(near, answers.pop(0))
     os.close(near)
     return process.wait(60.0), screen.decode()

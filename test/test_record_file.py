@@ -315,8 +315,8 @@ def test_the_extra_brings_every_library_that_is_imported(monkeypatch: pytest.Mon
     declared: dict[str, Any] = {}
     monkeypatch.setattr(setuptools, "setup", declared.update)
     runpy.run_path("setup.py")
-    wanted = [*declared["install_requires"], *declared["extras_require"]["record"]]
-    names = {re.split("[^A-Za-z0-9_-]", requirement.replace("PyYAML", "yaml"))[0] for requirement in wanted}
+    requirements = [*declared["install_requires"], *declared["extras_require"]["record"]]
+    names = {re.split("[^A-Za-z0-9_-]", requirement.replace("PyYAML", "yaml"))[0] for requirement in requirements}
     names.add("llvmlite")  # numba requires llvmlite at a fixed version, so it need not be declared
     # these libraries are used only if they are installed, so they need not be declared
     names |= {"pandas", "pyarrow"}
@@ -363,14 +363,14 @@ def test_a_string_has_the_bytes_that_rosbags_gives_it(text: str) -> None:
 def test_frames_of_lz4_are_read_as_its_library_reads_them() -> None:
     noise = np.random.default_rng(5).bytes(70_000)
     contents = (b"", b"x", bytes(range(256)) * 1000, noise, 3 * (noise[:9000] + bytes(90_000)))
-    taken = 0
+    read_directly = 0
     for content, linked, checksum, size in product(contents, (False, True), (False, True), (False, True)):
         frame = lz4.frame.compress(content, block_linked=linked, content_checksum=checksum, store_size=size)
         assert bytes(decompress("lz4", memoryview(frame), len(content))) == content
         direct = independent_blocks(memoryview(frame), len(content))
         assert direct is None or direct.tobytes() == content
-        taken += direct is not None
-    assert taken >= 6  # at least the kinds of records that the recorder writes are read directly
+        read_directly += direct is not None
+    assert read_directly >= 6  # at least the kinds of records that the recorder writes are read directly
     whole = np.frombuffer(lz4.frame.compress(contents[4][:5000], block_linked=False), np.uint8)
     for place in range(len(whole)):
         assert independent_blocks(whole[:place].data, 5000) is None

@@ -83,9 +83,9 @@ def test_the_run_in_progress_is_found_beside_an_earlier_run(tmp_path: Path) -> N
     writer = threading.Thread(target=record_run, args=(tmp_path / "run_2", map(paper_sample, range(COUNT))))
     writer.start()
     run_folder = find_run(tmp_path / "run", 60.0)
-    asked = RunReader(run_folder, Tail(stop=lambda: True))
-    assert run_folder == tmp_path / "run_2" and [*asked.batches()] and asked.status is FileStatus.UNREAD
+    reader = RunReader(run_folder, Tail(stop=lambda: True))
+    assert run_folder == tmp_path / "run_2" and [*reader.batches()] and reader.status is FileStatus.UNREAD
     writer.join()
     assert find_run(tmp_path / "run", 0.0) == tmp_path / "run"
-    with pytest.raises(RecordingError, match="expected one that is being written"):
+    with pytest.raises(RecordingError, match="expected a recording in progress"):
         find_run(tmp_path / "none", 0.0)

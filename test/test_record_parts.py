@@ -357,10 +357,10 @@ def test_a_decimated_recording_keeps_every_peak(tmp_path: Path) -> None:
         publication = session.outputs.pop()
         assert len(publication.rows)
         sent.append(publication)
-        wanted = decimation.select(publication)
-        if wanted is not None:
-            kept.append(wanted)
-            recorder.publication(wanted)
+        selected = decimation.select(publication)
+        if selected is not None:
+            kept.append(selected)
+            recorder.publication(selected)
     session.close()
     assert recorder.close().complete and len(kept) == COUNT // 50
     peaks = Published.joined(sent).rows["peak"].max(axis=0)

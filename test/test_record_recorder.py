@@ -173,7 +173,7 @@ def test_killed_writers_many_times(tmp_path: Path) -> None:
 
 def test_a_full_queue_is_counted_and_noted_in_the_file(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "run", HEADER, queue_size=40)
-    taken: Counter[str] = Counter()
+    accepted: Counter[str] = Counter()
     kept_samples, kept_messages = [], []
     for index in range(4000):
         sample = Sample(BASE_NS + index * STEP_NS, (float(index), 0.0, 0.0))
@@ -182,12 +182,12 @@ def test_a_full_queue_is_counted_and_noted_in_the_file(tmp_path: Path) -> None:
         if recorder.output(TOPIC, sample.stamp_ns, joint_state(index)):
             kept_messages.append(sample.stamp_ns)
         if recorder.snapshot_wanted:
-            taken["snapshot"] += recorder.journal(Snapshot(sample.stamp_ns, b"state"))
+            accepted["snapshot"] += recorder.journal(Snapshot(sample.stamp_ns, b"state"))
         if index % 500 == 0:
             time.sleep(0.05)
     loss = recorder.close()
     assert loss.closed and loss.error is None
-    assert loss.lost[JOURNAL] > 0 and loss.lost[TOPIC] > 0 and taken["snapshot"] > 0
+    assert loss.lost[JOURNAL] > 0 and loss.lost[TOPIC] > 0 and accepted["snapshot"] > 0
     assert len(kept_messages) + loss.lost[TOPIC] == 4000
     # refused snapshots may be among the lost entries, so the sum may be larger
     assert len(kept_samples) + loss.lost[JOURNAL] >= 4000
@@ -200,8 +200,8 @@ def test_a_full_queue_is_counted_and_noted_in_the_file(tmp_path: Path) -> None:
     assert sum(entry.count for entry in entries if isinstance(entry, Loss)) == loss.lost[JOURNAL]
     assert sum(entry.count for entry in entries if isinstance(entry, Dropped)) == loss.lost[TOPIC]
     # notes of lost messages may be between the note of a lost entry and the snapshot, so they are removed
-    told = [entry for entry in entries if not isinstance(entry, Dropped)]
-    for entry, following in itertools.pairwise(told):
+    recorded = [entry for entry in entries if not isinstance(entry, Dropped)]
+    for entry, following in itertools.pairwise(recorded):
         assert not isinstance(entry, Loss) or isinstance(following, Snapshot)
     assert reader.lost == dict(loss.lost)
     # the notes remain in the file if the process is killed
@@ -534,9 +534,9 @@ def test_with_sync_flushed_data_survive_a_loss_of_power(tmp_path: Path) -> None:
     with started(command, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         for line in process.stdout:
-            what, *rest = line.split()
-            if what != "synced":
-                index = int(what)
+            kind, *rest = line.split()
+            if kind != "synced":
+                index = int(kind)
             else:
                 synced.append((rest[1], int(rest[0])))
                 flushes += index >= 0
@@ -571,14 +571,14 @@ def test_only_with_sync_the_recorder_waits_for_the_disk(tmp_path: Path) -> None:
 def test_a_full_disk_beside_a_run_is_reported_and_so_is_its_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    said: list[str] = []
-    writer = BagWriter(tmp_path / "beside", said.append)
+    messages: list[str] = []
+    writer = BagWriter(tmp_path / "beside", messages.append)
     number = writer.topic(Topic("/level", "own/msg/Level", "float64 value", "RIHS01_" + 64 * "0", "[]"))
     for index, free in enumerate([True, False, False, True, True]):
         monkeypatch.setattr("plow_twin.record.bag.shortage", lambda folder, least, free=free: None if free else "full")
         writer.add(number, index, index, index, bytes(12))
         writer.flush()
-    assert [text.removeprefix(f"{writer.path}: ") for text in said] == [
+    assert [text.removeprefix(f"{writer.path}: ") for text in messages] == [
         "full: messages are lost until the disk has free space",
         "recording continues, 2 messages were lost",
     ]

@@ -100,7 +100,7 @@ def test_the_demo_starts_with_the_compiled_estimator_and_ends_when_each_sample_i
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The processes are simulated: each read of the diagnostics returns the next report."""
-    watch, seen = Watch(), list[str]()
+    watch, events = Watch(), list[str]()
     reports = iter([
         {"state": {"lifecycle": "active"}, "estimate": {"ready": "0"}}, {"estimate": {"ready": "0"}},
         {"estimate": {"ready": "1"}}, {"estimate": {"ready": "1", "estimates": "1"}, "input": {"samples_used": "9000"}},
@@ -111,12 +111,12 @@ def test_the_demo_starts_with_the_compiled_estimator_and_ends_when_each_sample_i
     def look() -> None:
         watch.parts |= next(reports, {})
         watch.reports += 1
-        seen.append(f"ready {watch.text('estimate', 'ready')}")
+        events.append(f"ready {watch.text('estimate', 'ready')}")
 
     @contextmanager
     def process(arguments: list[str], log: Path) -> Iterator[Mock]:
-        seen.append(arguments[0].rpartition(".")[2])
-        stop = Mock(side_effect=lambda: seen.append(f"stop after {watch.accounted} samples"))
+        events.append(arguments[0].rpartition(".")[2])
+        stop = Mock(side_effect=lambda: events.append(f"stop after {watch.accounted} samples"))
         yield Mock(running=False, output=lambda: '{"sent": 15000}', stop=stop)
 
     @contextmanager
@@ -126,8 +126,8 @@ def test_the_demo_starts_with_the_compiled_estimator_and_ends_when_each_sample_i
     monkeypatch.setattr("plow_twin.demo.demo._process", process)
     monkeypatch.setattr("plow_twin.demo.demo._watching", watching)
     assert _run("real", 15.0, tmp_path, Console(quiet=True), True, None) == (watch, 15000)
-    assert seen[:5] == ["main", "ready 0", "ready 0", "ready 1", "excitation_publisher"]
-    assert seen[-1] == "stop after 15000 samples"
+    assert events[:5] == ["main", "ready 0", "ready 0", "ready 1", "excitation_publisher"]
+    assert events[-1] == "stop after 15000 samples"
 
 
 def test_forces_are_compared_with_the_machine_s_and_times_of_estimates_are_printed(tmp_path: Path) -> None:

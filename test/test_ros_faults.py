@@ -336,11 +336,11 @@ def test_any_sequence_on_clock_is_survived_counted_and_repeated_by_the_journal(s
             clock.publish(message)
 
         for index in range(3000):
-            what = rng.random()
-            if what < 0.9:
+            draw = rng.random()
+            if draw < 0.9:
                 steps = (0, 1, 10, 100, 100, 10, 1, -1, -100, -900, -5000, 1000, 11_000, 3_600_000)
                 time_ns += rng.choice(steps) * MS
-            elif what < 0.95:
+            elif draw < 0.95:
                 show(rng.choice((0, -5 * 10**9, -(2**31) * 10**9, 1, (2**31 - 1) * 10**9)))
             else:
                 time_ns = T0
@@ -509,14 +509,14 @@ def test_two_twins_in_one_process_do_not_disturb_each_other() -> None:
             executor.add_node(node)
             assert node.start()
         senders = [node.create_publisher(WrenchStamped, "excitation", QoSProfile(depth=100)) for node in nodes]
-        heard: list[list[JointState]] = [[], []]
-        for node, messages in zip(nodes, heard, strict=True):
+        messages_of_node: list[list[JointState]] = [[], []]
+        for node, messages in zip(nodes, messages_of_node, strict=True):
             node.create_subscription(JointState, "contact_forces", messages.append, QoSProfile(depth=1000))
 
         def spin_until(reached: Callable[[], bool]) -> None:
             give_up = time.monotonic() + 60.0
             while not reached():
-                assert time.monotonic() < give_up, [len(messages) for messages in heard]
+                assert time.monotonic() < give_up, [len(messages) for messages in messages_of_node]
                 executor.spin_once(timeout_sec=0.05)
 
         spin_until(lambda: all(sender.get_subscription_count() == 1 for sender in senders))
@@ -526,8 +526,8 @@ def test_two_twins_in_one_process_do_not_disturb_each_other() -> None:
             for sender, force in zip(senders, (3e4, -3e4), strict=True):
                 message.wrench.force.x = force
                 sender.publish(message)
-            spin_until(lambda index=index: all(len(messages) == index + 1 for messages in heard))  # type: ignore[misc]
-        first, second = (np.array(messages[-1].position) for messages in heard)
+            spin_until(lambda index=index: all(len(messages) == index + 1 for messages in messages_of_node))  # type: ignore[misc]
+        first, second = (np.array(messages[-1].position) for messages in messages_of_node)
         assert not np.allclose(first, second)
         for node in nodes:
             executor.remove_node(node)
@@ -550,7 +550,7 @@ def test_two_minutes_of_recording_account_for_every_message_in_constant_memory()
 
 def test_a_flood_of_requests_loses_nothing_and_the_journal_repeats_them(tmp_path: Path) -> None:
     run, chance = tmp_path / "run", random.Random(2)
-    asked: Counter[str] = Counter()
+    requests: Counter[str] = Counter()
     numbers = {
         "clearance_horizontal": (-1.0, 0.022, 0.03),
         "limit_force": (0.0, 5e4, 1e6),
@@ -563,15 +563,17 @@ def test_a_flood_of_requests_loses_nothing_and_the_journal_repeats_them(tmp_path
         publisher = running.publisher("--rate", "500", "--seconds", "20")
         give_up = time.monotonic() + 12.0
         while time.monotonic() < give_up:
-            what = chance.choice([*SERVICES, *numbers, "stop", "cycle"])
-            asked[what] += 1
-            if what in SERVICES:
-                probe.call(Trigger, f"{name}/{what}", Trigger.Request())
-            elif what in numbers:
-                number = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=chance.choice(numbers[what]))
-                request = SetParameters.Request(parameters=[ParameterMessage(name=what, value=number)])
+            action = chance.choice([*SERVICES, *numbers, "stop", "cycle"])
+            requests[action] += 1
+            if action in SERVICES:
+                probe.call(Trigger, f"{name}/{action}", Trigger.Request())
+            elif action in numbers:
+                number = ParameterValue(
+                    type=ParameterType.PARAMETER_DOUBLE, double_value=chance.choice(numbers[action])
+                )
+                request = SetParameters.Request(parameters=[ParameterMessage(name=action, value=number)])
                 assert probe.call(SetParameters, f"{name}/set_parameters", request).results[0].successful
-            elif what == "stop":
+            elif action == "stop":
                 publisher.send_signal(signal.SIGSTOP)
                 time.sleep(chance.random())
                 publisher.send_signal(signal.SIGCONT)
@@ -583,5 +585,5 @@ def test_a_flood_of_requests_loses_nothing_and_the_journal_repeats_them(tmp_path
         _until_accounted(running, sent)
         assert "[ERROR]" not in running.twin.output() and "Traceback" not in running.twin.output()
         assert running.twin.stop() == 0
-    assert len(asked) == len(SERVICES) + len(numbers) + 2, asked
+    assert len(requests) == len(SERVICES) + len(numbers) + 2, requests
     assert replay(run).exit_code == 0

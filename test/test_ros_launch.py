@@ -45,15 +45,15 @@ class TestWhileItRuns(unittest.TestCase):
         rclpy.init()
         self.addCleanup(rclpy.shutdown)
         node = rclpy.create_node("listener")
-        said: list[str] = []
+        texts: list[str] = []
 
         def hear(message: Any) -> None:
-            said.extend(f"{value.key}={value.value}" for one in message.status for value in one.values)
+            texts.extend(f"{value.key}={value.value}" for one in message.status for value in one.values)
 
         node.create_subscription(DiagnosticArray, "/diagnostics", hear, 10)
         give_up = time.monotonic() + START_S
-        while "lifecycle=active" not in said:
-            assert time.monotonic() < give_up, said
+        while "lifecycle=active" not in texts:
+            assert time.monotonic() < give_up, texts
             rclpy.spin_once(node, timeout_sec=0.2)
         node.destroy_node()
 

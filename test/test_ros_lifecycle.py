@@ -40,13 +40,13 @@ def _state(running: Bench) -> str:
     return str(answer.current_state.label)
 
 
-def _set(running: Bench, name: str, given: Any) -> Any:
+def _set(running: Bench, name: str, value: Any) -> Any:
     kinds = {bool: "bool", int: "integer", float: "double", str: "string"}
-    if not isinstance(given, ParameterValue):
-        kind = kinds[type(given)]
+    if not isinstance(value, ParameterValue):
+        kind = kinds[type(value)]
         number = getattr(ParameterType, f"PARAMETER_{kind.upper()}")
-        given = ParameterValue(type=number, **{f"{kind}_value": given})
-    request = SetParameters.Request(parameters=[Parameter(name=name, value=given)])
+        value = ParameterValue(type=number, **{f"{kind}_value": value})
+    request = SetParameters.Request(parameters=[Parameter(name=name, value=value)])
     return running.probe.call(SetParameters, f"{running.namespace}/plow_twin/set_parameters", request).results[0]
 
 
@@ -60,8 +60,8 @@ def waiting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 @pytest.fixture
 def managed(waiting: Bench) -> Iterator[Bench]:
     """Yield this node in the state unconfigured, and restore its initial parameters after the test."""
-    for name, given in (("scene", "paper"), ("record_path", ""), ("wear_state_path", "")):
-        assert _set(waiting, name, given).successful
+    for name, text in (("scene", "paper"), ("record_path", ""), ("wear_state_path", "")):
+        assert _set(waiting, name, text).successful
     yield waiting
     if _state(waiting) == "active":
         assert _change(waiting, Transition.TRANSITION_DEACTIVATE)
@@ -151,16 +151,16 @@ def test_a_request_during_a_cleanup_is_answered_and_the_node_continues(tmp_path:
     with bench(tmp_path) as running:
         node, at = running.probe.node, f"{running.namespace}/plow_twin"
         change = node.create_client(ChangeState, f"{at}/change_state")
-        asked = [node.create_client(Trigger, f"{at}/{name}") for name in ("acknowledge_alarms", "mark", "reset")]
-        running.probe.until(lambda: all(one.service_is_ready() for one in (change, *asked)), "services")
+        clients = [node.create_client(Trigger, f"{at}/{name}") for name in ("acknowledge_alarms", "mark", "reset")]
+        running.probe.until(lambda: all(one.service_is_ready() for one in (change, *clients)), "services")
         running.probe.pause(0.5)
 
         def beside(transition: int) -> None:
             """Send requests before and after the request for a transition, faster than they are answered."""
             request = ChangeState.Request(transition=Transition(id=transition))
-            before = [one.call_async(Trigger.Request()) for one in asked]
+            before = [one.call_async(Trigger.Request()) for one in clients]
             changed = change.call_async(request)
-            after = [one.call_async(Trigger.Request()) for one in asked]
+            after = [one.call_async(Trigger.Request()) for one in clients]
             running.probe.until(lambda: all(one.done() for one in (changed, *before, *after)), "answers")
             assert changed.result().success
             answers = [one.result() for one in (*before, *after)]
@@ -177,10 +177,10 @@ def test_a_request_during_a_cleanup_is_answered_and_the_node_continues(tmp_path:
 
 
 def test_all_bad_parameters_are_named_at_once(tmp_path: Path) -> None:
-    given = ["excitation_source:=drum", "tolerance:=.nan", "jump_back:=-3", "input_depth:=5.5", "autostart:=1"]
-    given += [r'frame_id:="a\x1b[2J"', f"child_frame_id:={'h' * 5000}"]
-    given += [f"alarm_wear_rate:=[{', '.join(['-1.0'] * 10_000)}]"]  # not a problem for each of its items
-    settings = [word for item in given for word in ("-p", item)]
+    assignments = ["excitation_source:=drum", "tolerance:=.nan", "jump_back:=-3", "input_depth:=5.5", "autostart:=1"]
+    assignments += [r'frame_id:="a\x1b[2J"', f"child_frame_id:={'h' * 5000}"]
+    assignments += [f"alarm_wear_rate:=[{', '.join(['-1.0'] * 10_000)}]"]  # not a problem for each of its items
+    settings = [word for item in assignments for word in ("-p", item)]
     twin = Process("plow_twin.ros.main", ["--ros-args", *settings], tmp_path / "twin.log")
     assert twin.wait() == 2
     output = twin.output()
@@ -235,7 +235,7 @@ def active(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("name", "given", "accepted"),
+    ("name", "value", "accepted"),
     [
         ("excitation_timeout", 0.25, True),
         ("excitation_timeout", 3, True),
@@ -257,9 +257,9 @@ def active(tmp_path_factory: pytest.TempPathFactory) -> Any:
     ],
 )
 def test_changes_at_run_time_are_applied_or_refused_with_a_reason(
-    active: Bench, name: str, given: Any, accepted: bool
+    active: Bench, name: str, value: Any, accepted: bool
 ) -> None:
-    result = _set(active, name, given)
+    result = _set(active, name, value)
     assert result.successful is accepted, result.reason
     assert accepted or 0 < len(result.reason) < 1000
     assert active.twin.running

@@ -86,8 +86,8 @@ def test_outputs_equal_an_offline_twin_on_the_same_samples_bit_for_bit(tmp_path:
         probe.until(lambda: not publisher.running, "the end of the publisher", 100.0)
         assert publisher.wait() == 0, publisher.output()
         assert json.loads(publisher.output().splitlines()[-1])["sent"] == 2000
-        for name, heard in (("forces", forces), ("peaks", peaks), ("heads", heads)):
-            probe.until(lambda heard=heard: len(heard) == 2000, f"2000 {name}")
+        for name, received in (("forces", forces), ("peaks", peaks), ("heads", heads)):
+            probe.until(lambda heard=received: len(heard) == 2000, f"2000 {name}")
         probe.until_figure("input", "samples_used", "2000")
         assert probe.figures("input")["samples_missing"] == "0"
 
@@ -223,8 +223,8 @@ def test_one_publisher_is_followed_and_a_second_reported_until_a_switch(tmp_path
     # the file names the sender of each message
     unused = list(unused_messages(tmp_path / "run"))
     assert {message["reason"] for message in unused} == {"not_followed"} and len(unused) == 41
-    told = [(entry["stamp_ns"], entry["values"][0]) for entry in unused]
-    assert told == [(T0 + index * MS - 1_500_000_000, -30e3) for index in range(40)] + [(T0 + 40 * MS, 30e3)]
+    unused_values = [(entry["stamp_ns"], entry["values"][0]) for entry in unused]
+    assert unused_values == [(T0 + index * MS - 1_500_000_000, -30e3) for index in range(40)] + [(T0 + 40 * MS, 30e3)]
     senders = [found["sender"] for found in unused]
     assert all(name.startswith(f"{running.namespace}/probe ") for name in senders)
     assert senders[0] == senders[39] != senders[40]
@@ -291,26 +291,26 @@ def test_an_alarm_stays_until_it_is_acknowledged_and_writes_the_time_before_it(t
             probe.until(lambda: "screen: " in screen.output(), "the screen")
             address = screen.output().partition("screen: http")[2].split()[0]
             with connect(f"ws{address}data", max_size=None, close_timeout=0.1) as page:
-                seen: dict[str, Any] = {"events": []}
+                latest: dict[str, Any] = {"events": []}
 
                 def told(reached: Callable[[], bool]) -> None:
                     while not reached():
                         message = json.loads(page.recv(timeout=WAIT_S))
-                        seen.update(message.get("parts", {}))
-                        seen["events"] += message.get("events", [])
-                        seen["motion"] = message.get("motion") or seen.get("motion")
+                        latest.update(message.get("parts", {}))
+                        latest["events"] += message.get("events", [])
+                        latest["motion"] = message.get("motion") or latest.get("motion")
 
-                told(lambda: {"alarms", "input"} <= seen.keys())
-                assert seen["alarms"][2]["force_latched"] == "warn" and seen["input"][2]["samples_used"] == "601"
+                told(lambda: {"alarms", "input"} <= latest.keys())
+                assert latest["alarms"][2]["force_latched"] == "warn" and latest["input"][2]["samples_used"] == "601"
                 page.send(json.dumps({"do": "acknowledge"}))
-                told(lambda: len(seen["events"]) == 1)
+                told(lambda: len(latest["events"]) == 1)
                 probe.until(lambda: len(alarms) > 1, "what is left")
                 page.send(json.dumps({"do": "mark", "text": "by the screen"}))
-                told(lambda: len(seen["events"]) == 2)
+                told(lambda: len(latest["events"]) == 2)
                 send(T0 + 601 * MS, (0.0, 0.0, 0.0))
-                told(lambda: seen["motion"] is not None)
-            assert all(event["done"] for event in seen["events"]), seen["events"]
-            assert str(tmp_path / "run_2") in seen["events"][1]["text"]
+                told(lambda: latest["motion"] is not None)
+            assert all(event["done"] for event in latest["events"]), latest["events"]
+            assert str(tmp_path / "run_2") in latest["events"][1]["text"]
             assert screen.stop() == 0
         finally:
             screen.close()
@@ -478,10 +478,10 @@ def test_bad_samples_are_dropped_counted_and_never_published(tmp_path: Path) -> 
     }
     assert figures["rolled_back"] == "1"
     assert figures["out_of_plane"] == "1"
-    told = {key.removeprefix("dropped_"): count for key, count in dropped.items() if count}
-    del told["not_selected"]
+    drops = {key.removeprefix("dropped_"): count for key, count in dropped.items() if count}
+    del drops["not_selected"]
     assert replay(tmp_path / "run").inputs == {
-        "excitation": {"used": 4, **told},
+        "excitation": {"used": 4, **drops},
         "tool_forces": {"not_selected": 1},
         **{topic: {"malformed": 1} for topic in ("travel", "head_pose", "gaps")},
     }
@@ -546,14 +546,16 @@ def test_a_stop_under_load_is_clean_and_closes_the_recording(tmp_path: Path, num
 def test_a_twin_ends_cleanly_with_its_launch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # `launch` ends at SIGTERM without passing the signal on, so mocks replace it; the tests check the requests of the
     # launch file
-    asked = {name: MagicMock() for name in ("launch", "launch_ros")}
+    modules = {name: MagicMock() for name in ("launch", "launch_ros")}
     for package, names in (("launch", "actions conditions substitutions"), ("launch_ros", "actions substitutions")):
         for name in ("", *names.split(), *(("parameter_descriptions",) if package == "launch_ros" else ())):
             monkeypatch.setitem(
-                sys.modules, f"{package}.{name}".rstrip("."), getattr(asked[package], name) if name else asked[package]
+                sys.modules,
+                f"{package}.{name}".rstrip("."),
+                getattr(modules[package], name) if name else modules[package],
             )
     runpy.run_path(str(ROOT / "launch" / "twin.launch.py"))["generate_launch_description"]()
-    prefix = shlex.split(asked["launch_ros"].actions.Node.call_args.kwargs["prefix"])
+    prefix = shlex.split(modules["launch_ros"].actions.Node.call_args.kwargs["prefix"])
     twin = [sys.executable, "-m", "plow_twin.ros.main", "--ros-args", "-p", f"record_path:={tmp_path / 'run'}"]
     launch = subprocess.Popen(
         [sys.executable, "-c", "import subprocess, sys; subprocess.run(sys.argv[1:])", *prefix, *twin],
@@ -563,11 +565,11 @@ def test_a_twin_ends_cleanly_with_its_launch(tmp_path: Path, monkeypatch: pytest
     assert any("solver ready" in line for line in launch.stderr)
     children = psutil.Process(launch.pid).children(recursive=True)
     launch.kill()
-    gone, left = psutil.wait_procs(children, 10.0)
-    for process in left:
+    ended, running_children = psutil.wait_procs(children, 10.0)
+    for process in running_children:
         process.kill()
     launch.communicate()
-    assert gone and not left
+    assert ended and not running_children
     reader = RunReader(tmp_path / "run")
     assert list(records_of(reader)) and reader.status is FileStatus.COMPLETE
 

@@ -45,18 +45,18 @@ def test_the_policy_allows_exactly_the_names_of_the_node(tmp_path: Path) -> None
         running.probe.until(lambda: node.get_service_names_and_types_by_node(*name), "the services of the twin")
         running.probe.pause(1.0)
         sent = {topic for topic, _ in node.get_publisher_names_and_types_by_node(*name)}
-        taken = {topic for topic, _ in node.get_subscriber_names_and_types_by_node(*name)}
+        subscribed = {topic for topic, _ in node.get_subscriber_names_and_types_by_node(*name)}
         answered = {service for service, _ in node.get_service_names_and_types_by_node(*name)}
     assert f"{ns}/markers" not in sent and "/tf" not in sent
     allowed = _rights("/plow_twin/twin", "topic", "publish", ns)
     assert sent <= allowed and allowed - sent <= optional
-    assert _rights("/plow_twin/twin", "topic", "subscribe", ns) == taken | {"/parameter_events"}
+    assert _rights("/plow_twin/twin", "topic", "subscribe", ns) == subscribed | {"/parameter_events"}
     assert _rights("/plow_twin/twin", "service", "reply", ns) == answered
     assert _rights("/plow_twin/manager", "service", "request", ns) == answered
     assert {f"{ns}/plow_twin/{service}" for service in SERVICES} <= answered
     # the sender of the load may publish only the inputs, and may call no service
     assert not _rights("/plow_twin/plant", "service", "request", ns)
-    assert _rights("/plow_twin/plant", "topic", "publish", ns) - {"/rosout"} == taken - {"/parameter_events"}
+    assert _rights("/plow_twin/plant", "topic", "publish", ns) - {"/rosout"} == subscribed - {"/parameter_events"}
 
 
 def test_markers_show_the_head_where_it_is_and_the_forces_on_it(tmp_path: Path) -> None:

@@ -88,5 +88,5 @@ def test_a_named_topic_without_a_publisher_is_an_error(tmp_path: Path) -> None:
         assert "recording to" in recorder.stderr.readline()
         recorder.send_signal(signal.SIGTERM)
         errors = recorder.stderr.read()
-    assert "/never: not recorded: no publisher, expected one" in errors
+    assert "/never: not recorded: got no publisher, expected at least one" in errors
     assert recorder.returncode == 3

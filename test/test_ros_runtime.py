@@ -127,29 +127,29 @@ def test_participants_of_the_graph_cannot_name_files_outside_the_root(tmp_path: 
     ):
         pass
     with (
-        pytest.raises(ParameterError, match="services_off: got 'set_waer', expected some of reset, "),
+        pytest.raises(ParameterError, match="services_off: got 'set_waer', expected one of reset, "),
         _node(services_off="set_waer"),
     ):
         pass
 
 
 def test_no_runtime_outlives_its_cycle() -> None:
-    seen: list[weakref.ref[Any]] = []
+    references: list[weakref.ref[Any]] = []
     with _node() as node:
         for _ in range(3):
             assert node.start()
             assert node.runtime is not None
-            seen.append(weakref.ref(node.runtime))
+            references.append(weakref.ref(node.runtime))
             assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
             assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
             gc.collect()
-            assert [reference() for reference in seen] == [None] * len(seen)
+            assert [reference() for reference in references] == [None] * len(references)
         assert node.start()
         assert node.runtime is not None
-        seen.append(weakref.ref(node.runtime))
+        references.append(weakref.ref(node.runtime))
         node.release()  # the node is released while it is active
         gc.collect()
-        assert seen[-1]() is None
+        assert references[-1]() is None
     assert gc.get_freeze_count() == 0
 
 
@@ -158,7 +158,7 @@ def test_an_incompatible_peer_is_named_although_its_topics_are_discovered_first(
 ) -> None:
     names = iter(["_NODE_NAME_UNKNOWN_", "sender", "sender", "_NODE_NAME_UNKNOWN_", "_NODE_NAME_UNKNOWN_"])
     with _node() as node:
-        taken = node.create_subscription(WrenchStamped, "excitation", lambda message: None, 10)
+        subscription = node.create_subscription(WrenchStamped, "excitation", lambda message: None, 10)
         identity = [1]
 
         def discovered(topic: str) -> list[TopicEndpointInfo]:
@@ -166,9 +166,9 @@ def test_an_incompatible_peer_is_named_although_its_topics_are_discovered_first(
 
         monkeypatch.setattr(node, "get_publishers_info_by_topic", discovered)
         connections = Connections(node)
-        assert [connections.publishers(taken) for _ in range(3)] == [([], 0), ([], 1), ([], 0)]
+        assert [connections.publishers(subscription) for _ in range(3)] == [([], 0), ([], 1), ([], 0)]
         identity = [2]  # a publisher without a name is reported too
-        assert [connections.publishers(taken) for _ in range(2)] == [([], 0), ([], 1)]
+        assert [connections.publishers(subscription) for _ in range(2)] == [([], 0), ([], 1)]
     lines = [line for line in capfd.readouterr().err.splitlines() if "nothing is received" in line]
     assert ["publisher sender: type" in line for line in lines] == [True, False]
 
@@ -228,8 +228,8 @@ def test_a_pose_and_its_negative_quaternion_give_the_same_residual() -> None:
             message.pose.orientation.z, message.pose.orientation.w = sign * math.sin(5e-3), sign * math.cos(5e-3)
             front = node._front
             assert front is not None
-            taken = [Received(b"", number, 0, serialize_message(message))]
-            front.subscriptions._measured_poses(taken)
+            received = [Received(b"", number, 0, serialize_message(message))]
+            front.subscriptions._measured_poses(received)
             residual = node.runtime.inputs.residual(np.array([0.0, 0.0, 0.002]))
             assert residual is not None
             residuals.append(residual[2])
@@ -237,20 +237,20 @@ def test_a_pose_and_its_negative_quaternion_give_the_same_residual() -> None:
 
 
 def test_the_covariance_of_each_pose_goes_into_the_journal_and_the_estimate(tmp_path: Path) -> None:
-    said = [(1e-8, 4e-8, 9e-6), (0.0, 0.0, 0.0), (9e-8, 4e-8, 9e-6), (-1.0, 0.0, 0.0), (math.nan, 0.0, 0.0)]
+    covariances = [(1e-8, 4e-8, 9e-6), (0.0, 0.0, 0.0), (9e-8, 4e-8, 9e-6), (-1.0, 0.0, 0.0), (math.nan, 0.0, 0.0)]
     run = tmp_path / "run"
     with _node(head_pose_type="pose_with_covariance", record_path=str(run)) as node:
         assert node.start()
         front = node._front
         assert front is not None
-        for number, variances in enumerate(said, 1):
+        for number, variances in enumerate(covariances, 1):
             message = PoseWithCovarianceStamped()
             message.header.stamp.sec = number
             message.pose.pose.orientation.w = 1.0
             for axis, variance in zip((0, 1, 5), variances, strict=True):
                 message.pose.covariance[7 * axis] = variance
-            taken = [Received(b"", number, 0, serialize_message(message))]
-            front.subscriptions._measured_poses(taken)
+            received = [Received(b"", number, 0, serialize_message(message))]
+            front.subscriptions._measured_poses(received)
         assert front.runtime.inputs.head_pose.counts[Verdict.NON_FINITE] == 2
         # a quaternion of zeros must not be read as an angle of 0
         message.pose.pose.orientation.w = 0.0
@@ -307,7 +307,7 @@ def test_a_flood_of_samples_delays_neither_timers_nor_other_threads() -> None:
 def test_a_queue_that_fills_during_reading_is_read_completely() -> None:
     # a turn requests as many messages as were announced; newer messages must not displace the remaining ones
     with _node() as node:
-        heard: list[int] = []
+        numbers: list[int] = []
         subscription = node.create_subscription(TwistStamped, "burst", lambda _: None, sensor_input(1000), raw=True)
         queue = InputQueue(node, subscription)
         publisher = node.create_publisher(TwistStamped, "burst", OUTPUTS["contact_forces"])
@@ -322,8 +322,8 @@ def test_a_queue_that_fills_during_reading_is_read_completely() -> None:
         send(50)
 
         def take() -> bool:
-            taken, more = queue.pop(20)
-            heard.extend(message.number for message in taken)
+            messages, more = queue.pop(20)
+            numbers.extend(message.number for message in messages)
             return more
 
         assert take()
@@ -331,7 +331,7 @@ def test_a_queue_that_fills_during_reading_is_read_completely() -> None:
         while take():
             pass
         queue.close()
-    assert heard == list(range(1, 54))
+    assert numbers == list(range(1, 54))
 
 
 def test_another_node_under_the_same_name_is_reported() -> None:

@@ -41,9 +41,9 @@ def members() -> list[Scene]:
 
 @pytest.mark.parametrize("workers", [1, 3])
 def test_each_member_has_the_bits_of_its_single_run(workers: int) -> None:
-    seen: list[int] = []
-    ensemble = simulate_many(members(), 4.0, output_dt=0.1, tol=1e-7, workers=workers, on_progress=seen.append)
-    assert max(seen) == len(members()) and (ensemble.status == Status.OK).all()
+    progress: list[int] = []
+    ensemble = simulate_many(members(), 4.0, output_dt=0.1, tol=1e-7, workers=workers, on_progress=progress.append)
+    assert max(progress) == len(members()) and (ensemble.status == Status.OK).all()
     for index, scene in enumerate(members()):
         single = simulate(scene, 4.0, output_dt=0.1, tol=1e-7)
         assert np.array_equal(ensemble.q[index], single.q) and np.array_equal(ensemble.v[index], single.v)

@@ -259,9 +259,9 @@ def test_the_command_that_gets_sigint_writes_the_rows_computed_so_far(tmp_path: 
         assert process.stderr is not None and process.stderr.readline() == "under way\n"
         time.sleep(0.1)
         process.send_signal(signal.SIGINT)
-        told, errors = process.communicate(timeout=60)
+        output, errors = process.communicate(timeout=60)
     assert process.returncode == 1 and "interrupted at t = " in errors
-    result = json.loads(told)
+    result = json.loads(output)
     assert 0.0 < result["t_end"] < 1e7 and result["solver"]["steps"] > 0
     with np.load(out) as file:
         assert len(file["t"]) >= 1 and np.isfinite(file["q"]).all()

@@ -93,7 +93,7 @@ def test_the_derivatives_by_parameters_are_finite_differences_of_the_motion(name
         expected = (ends[0] - ends[1]) / (2e-5 * value)
         sensitivity = result.sensitivity.by_parameter[path][-1]
         assert sensitivity == pytest.approx(expected, abs=1e-3 * np.abs(expected).max()), path
-    with pytest.raises(ArgumentError, match=r"got 'contact\.exponent', expected some of contact\.stiffness"):
+    with pytest.raises(ArgumentError, match=r"got 'contact\.exponent', expected one of contact\.stiffness"):
         simulate(scene, 0.5, sensitivity=("contact.exponent",))
 
 
@@ -253,7 +253,7 @@ def test_a_live_twin_has_the_same_derivatives() -> None:
     ends = [end(replace(scene, initial=replace(scene.initial, v=(0.1 + d, 0.0, 0.2)))) for d in (1e-6, -1e-6)]
     expected = (ends[0] - ends[1]) / 2e-6
     assert followed.from_start[:, 3] == pytest.approx(expected, abs=2e-3 * np.abs(expected).max())
-    with pytest.raises(ArgumentError, match=r"parameters: got 'loads\.fx\.scale', expected some of contact\.stiffness"):
+    with pytest.raises(ArgumentError, match=r"parameters: got 'loads\.fx\.scale', expected one of contact\.stiffness"):
         TwinSensitivity(twin, ("loads.fx.scale",))
 
 

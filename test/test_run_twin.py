@@ -73,11 +73,11 @@ def test_a_twin_can_be_advanced_twice_to_the_same_time() -> None:
 @settings(max_examples=10)
 @given(st.lists(st.floats(0.0, 2.0), max_size=20))
 def test_intermediate_advances_do_not_change_the_motion(times: list[float]) -> None:
-    asked, direct = Twin(preset("paper")), Twin(preset("paper"))
-    rows = [asked.advance(t) for t in sorted(times)]
-    last, expected = asked.advance(2.0), direct.advance(2.0)
+    stepped, direct = Twin(preset("paper")), Twin(preset("paper"))
+    rows = [stepped.advance(t) for t in sorted(times)]
+    last, expected = stepped.advance(2.0), direct.advance(2.0)
     assert np.array_equal(last.q, expected.q) and np.array_equal(last.force, expected.force)
-    assert asked.digest() == direct.digest()
+    assert stepped.digest() == direct.digest()
     impulse = sum((row.impulse for row in rows), last.impulse)
     assert impulse == pytest.approx(expected.impulse, rel=1e-10, abs=1e-9)
     assert np.max([row.peak for row in [*rows, last]], axis=0) == pytest.approx(expected.peak, rel=1e-10)

@@ -41,8 +41,10 @@ def fixed_step_errors(
         dt, found = t_end / int(count), []
         for phase in range(phases):
             stiffness = contact.stiffness * (1.0 + 0.2 * ((phase * 0.6180339887) % 1.0))
-            given = dataclasses.replace(contact, stiffness=stiffness)
-            scene = with_presets_terms(wall_and_point(given, speed=1.0, gap=0.004 + 2.0 * dt * (phase + 0.5) / phases))
+            stiffened = dataclasses.replace(contact, stiffness=stiffness)
+            scene = with_presets_terms(
+                wall_and_point(stiffened, speed=1.0, gap=0.004 + 2.0 * dt * (phase + 0.5) / phases)
+            )
             exact = simulate(scene, t_end, output_dt=t_end, tol=1e-13)
             fixed_run = simulate(scene, t_end, output_dt=t_end, method=method, dt=dt)
             found.append(abs(fixed_run.q[-1, 1] - exact.q[-1, 1]))

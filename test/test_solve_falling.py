@@ -91,9 +91,9 @@ def test_drop_returns_the_restitution_that_its_speed_leaves(speed: float, expone
 @pytest.mark.parametrize("law", [name for name, law in LAWS.items() if law.takes_restitution])
 def test_every_law_uses_the_reduced_restitution(law: str) -> None:
     falling = impact(replace(LAW, law=law), (0.0, -2.0, 0.0), head=HEAVY, pairs=("bottom_left_bottom",))
-    left = E * (2.0 / SPEED) ** -FALL
+    reduced = E * (2.0 / SPEED) ** -FALL
     # this restitution is practically constant, and has the same compiled kernels
-    constant = replace(falling, contact=replace(LAW, law=law, restitution=left, restitution_fall=1e-12))
+    constant = replace(falling, contact=replace(LAW, law=law, restitution=reduced, restitution_fall=1e-12))
     assert returned(falling) == pytest.approx(returned(constant), abs=2e-5)
 
 
@@ -170,10 +170,10 @@ def test_impact_that_contains_the_start_continues_unchanged() -> None:
 
 def test_block_with_a_falling_restitution_agrees_with_an_independent_integration() -> None:
     scene = impact(replace(LAW, stiffness=3e6), (0.3, -1.5, 8.0), 0.25, gravity=Gravity())
-    left = E * ((1.5 + 8.0 * 0.5 * SIDE * (math.cos(0.25) - math.sin(0.25))) / SPEED) ** -FALL
+    reduced = E * ((1.5 + 8.0 * 0.5 * SIDE * (math.cos(0.25) - math.sin(0.25))) / SPEED) ** -FALL
     arm = 0.5 * SIDE * (math.cos(0.25) - math.sin(0.25))
     approach = 1.5 + 8.0 * arm
-    damping = LAWS["exact_restitution"].damping_number(left) / approach
+    damping = LAWS["exact_restitution"].damping_number(reduced) / approach
 
     def rate(t: float, z: np.ndarray) -> list[float]:
         _, y, theta, vx, vy, omega = z  # the friction is negligible

@@ -91,9 +91,9 @@ def test_advances_and_snapshots_in_flight_do_not_change_the_motion() -> None:
     # with this law, the kernels of other twins are used
     scene = dataclasses.replace(swaying((2e-4, 0.0, 0.0)), contact=preset("paper").contact)
     twin, other = Twin(scene), Twin(scene)
-    asked = [twin.advance(t) for t in np.linspace(0.1, 40.0, 700)]
+    advances = [twin.advance(t) for t in np.linspace(0.1, 40.0, 700)]
     assert twin._state.in_flight == 1
-    assert other.advance(40.0).q.tolist() == asked[-1].q.tolist()
+    assert other.advance(40.0).q.tolist() == advances[-1].q.tolist()
     restored = Twin(scene)
     restored.restore(twin.snapshot())
     for t in (41.0, 130.0):

@@ -90,10 +90,10 @@ CLAMPED = replace(BENCH, clearance=Clearance(-1e-3, -1e-3))
 
 def overdamped(law: str, damping: float) -> Contact:
     """Return a contact with a damping or, for laws with a restitution up to 1, with this restitution."""
-    given = law in ("kelvin_voigt", "ramped_damping") or damping > 1.0
+    linear = law in ("kelvin_voigt", "ramped_damping") or damping > 1.0
     return Contact(
-        law, 1e9, 1.5 if law == "ramped_damping" else 1.0, damping=damping if given else None,
-        restitution=None if given else damping, ramp_m=1e-4 if law == "ramped_damping" else None,
+        law, 1e9, 1.5 if law == "ramped_damping" else 1.0, damping=damping if linear else None,
+        restitution=None if linear else damping, ramp_m=1e-4 if law == "ramped_damping" else None,
     )  # fmt: skip
 
 

@@ -394,6 +394,6 @@ def test_random_scenes_without_amplification_meet_the_tolerance(law: str) -> Non
             checked += 1
             continue
         with pytest.warns(ToleranceWarning):
-            grown = simulate(scene, 1.0, sensitivity=True).sensitivity
-        assert grown is not None and not grown.trusted, seed
+            sensitivity = simulate(scene, 1.0, sensitivity=True).sensitivity
+        assert sensitivity is not None and not sensitivity.trusted, seed
     assert checked > 100

@@ -81,9 +81,9 @@ def test_violent_samples_give_finite_rows_or_a_status(kind: str) -> None:
     if kind == "spikes of 1e9 N":
         # the first spike throws the head out of the range of the model; all later rows have this status and the last
         # valid pose
-        left = int(np.argmin(good))
-        assert 0 < left < 100 and (series.status[left:] == Status.OUT_OF_RANGE).all()
-        assert (series.q[left:] == series.q[left - 1]).all()
+        first_bad = int(np.argmin(good))
+        assert 0 < first_bad < 100 and (series.status[first_bad:] == Status.OUT_OF_RANGE).all()
+        assert (series.q[first_bad:] == series.q[first_bad - 1]).all()
     else:
         assert good.all()
     assert series.steps.max() < 10_000

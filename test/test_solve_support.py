@@ -69,8 +69,8 @@ def test_two_masses_pressed_together_move_in_their_eigenmodes() -> None:
     assert (result.force[:, 0] > 0.0).all() and len(result.events) == 0
     assert result.frame is not None
     assert np.abs(result.frame[:, 1] - expected[:, 1]).max() < 1e-10 * np.abs(expected[:, 1]).max()
-    seen = result.q[:, 1] + 0.015
-    assert np.abs(seen - (expected[:, 0] - expected[:, 1])).max() < 1e-10 * np.abs(expected[:, 0]).max()
+    distance = result.q[:, 1] + 0.015
+    assert np.abs(distance - (expected[:, 0] - expected[:, 1])).max() < 1e-10 * np.abs(expected[:, 0]).max()
 
 
 def reference(scene: Scene, times: np.ndarray) -> np.ndarray:
@@ -112,11 +112,11 @@ def reference(scene: Scene, times: np.ndarray) -> np.ndarray:
         total = np.append(force.sum(axis=0), cross(arms, force).sum())
         swing = math.sin(load.omega_rad_s * t + load.phase_rad)
         fx, fy = load.force_n
-        given = swing * np.array([fx, fy, load.at_m[0] * fy - load.at_m[1] * fx + load.moment_n_m])
-        given[1] -= scene.head.mass_kg * scene.gravity.acceleration_m_s2
-        taken = np.append(force.sum(axis=0), cross(frame_arms, force).sum())
-        held = -springs * frame - dampers * frame_rate - taken
-        return np.concatenate([rate, frame_rate, (given + total) / masses, held / frame_masses])
+        applied = swing * np.array([fx, fy, load.at_m[0] * fy - load.at_m[1] * fx + load.moment_n_m])
+        applied[1] -= scene.head.mass_kg * scene.gravity.acceleration_m_s2
+        transferred = np.append(force.sum(axis=0), cross(frame_arms, force).sum())
+        held = -springs * frame - dampers * frame_rate - transferred
+        return np.concatenate([rate, frame_rate, (applied + total) / masses, held / frame_masses])
 
     start = np.concatenate([scene.initial.q, np.zeros(3), scene.initial.v, np.zeros(3)])
     solution = solve_ivp(change, (0.0, times[-1]), start, "DOP853", times, rtol=1e-11, atol=1e-13, max_step=2e-3)
@@ -136,9 +136,11 @@ def test_a_tilted_throw_agrees_with_independent_equations() -> None:
     head, frame = expected[:, :3], expected[:, 3:]
     c, s = np.cos(frame[:, 2]), np.sin(frame[:, 2])
     apart = head[:, :2] - frame[:, :2]
-    seen = np.stack([c * apart[:, 0] + s * apart[:, 1], c * apart[:, 1] - s * apart[:, 0], head[:, 2] - frame[:, 2]], 1)
+    relative = np.stack(
+        [c * apart[:, 0] + s * apart[:, 1], c * apart[:, 1] - s * apart[:, 0], head[:, 2] - frame[:, 2]], 1
+    )
     assert np.abs(frame).max(axis=0).min() > 1e-4
-    assert pose_error(scene, result.q, seen) < 2e-8
+    assert pose_error(scene, result.q, relative) < 2e-8
     assert np.abs(result.frame[:, :3] - frame).max() < 1e-9
 
 

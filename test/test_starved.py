@@ -35,11 +35,11 @@ def _run(
     **environment: str | None,
 ) -> tuple[int, list[str]]:
     """Run a command under a shortage. Return its exit code and the lines of its standard error."""
-    given = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "10000", **environment}
+    variables = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "10000", **environment}
     completed = subprocess.run(
         [*within, sys.executable, "-m", "plow_twin", *words],
         cwd=folder,
-        env={name: value for name, value in given.items() if value is not None},
+        env={name: value for name, value in variables.items() if value is not None},
         preexec_fn=before,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
@@ -64,7 +64,7 @@ def folder(compiled: None, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    "lacking",
+    "limits",
     [
         {"before": _limit(AS=3_000_000_000, NOFILE=64)},
         {
@@ -75,8 +75,8 @@ def folder(compiled: None, tmp_path: Path) -> Path:
     ],
     ids=["3 GB of addresses, 64 files", "no home, no terminal, the locale C", "a home that is not there"],
 )
-def test_a_run_and_its_replay_work_with_few_resources(lacking: dict[str, object], folder: Path) -> None:
-    assert _run(folder, *LIVE, **lacking) == (0, [])  # type: ignore[arg-type]
+def test_a_run_and_its_replay_work_with_few_resources(limits: dict[str, object], folder: Path) -> None:
+    assert _run(folder, *LIVE, **limits) == (0, [])  # type: ignore[arg-type]
     report = replay(folder / "run")
     assert (report.exit_code, report.samples) == (0, 1500)
 
@@ -119,7 +119,7 @@ def test_a_recording_in_progress_is_replayed_up_to_its_end(folder: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("lacking", "code", "message"),
+    ("limits", "code", "message"),
     [
         ({"before": _limit(AS=150_000_000)}, 1, "a library cannot be loaded"),
         ({"before": _limit(FSIZE=0)}, 1, "File too large"),
@@ -128,8 +128,8 @@ def test_a_recording_in_progress_is_replayed_up_to_its_end(folder: Path) -> None
     ],
     ids=["150 MB of addresses", "no room for a file", "100 kB for a file", "no compiled code"],
 )
-def test_lacking_resources_are_named(lacking: dict[str, object], code: int, message: str, folder: Path) -> None:
-    result, lines = _run(folder, *LIVE, **lacking)  # type: ignore[arg-type]
+def test_lacking_resources_are_named(limits: dict[str, object], code: int, message: str, folder: Path) -> None:
+    result, lines = _run(folder, *LIVE, **limits)  # type: ignore[arg-type]
     assert result == code and message in lines[0], lines
     assert len(lines) <= (2 if code == 3 else 1), lines  # a loss (exit code 3) may add a second line
 

@@ -11,10 +11,10 @@ ONE, OTHER = b"one", b"other"
 
 
 @given(st.sets(st.integers(1, 300), min_size=1))
-def test_used_plus_lost_equals_sent_for_any_removed_messages(heard: set[int]) -> None:
+def test_used_plus_lost_equals_sent_for_any_removed_messages(arrived: set[int]) -> None:
     senders = Senders()
-    assert all(senders.count_arrival(ONE, number) for number in sorted(heard))
-    assert len(heard) + senders.lost == max(heard)
+    assert all(senders.count_arrival(ONE, number) for number in sorted(arrived))
+    assert len(arrived) + senders.lost == max(arrived)
 
 
 @given(st.permutations(range(1, 12)))

@@ -205,9 +205,9 @@ def test_the_wear_rate_times_the_time_is_the_growth(reference: Run) -> None:
     spans = (slow["stamp_ns"] // SLOW_PERIOD_NS).tolist()
     assert spans == sorted({stamp // SLOW_PERIOD_NS for stamp in stamps})
     for before, after in itertools.pairwise(slow):
-        grown = after["clearance"][2:10] - before["clearance"][2:10]
+        growth = after["clearance"][2:10] - before["clearance"][2:10]
         seconds = (int(after["stamp_ns"]) - int(before["stamp_ns"])) * 1e-9
-        np.testing.assert_allclose(after["wear_rate"] * seconds, grown, atol=1e-18)
+        np.testing.assert_allclose(after["wear_rate"] * seconds, growth, atol=1e-18)
     assert slow["wear_rate"].max() > 0.0
 
 

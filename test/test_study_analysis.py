@@ -440,8 +440,8 @@ def test_speeds_act_at_the_stamps_that_the_mapping_reads(
     passes = [(item.start_s, item.end_s, item.start_m, item.end_m) for item in analysis.predictions[0].loads.passes]
     expected = [(0.0, 3.0, 0.0, 3.0), (3.0, 5.0, 3.0, 1.0), (5.0, 8.0, 1.0, 7.0)]
     assert len(passes) == 3
-    for one, known in zip(passes, expected, strict=True):
-        assert one == pytest.approx(known, abs=0.05)
+    for one, expected_pass in zip(passes, expected, strict=True):
+        assert one == pytest.approx(expected_pass, abs=0.05)
 
 
 def test_late_repeated_and_non_finite_samples_are_counted_as_in_a_live_run(tmp_path: Path) -> None:

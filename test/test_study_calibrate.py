@@ -74,9 +74,9 @@ def test_known_parameters_are_recovered_from_every_random_start() -> None:
     assert (
         len({start.before_polish for start in calibration.starts}) == 3
     )  # the three starts have taken different paths
-    known = identifiability(space(), objective, calibration.best.point)
-    assert len(known.singular_values) == 4 and known.singular_values[-1] > 1e-2
-    assert sum(value**2 for value in known.weakest.values()) == pytest.approx(1.0)
+    uniqueness = identifiability(space(), objective, calibration.best.point)
+    assert len(uniqueness.singular_values) == 4 and uniqueness.singular_values[-1] > 1e-2
+    assert sum(value**2 for value in uniqueness.weakest.values()) == pytest.approx(1.0)
     clusters = near_optimal(space(), calibration, excess=1e-6)
     assert len(clusters) == 1 and clusters[0].members >= 3 and clusters[0].values["loads.fx2.sign"] == -1.0
     two = [Cluster(2, 1.0, {}, {"x": (1.0, 2.0)}), Cluster(1, 1.05, {}, {"x": (5.0, 6.0)})]
@@ -102,9 +102,9 @@ def test_an_undetermined_parameter_is_reported() -> None:
         tuple(parse_unknown(text, scene) for text in (RANGES[0], "contact.impact_speed_floor_m_s=1e-4:1e-2"))
     )
     objective = RecordingObjective(scene, recording(1.0))
-    known = identifiability(unknowns, objective, np.array([0.4, 0.5]))
-    assert known.singular_values[1] == 0.0 < known.singular_values[0]
-    assert known.weakest == {"contact.stiffness": 0.0, "contact.impact_speed_floor_m_s": 1.0}
+    uniqueness = identifiability(unknowns, objective, np.array([0.4, 0.5]))
+    assert uniqueness.singular_values[1] == 0.0 < uniqueness.singular_values[0]
+    assert uniqueness.weakest == {"contact.stiffness": 0.0, "contact.impact_speed_floor_m_s": 1.0}
 
 
 def figures(seconds: float) -> TargetSet:

@@ -168,8 +168,8 @@ def test_a_lasting_change_of_the_load_is_attributed_to_the_load() -> None:
                 1.0, 0.15, 62
             )  # a window covers half of each of two periods, and contains the peak of only one of them
             start_ns = 10**9 * np.arange(61)
-            seen = with_neighbours(0.5 * (true[1:] + true[:-1]), start_ns)
-            groups.append((1e5 * true[1:] * random.normal(1.0, 0.02, 61), seen))
+            loads = with_neighbours(0.5 * (true[1:] + true[:-1]), start_ns)
+            groups.append((1e5 * true[1:] * random.normal(1.0, 0.02, 61), loads))
         difference = change(*groups, random, draws=100)
         assert difference is not None
         verdicts.append(difference.verdict)
@@ -278,8 +278,8 @@ def test_stray_files_beside_runs_are_named_and_the_runs_compared(
     assert cli(["compare", str(tmp_path), "--window", "0.5", "--workers", "1", "--json"]) == 3
     printed = capsys.readouterr()
     assert list(json.loads(printed.out)["groups"]) == ["monday", "tuesday"]
-    for said in (f"{tmp_path / 'load.csv'}: left out", f"left out: {tmp_path / 'cut.mcap'}"):
-        assert said in printed.err
+    for message in (f"{tmp_path / 'load.csv'}: left out", f"left out: {tmp_path / 'cut.mcap'}"):
+        assert message in printed.err
 
 
 def test_the_same_run_under_two_paths_counts_once(

@@ -90,8 +90,8 @@ def mcap(path: Path, encoding: str, schema: tuple[str, str, bytes], messages: li
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start()
-        known = writer.register_schema(*schema) if schema[0] else 0
-        channel = writer.register_channel("/load", encoding, known)
+        schema_id = writer.register_schema(*schema) if schema[0] else 0
+        channel = writer.register_channel("/load", encoding, schema_id)
         for time_ns, data in messages:
             writer.add_message(channel, max(time_ns, 0) % 2**64, data, max(time_ns, 0) % 2**64)
         writer.finish()
@@ -187,13 +187,15 @@ def test_a_mapping_without_a_field_or_stamp_is_named(tmp_path: Path) -> None:
         analyse(file, scene=PAPER, mapping=chosen)
     wrong = "{fx: wrench.force.x, fy: wrench.forc.y, m: wrench.torque.z}"
     chosen.write_text(f"excitation: {{topic: {topic}, fields: {wrong}}}")
-    told = f"{topic} has no number at 'wrench.forc.y' for fy"
-    with pytest.raises(RecordingError, match=f"malformed {COUNT}; excitation: {told}"):
+    message = f"{topic} has no number at 'wrench.forc.y' for fy"
+    with pytest.raises(RecordingError, match=f"malformed {COUNT}; excitation: {message}"):
         analyse(file, scene=PAPER, mapping=chosen)
     chosen.write_text(f"excitation: {{topic: {topic}}}\nhead_pose: {{topic: {topic}, fields: {{x: pose.x}}}}")
     analysis = analyse(file, scene=PAPER, mapping=chosen)
     assert analysis.losses == {f"unfit, head_pose: {topic} has no number at 'pose.x' for x": COUNT}
-    with pytest.raises(RecordingError, match=f"got no measured pose, expected some; head_pose: {topic} has no number"):
+    with pytest.raises(
+        RecordingError, match=f"got no measured pose, expected at least one row; head_pose: {topic} has no number"
+    ):
         read_recording(file, Path(PAPER), chosen)
 
 

@@ -119,14 +119,14 @@ def test_tossed_block_moves_as_the_preset_computed_by_the_solver(drops) -> None:
 
 
 def test_flight_is_fitted_to_its_measured_rows(drops) -> None:
-    for pose, given in list(zip(drops.pose, drops.flight_rows, strict=True))[:40]:
-        if given < 8:
+    for pose, rows in list(zip(drops.pose, drops.flight_rows, strict=True))[:40]:
+        if rows < 8:
             continue
-        flight = fit_flight(pose[:given])
-        assert abs(flight.state[0] - pose[given - 1, 0]) < 3e-4
+        flight = fit_flight(pose[:rows])
+        assert abs(flight.state[0] - pose[rows - 1, 0]) < 3e-4
         # the last given row may be after the impact; the flight then ends one row earlier
-        assert len(flight.times) in (given, given - 1, given - 2)
-    assert fit_flight(np.delete(pose[:given], 4, axis=0)).times[0] == pytest.approx(fit_flight(pose[:given]).times[0])
+        assert len(flight.times) in (rows, rows - 1, rows - 2)
+    assert fit_flight(np.delete(pose[:rows], 4, axis=0)).times[0] == pytest.approx(fit_flight(pose[:rows]).times[0])
 
 
 def test_bands_contain_nine_of_ten_measured_rows(drops) -> None:

@@ -184,8 +184,8 @@ def test_contact_sets_from_the_events_agree_with_the_solver(study: PaperStudy) -
     forces = study.runs.case.force  # the sets from the events agree with the forces of the rows
     letters, chosen = paper_sets.letters_of_pairs(study.runs.scene), paper_sets.of_sense("cw")
     for index in range(0, len(forces), 997):
-        seen = {letters[pair] for pair in range(8) if chosen[pair] and forces[index, pair] > 0.0}
-        assert set(paper_sets.at(timeline, float(study.runs.case.t[index]))) == seen
+        from_solver = {letters[pair] for pair in range(8) if chosen[pair] and forces[index, pair] > 0.0}
+        assert set(paper_sets.at(timeline, float(study.runs.case.t[index]))) == from_solver
 
 
 def test_published_forces_are_those_of_the_calibration_s_targets() -> None:
@@ -247,11 +247,11 @@ def test_the_page_has_the_run_s_numbers(study: PaperStudy) -> None:
     yes = study.verdicts["yes"]
     fitted = [entry for entry in study.rows if entry.inputs == FITTED]
     agree = sum(entry.verdict is Verdict.AGREES for entry in fitted)
-    said = (
+    sentence = (
         f"Of {len(study.rows)} statements, {yes} agree. R1 was fitted to {len(fitted)} of the {len(study.rows)} "
         f"statements. Of these {len(fitted)}, {agree} agree."
     )
-    assert said in " ".join(text.split())
+    assert sentence in " ".join(text.split())
     for entry in study.rows:
         if entry.difference is not None:
             assert f"| {entry.published} kN | {entry.computed} kN, {100 * entry.difference:+.1f} % |" in text

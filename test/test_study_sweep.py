@@ -164,7 +164,7 @@ def test_failed_members_are_listed_and_invalid_arguments_refused(
         (["--x", "contact.stiffness=1:2"], "PATH=LOW:HIGH:COUNT".replace("PATH", "contact.stiffness")),
         (["--statistic", "max.ccw.z"], "nearest: max.ccw"),
         (["--x", "contact.law=flores,hu_gou"], "contact.law: got 'hu_gou', expected one of exact_restitution"),
-        (["--y", "contact.stiffness=1:2:3"], "two different ones"),
+        (["--y", "contact.stiffness=1:2:3"], "two different parameters"),
         (["--x", "contact.stiffness=1:2:100000000"], "expected at most 1000000"),
         (["--x", "contact.stiffness=1:2:2000", "--y", "head.mass_kg=1:2:2000"], "got 4000000 members"),
         (["--dask", "tcp://127.0.0.1:1"], "expected the address of a scheduler"),

@@ -47,9 +47,9 @@ async def _device(client: Client) -> tuple[Any, Callable[[str], Any]]:
     return client.get_node(f"ns={index};s=plough"), lambda name: client.get_node(f"ns={index};s=plough.{name}")
 
 
-async def _acknowledge(client: Client, heard: Heard, condition: Any, event_id: bytes | None = None) -> str:
-    given = ua.Variant(event_id or heard.events[-1].EventId, ua.VariantType.ByteString)
-    return await _call_acknowledge(condition, given, ua.Variant(ua.LocalizedText("seen")))
+async def _acknowledge(client: Client, listener: Heard, condition: Any, event_id: bytes | None = None) -> str:
+    event = ua.Variant(event_id or listener.events[-1].EventId, ua.VariantType.ByteString)
+    return await _call_acknowledge(condition, event, ua.Variant(ua.LocalizedText("seen")))
 
 
 async def _call_acknowledge(condition: Any, *arguments: ua.Variant) -> str:
@@ -63,15 +63,15 @@ async def _call_acknowledge(condition: Any, *arguments: ua.Variant) -> str:
 
 async def _conditions(client: Client) -> Heard:
     """Subscribe to conditions, and request their present state."""
-    heard = Heard()
-    subscription = await client.create_subscription(50, heard)
+    listener = Heard()
+    subscription = await client.create_subscription(50, listener)
     alarm_type = client.get_node(ua.NodeId(ua.ObjectIds.ExclusiveLevelAlarmType))
     await subscription.subscribe_alarms_and_conditions(client.nodes.server, alarm_type)
     conditions = client.get_node(ua.NodeId(ua.ObjectIds.ConditionType))
     number = ua.Variant(subscription.subscription_id, ua.VariantType.UInt32)
     await conditions.call_method("0:ConditionRefresh", number)
-    await _soon(lambda: bool(heard.events))
-    return heard
+    await _soon(lambda: bool(listener.events))
+    return listener
 
 
 async def _soon(reached: Callable[[], Any]) -> None:
@@ -102,22 +102,26 @@ def test_opcua_clients_read_a_typed_model_and_may_acknowledge_alarms(tmp_path: P
             for written in (horizontal, node("flags.stream"), node("alarms.force")):
                 with pytest.raises(ua.UaStatusCodeError):
                     await written.write_value(await written.read_value())
-            heard, condition = await _conditions(client), node("alarms.force.condition")
-            assert heard.events[-1].ConditionName == "force" and not heard.states()[-1][1] and heard.events[-1].Retain
+            listener, condition = await _conditions(client), node("alarms.force.condition")
+            assert (
+                listener.events[-1].ConditionName == "force"
+                and not listener.states()[-1][1]
+                and listener.events[-1].Retain
+            )
             if not allowed:
-                assert await _acknowledge(client, heard, condition) == "BadUserAccessDenied"
+                assert await _acknowledge(client, listener, condition) == "BadUserAccessDenied"
                 return
             assert await _call_acknowledge(condition) == "BadArgumentsMissing"
             assert await _call_acknowledge(condition, *[ua.Variant(b"event")] * 3) == "BadTooManyArguments"
-            assert await _acknowledge(client, heard, condition, b"another") == "BadEventIdUnknown"
-            assert await _acknowledge(client, heard, condition) == "Good"
-            await _soon(lambda: heard.states()[-1][1])
+            assert await _acknowledge(client, listener, condition, b"another") == "BadEventIdUnknown"
+            assert await _acknowledge(client, listener, condition) == "Good"
+            await _soon(lambda: listener.states()[-1][1])
 
     for allowed, more in ((False, ()), (True, ("--opcua-acknowledge", "--record", str(run)))):
         with _live(*arguments, *more) as live:
             live.until_count("samples_used", 1500)
             _meanwhile(live, look(allowed=allowed))
-            live.until(lambda heard: heard["opcua_out"]["values"]["sent"] > 2, "sent")
+            live.until(lambda listener: listener["opcua_out"]["values"]["sent"] > 2, "sent")
             assert live.stop() == 0
     assert [entry.name for entry in _entries(run) if isinstance(entry, Parameter)] == ["alarms_acknowledged"]
 
@@ -172,7 +176,7 @@ def test_an_opcua_server_for_other_machines_encrypts_and_admits_trusted_clients(
         live.until_count("samples_used", 100)
         trusted, other = tmp_path / "trusted" / "client.crt", tmp_path / "other.pem"
         cases = ((trusted, "s3cret"), (trusted, "guess"), (other, "s3cret"), (None, "s3cret"))
-        connected = [_meanwhile(live, connects(*given)) for given in cases]
+        connected = [_meanwhile(live, connects(*case)) for case in cases]
         assert connected == [True, False, False, False]
         live.process.terminate()
         output = live.process.communicate(timeout=60.0)[1]
@@ -220,9 +224,9 @@ def test_influxdb_receives_the_lines_of_its_downtime(tmp_path: Path) -> None:
         url = f"http://127.0.0.1:{database.server_address[1]}/mine/face"
         arguments = (str(path), "--follow", "--influx", url, "--out-access", str(tmp_path / "out.yaml"), *STALE)
         with _live(*arguments, "--out-rate", "5") as live:
-            live.until(lambda heard: "503" in str(heard.get("influx", {}).get("message")), "trouble")
+            live.until(lambda listener: "503" in str(listener.get("influx", {}).get("message")), "trouble")
             database.open = True  # type: ignore[attr-defined]
-            values = live.until(lambda heard: heard["influx"]["values"]["sent"] > 5, "sent")
+            values = live.until(lambda events: events["influx"]["values"]["sent"] > 5, "sent")
             assert live.heard["influx"]["values"]["lost"] == 0 and values["samples_used"] == "500"
             assert live.stop() == 0
         lines = database.lines  # type: ignore[attr-defined]

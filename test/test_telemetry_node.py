@@ -22,30 +22,30 @@ def test_the_telemetry_of_a_node_sends_its_results_and_ends_cleanly(tmp_path: Pa
     port = _free_port()
     parameters = {"alarm_force": "[1.0, 1e9]", "excitation_timeout": 60.0, **RELIABLE_INPUT}
     with _open_broker(tmp_path, port), bench(tmp_path, **parameters) as running:
-        probe, heard = running.probe, Subscriber(port)
+        probe, subscriber = running.probe, Subscriber(port)
         words = ["telemetry", "--namespace", running.namespace, "--mqtt-out", f"mqtt://127.0.0.1:{port}/face"]
         words += ["--influx", f"http://127.0.0.1:{_free_port()}/org/bucket", "--out-rate", "5"]
         beside = Process("plow_twin", words, tmp_path / "telemetry.log")
         try:
-            probe.until(lambda: heard.newest("face/status") is not None, "the status")
+            probe.until(lambda: subscriber.newest("face/status") is not None, "the status")
             send, begin_ns = probe.excitation(), time.time_ns()
             for index in range(600):
                 send(begin_ns + index * MS, (32e3, 0.0, -45e3))
                 probe.pace(index)
-            probe.until(lambda: (heard.newest("face/alarms") or {"values": {}})["values"].get("force_level") == "warn",
-                        "the alarm")  # fmt: skip
+            alarms = lambda: (subscriber.newest("face/alarms") or {"values": {}})["values"]  # noqa: E731
+            probe.until(lambda: alarms().get("force_level") == "warn", "the alarm")
             peaks = max(
-                max(filter(None, message["values"].values()), default=0.0) for message in heard.all("face/peaks")
+                max(filter(None, message["values"].values()), default=0.0) for message in subscriber.all("face/peaks")
             )
-            assert peaks > 1e4 and heard.newest("face/clearance")["values"]["horizontal"] == pytest.approx(0.025)
+            assert peaks > 1e4 and subscriber.newest("face/clearance")["values"]["horizontal"] == pytest.approx(0.025)
             # the message names the unreachable receiver
             assert "influx" in beside.output() or "http" in beside.output()
             # points for the unreachable database are lost, and the exit code shows a loss
             assert beside.stop() == 3
-            probe.until(lambda: heard.newest("face/online") is False, "the end")
+            probe.until(lambda: subscriber.newest("face/online") is False, "the end")
         finally:
             beside.close()
-            heard.close()
+            subscriber.close()
 
 
 def test_a_missing_node_is_named(tmp_path: Path) -> None:

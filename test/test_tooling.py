@@ -134,7 +134,7 @@ def test_ci_is_bounded_and_runs_every_check() -> None:
     program = (ROOT / ".ci" / "run").read_text()
     steps = re.findall(r'^step "([^"]+)" (\d+) (?:env \S+ )?make (.+)', program, re.MULTILINE)
     assert sum(int(limit) for _, limit, _ in steps) <= 4200
-    targets = {word for _, _, given in steps for word in given.split()}
+    targets = {word for _, _, script in steps for word in script.split()}
     # coverage is a figure and not a check, so it has no required minimum
     assert targets >= {"test", "lint", "docs", "demo", "lowest"}
     assert "test_stream_session.py" in dry_run("coverage") and "--cov" not in dry_run("test")
@@ -150,9 +150,9 @@ def test_a_screenshot_does_not_change_the_settings_of_the_user_s_viewer(
 ) -> None:
     monkeypatch.syspath_prepend(str(ROOT / "tools"))
     screenshot = importlib.import_module("screenshot")
-    given: list[dict[str, str]] = []
-    monkeypatch.setattr(screenshot.subprocess, "run", lambda command, **options: given.append(options["env"]))
-    monkeypatch.setattr(screenshot.subprocess, "Popen", lambda command, **options: given.append(options["env"]))
+    environments: list[dict[str, str]] = []
+    monkeypatch.setattr(screenshot.subprocess, "run", lambda command, **options: environments.append(options["env"]))
+    monkeypatch.setattr(screenshot.subprocess, "Popen", lambda command, **options: environments.append(options["env"]))
     screenshot.start_viewer(9, tmp_path)
     for name in ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME"):
-        assert [environment[name] for environment in given] == [str(tmp_path)] * 2
+        assert [environment[name] for environment in environments] == [str(tmp_path)] * 2

@@ -397,8 +397,8 @@ def test_a_picture_shows_only_contents_of_the_recording(tmp_path: Path, monkeypa
     run = record_run(tmp_path / "run", journal, frame_every=10**9)
     to_png(run.folder, tmp_path / "run.png")
     section, wide, force, load, clearance = figures[0].axes
-    said = [axis.texts[0].get_text() for axis in (section, wide, force, clearance)]
-    assert all(text.endswith("in the recording") for text in said) and not section.lines and load.lines
+    texts = [axis.texts[0].get_text() for axis in (section, wide, force, clearance)]
+    assert all(text.endswith("in the recording") for text in texts) and not section.lines and load.lines
 
 
 def test_a_run_without_a_row_has_no_picture(tmp_path: Path) -> None:

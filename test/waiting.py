@@ -9,9 +9,9 @@ from collections.abc import Callable
 LONGEST_S = 200.0
 
 
-def until(reached: Callable[[], object], what: object = "", pause_s: float = 0.01) -> None:
+def until(reached: Callable[[], object], event: object = "", pause_s: float = 0.01) -> None:
     """Call `reached` until it returns a true value."""
     give_up = time.monotonic() + LONGEST_S
     while not reached():
-        assert time.monotonic() < give_up, what
+        assert time.monotonic() < give_up, event
         time.sleep(pause_s)

@@ -28,8 +28,8 @@ def _text(function: str, call: ast.Call) -> str | None:
         bounds = {word.arg: ast.unparse(word.value) for word in call.keywords}
         signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
         limits = ", ".join(f"{signs[name]} {value}" for name, value in bounds.items() if name in signs)
-        given = [ast.unparse(argument) for argument in call.args[2:]]
-        default = f"; {given[0]} unless given" if given and given[0] not in ("None", "math.nan") else ""
+        arguments = [ast.unparse(argument) for argument in call.args[2:]]
+        default = f"; {arguments[0]} unless given" if arguments and arguments[0] not in ("None", "math.nan") else ""
         return f"[{words[0]}] {words[1]}{default}{f' ({limits})' if limits else ''}"
     if function == "_choice":
         return f"{words[0]}{f'; {words[1]} unless given' if len(words) > 1 else ''}"

@@ -32,8 +32,8 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
             newer = (
                 "" if sys.version_info < (3, 13) else f"; this is Python 3.{sys.version_info[1]}, expected 3.11 or 3.12"
             )
-            why = error.__context__ or error or "not enough memory"
-            sys.exit(f"plow-twin: a library cannot be loaded: {why}{newer}")
+            reason = error.__context__ or error or "not enough memory"
+            sys.exit(f"plow-twin: a library cannot be loaded: {reason}{newer}")
 
     run(arguments)
 

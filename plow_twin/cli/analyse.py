@@ -60,10 +60,10 @@ def analyse(
         if len(recordings) != 1:
             raise click.UsageError(f"--watch: got {len(recordings)} recordings, expected one")
         return _watched(Task(recordings[0], scene_file, mapping, further, out, units=units), watch, as_json, quiet)
-    recordings_found, left = found_recordings(recordings, out)
+    recordings_found, left_out_files = found_recordings(recordings, out)
     many = len(recordings_found) > 1 or recordings_found != list(recordings)
-    for option, given in (("--dask", dask), ("--workers", workers)):
-        if given is not None and not many:
+    for option, value in (("--dask", dask), ("--workers", workers)):
+        if value is not None and not many:
             raise click.UsageError(f"{option}: got one recording, expected many, or a folder of recordings")
     if dask is not None and workers is not None:
         raise click.UsageError("--workers cannot be combined with --dask: a cluster has its own workers")
@@ -72,7 +72,7 @@ def analyse(
         if out is not None and many
         else [out] * len(recordings_found)
     )
-    beside = () if many else left
+    beside = () if many else left_out_files
     tasks = [
         Task(path, scene_file, mapping, further, folder, beside, units)
         for path, folder in zip(recordings_found, folders, strict=True)
@@ -83,8 +83,8 @@ def analyse(
     if many and out is not None:
         from plow_twin.study.analysis.report import write_table_of_runs
 
-        write_table_of_runs(results, out, left)
-    _show(results, many, as_json, quiet, list(map(str, left)))
+        write_table_of_runs(results, out, left_out_files)
+    _show(results, many, as_json, quiet, list(map(str, left_out_files)))
     if out is not None and not (as_json or quiet):
         click.echo(str(out / ("runs.parquet" if many else "report.html")))
     failed = any("error" in facts for facts in results)
@@ -196,11 +196,11 @@ def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool,
         _show_contacts(console, good)
     for facts in good:
         if "without_samples" in facts:
-            said = f"{facts['run']}: {facts['without_samples']}; in these intervals the load is interpolated linearly"
-            console.print(said, highlight=False, soft_wrap=True)
+            text = f"{facts['run']}: {facts['without_samples']}; in these intervals the load is interpolated linearly"
+            console.print(text, highlight=False, soft_wrap=True)
         if not facts["signals"]:
-            said = f"{facts['run']}: no measured values to compare with the model"
-            console.print(said, highlight=False, soft_wrap=True)
+            text = f"{facts['run']}: no measured values to compare with the model"
+            console.print(text, highlight=False, soft_wrap=True)
             continue
         shown = table(
             f"{facts['run']}: predicted minus measured", "signal", "n", "bias", "RMS", "correlation [1]", "lag [s]"
@@ -214,10 +214,9 @@ def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool,
             )
         console.print(shown)
         if "stretches" in facts:
-            left = ", ".join(f"{name} {count}" for name, count in facts["not_compared"].items()) or "none"
-            console.print(
-                f"{facts['stretches']} stretches between resets; the table shows the longest. Not compared: {left}."
-            )
+            not_compared = ", ".join(f"{name} {count}" for name, count in facts["not_compared"].items()) or "none"
+            intervals = f"{facts['stretches']} stretches between resets; the table shows the longest."
+            console.print(f"{intervals} Not compared: {not_compared}.")
         if "outside" in facts:
             outside = ", ".join(f"{name} {count}" for name, count in facts["outside"].items())
             console.print(f"Measurements outside the time of the load, not compared: {outside}.")

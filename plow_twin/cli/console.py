@@ -197,5 +197,5 @@ def say_lost(recording: object, lost: Mapping[str, int]) -> None:
     ends = {status.value for status in FileStatus}
     for status in ends.intersection(lost):
         say_end(recording, status)
-    if left := {name: count for name, count in lost.items() if name not in ends}:
-        say_error(f"plow-twin: {recording}: lost {counts(left)}")
+    if other_losses := {name: count for name, count in lost.items() if name not in ends}:
+        say_error(f"plow-twin: {recording}: lost {counts(other_losses)}")

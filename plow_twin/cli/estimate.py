@@ -175,7 +175,7 @@ class _Task:
 
 
 @dataclass(frozen=True)
-class _Given:
+class _Recorded:
     measured: Measured
     load: Load
     poses: Poses
@@ -183,7 +183,7 @@ class _Given:
     lost: int
 
 
-def _measured(source: Path, scene: Path | None, mapping: Path | None, folder: bool) -> _Given:
+def _measured(source: Path, scene: Path | None, mapping: Path | None, folder: bool) -> _Recorded:
     from plow_twin.estimate.gaps import Gaps
     from plow_twin.estimate.measurements import Poses
     from plow_twin.record.measured import read_measured, read_recording
@@ -194,7 +194,7 @@ def _measured(source: Path, scene: Path | None, mapping: Path | None, folder: bo
     poses, lost_poses = Poses.of(measured.poses[:, 0], measured.poses[:, 1:], measured.pose_deviation)
     gaps, lost_gaps = Gaps.of(measured.gaps[:, 0], measured.gaps[:, 1:], measured.gaps_deviation)
     lost = measured.unreadable + lost_load + lost_poses + lost_gaps
-    return _Given(measured, load, poses, gaps if len(gaps.t) else None, lost)
+    return _Recorded(measured, load, poses, gaps if len(gaps.t) else None, lost)
 
 
 def _load_of(measured: Measured) -> tuple[Load, int]:
@@ -210,8 +210,8 @@ def _load_of(measured: Measured) -> tuple[Load, int]:
 def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool) -> _Task:
     from plow_twin.estimate.estimate import estimate as run
 
-    given = _measured(source, scene, mapping, folder)
-    measured, lost, forces = given.measured, given.lost, None
+    recording = _measured(source, scene, mapping, folder)
+    measured, lost, forces = recording.measured, recording.lost, None
     if len(measured.forces):
         from plow_twin.estimate.contact_forces import ContactForces
 
@@ -220,23 +220,23 @@ def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool)
     losses = {"losses": dict(measured.lost)}
 
     def found() -> tuple[Estimate, dict[str, Any]]:
-        return run(measured.scene, given.load, given.poses, lost, given.gaps, forces), losses
+        return run(measured.scene, recording.load, recording.poses, lost, recording.gaps, forces), losses
 
-    return _Task(measured.scene, given.load, given.poses, found)
+    return _Task(measured.scene, recording.load, recording.poses, found)
 
 
-def _followed(given: _Given, members: int, dt: float | None) -> tuple[list[str], Any]:
+def _followed(data: _Recorded, members: int, dt: float | None) -> tuple[list[str], Any]:
     from plow_twin.estimate import followed as offline
     from plow_twin.live.parameters import SPECS
 
-    if not len(given.measured.load):
+    if not len(data.measured.load):
         raise click.UsageError("--follow: got no load, expected its samples")
-    apart = float(max(given.load.t[1:] - given.load.t[:-1], default=0.0))
+    apart = float(max(data.load.t[1:] - data.load.t[:-1], default=0.0))
     longest = SPECS["jump_forward"].metadata["high"]
     if apart > longest:
         raise click.UsageError(f"--follow: got {apart:g} s between two samples, expected at most {longest:g} s")
-    check_rows(float(given.load.t[-1] - given.load.t[0]), dt, "--follow-dt")
-    stretch = offline.follow(given.measured.scene, given.load, given.poses, members, dt, gaps=given.gaps)
+    check_rows(float(data.load.t[-1] - data.load.t[0]), dt, "--follow-dt")
+    stretch = offline.follow(data.measured.scene, data.load, data.poses, members, dt, gaps=data.gaps)
     return offline.table(stretch.rows)
 
 

@@ -110,20 +110,25 @@ def forecast(
     except LifeError as error:
         raise click.UsageError(str(error)) from error
     with busy("forecasting", quiet or as_json):
-        known = None
+        wear_coefficient = None
         if history is None:
             model, deviation = _now(model, facts_now)
         else:
             if estimated is not None:
                 model = replace(model, contact=_now(model, facts_now)[0].contact)
-            known = coefficient(model, _history(history))
-            deviation = float(known.deviation[0]), float(known.deviation[1])
-            model = with_clearances(model, float(known.clearance[0]), float(known.clearance[1]), known.depth)
+            wear_coefficient = coefficient(model, _history(history))
+            deviation = float(wear_coefficient.deviation[0]), float(wear_coefficient.deviation[1])
+            model = with_clearances(
+                model,
+                float(wear_coefficient.clearance[0]),
+                float(wear_coefficient.clearance[1]),
+                wear_coefficient.depth,
+            )
         _check_limits(limits, model)
-        result = run(model, plan, deviation, known)
+        result = run(model, plan, deviation, wear_coefficient)
     facts = result.as_dict()
-    if known is not None:
-        facts["coefficient_m2_n"] = asdict(known.interval())
+    if wear_coefficient is not None:
+        facts["coefficient_m2_n"] = asdict(wear_coefficient.interval())
     if plot is not None:
         from plow_twin.view.forecast import draw_forecast
 
@@ -163,11 +168,11 @@ def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
     reader = RunReader(path) if path.is_dir() else own_run(path) if path.exists() else None
     if reader is None:
         return load_scene(name), None, {}
-    left, newest = left_by(reader)
+    scene, newest = left_by(reader)
     counts = {"journal": reader.lost.get("journal", 0), "damaged_chunks": reader.damaged_chunks, **reader.lost_parts}
     counts["truncated_files"] = int(reader.status is FileStatus.TRUNCATED)
     lost = {topic: count for topic, count in counts.items() if count}
-    return left, None if newest is None else json.loads(newest.result), lost
+    return scene, None if newest is None else json.loads(newest.result), lost
 
 
 def _estimate(path: Path) -> Any:

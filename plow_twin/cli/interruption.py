@@ -22,14 +22,14 @@ def interruptible(on_overdue: Callable[[], object] = lambda: None) -> Iterator[C
     If the context has not ended `PATIENCE_S` seconds after the signal, because a library is waiting, `on_overdue` is
     called and the process ends with exit code 1.
     """
-    asked, done = threading.Event(), threading.Event()
+    interrupted, done = threading.Event(), threading.Event()
     receive, send = os.pipe()
     os.set_blocking(send, False)
 
     def watch() -> None:
         # a signal writes a byte to the pipe, which wakes this thread even if the main thread is blocked
         os.read(receive, 1)
-        asked.set()
+        interrupted.set()
         if not done.wait(PATIENCE_S):
             on_overdue()
             os._exit(1)
@@ -39,7 +39,7 @@ def interruptible(on_overdue: Callable[[], object] = lambda: None) -> Iterator[C
     thread = threading.Thread(target=watch, daemon=True, name="plow_twin interruption")
     thread.start()
     try:
-        yield asked.is_set
+        yield interrupted.is_set
     finally:
         done.set()
         signal.set_wakeup_fd(wakeup)

@@ -157,13 +157,13 @@ def _live(
         return leave(DONE)
     parts = front.parts()
     facts = {name: values for name, (_, _, values) in parts.items()}
-    taken = report.close_lines()
+    closed = report.close_lines()
     if report.lost:
         lost = [*lost, f"{report.lost} lines were not, or only partly, written to standard output"]
     for text in (*lost, *front.causes()):
         report.error(text)
-    hangs = not report.close() or not taken
-    if as_json and taken:
+    hangs = not report.close() or not closed
+    if as_json and closed:
         click.echo(json.dumps(facts, indent=2))
     elif not quiet and not lines:
         shown = {key: value for key, value in facts["input"].items() if value not in ("", "0") or key == "samples_used"}
@@ -259,7 +259,7 @@ def _bridge(source: str, options: dict[str, Any], rate_hz: float) -> Bridge:
     paths = _tables(path, growing=options["follow"]) if path.is_dir() else [path]
     if not paths:
         kinds = ".csv" if options["follow"] else ".csv or .parquet"
-        raise BridgeError(f"{path}: got a folder without {kinds}, expected some")
+        raise BridgeError(f"{path}: got a folder without {kinds}, expected at least one file")
     files = Files(paths, follow=options["follow"])
     page = "; the page opens after it, and its address is then printed" if options["dashboard"] else ""
     for missing in files.awaited() if options["follow"] else ():

@@ -77,8 +77,14 @@ class Report:
             self._alarms, message = texts, "; ".join(new or texts) or "none"
         if self._lines:
             typed = {key: _typed(value) for key, value in values.items()}
-            said = {"topic": name, "stamp_ns": self._stamp_ns(), "level": level, "message": message, "values": typed}
-            self._out.put(json.dumps(said))
+            message_facts = {
+                "topic": name,
+                "stamp_ns": self._stamp_ns(),
+                "level": level,
+                "message": message,
+                "values": typed,
+            }
+            self._out.put(json.dumps(message_facts))
         elif name in ("status", "alarms") and not self._quiet:
             self._errors.put(f"{_LEVELS[level]} {name}: {message}")
 
@@ -154,10 +160,10 @@ class Outlet:
             self._closed = True
             self._news.notify()
         while self._thread is not None and self._thread.is_alive():
-            left = len(self._waiting)
+            waiting = len(self._waiting)
             self._thread.join(_PATIENCE_S)
-            if self._thread.is_alive() and len(self._waiting) == left:
-                self.lost += left + 1  # the lines in the queue, and the line that is being written
+            if self._thread.is_alive() and len(self._waiting) == waiting:
+                self.lost += waiting + 1  # the lines in the queue, and the line that is being written
                 return False
         if self._broken:
             raise BrokenPipeError
@@ -171,9 +177,9 @@ class Outlet:
                     return
                 line = self._waiting.popleft()
             try:
-                taken = self._write(line)
+                written = self._write(line)
             except BrokenPipeError:
                 self._broken = True
                 return
             with self._news:
-                self.lost += not taken
+                self.lost += not written

@@ -64,9 +64,9 @@ def find_ros_wheels() -> None:
 def unit_option(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the option `--unit NAME=UNIT`. The parameter `units` of the command receives the units by name."""
 
-    def parsed(context: click.Context, parameter: click.Parameter, given: tuple[str, ...]) -> dict[str, str]:
-        units = dict(text.partition("=")[::2] for text in given)
-        for text in given:
+    def parsed(context: click.Context, parameter: click.Parameter, texts: tuple[str, ...]) -> dict[str, str]:
+        units = dict(text.partition("=")[::2] for text in texts)
+        for text in texts:
             if "=" not in text:
                 raise click.BadParameter(f"got {text!r}, expected NAME=UNIT, such as fx=kN or t=ms")
         return units

@@ -72,5 +72,5 @@ def record(
     for name, reason in facts["skipped_topics"].items():
         say_error(f"plow-twin: {name}: not recorded: {reason}")
     for name in facts["without_publisher"]:
-        say_error(f"plow-twin: {name}: not recorded: no publisher, expected one")
+        say_error(f"plow-twin: {name}: not recorded: got no publisher, expected at least one")
     return DONE if facts["complete"] else DONE_WITH_LOSS

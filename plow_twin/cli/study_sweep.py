@@ -111,9 +111,9 @@ def _computed(store: Store, workers: int | None, dask: str | None, quiet: bool) 
     from plow_twin.study.sweep.run import run_here, run_on_cluster
 
     size, chunks = store.sweep.size, store.chunks
-    lacking = sum(len(chunks[index]) for index in store.missing())
+    missing = sum(len(chunks[index]) for index in store.missing())
     if not quiet:
-        say_error(f"{size} members, {size - lacking} already stored, {lacking} to compute")
+        say_error(f"{size} members, {size - missing} already stored, {missing} to compute")
     with progress("sweeping", quiet) as on_progress:
 
         def report(done: int) -> None:

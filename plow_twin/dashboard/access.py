@@ -59,8 +59,8 @@ class PageAccess:
 
     def admits(self, token: object) -> bool:
         """Compare a token with the token of the screen, in a time that does not depend on the tokens."""
-        given = token if isinstance(token, str) else ""
-        return hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
+        text = token if isinstance(token, str) else ""
+        return hmac.compare_digest(text.encode("utf-8", "replace"), self.token.encode())
 
     def answers_to(self, host: str) -> bool:
         """Return whether the screen can be requested under the name in the header `Host`.

@@ -213,13 +213,13 @@ class Feed:
     def receive(self) -> None:
         """Handle operator requests, and receive reports of the process."""
         for _ in range(_MOST_REQUESTS):
-            asked = self._link.receive()
-            if asked is None:
+            request = self._link.receive()
+            if request is None:
                 break
-            if asked.get("do") == "report":
-                self.report = asked
+            if request.get("do") == "report":
+                self.report = request
             else:
-                self._do(asked)
+                self._do(request)
 
     def send(self) -> bool:
         """Send an update. If the update does not fit in the buffer of the link, count it and return False."""
@@ -247,13 +247,13 @@ class Feed:
             self.motion.add_load(np.array(self._loads))
             self._loads = []
 
-    def _do(self, asked: dict[str, Any]) -> None:
-        action, text = str(asked.get("do")), str(asked.get("text", ""))
+    def _do(self, request: dict[str, Any]) -> None:
+        action, text = str(request.get("do")), str(request.get("text", ""))
         if self._answer is None or action not in ("acknowledge", "mark"):
             self.event(action, "not possible here", done=False)
             return
-        done, said = self._answer(action, text)
-        self.event(action, f"{text}: {said}" if text and done else said, done=done)
+        done, answer = self._answer(action, text)
+        self.event(action, f"{text}: {answer}" if text and done else answer, done=done)
 
 
 def _joined(rows: list[NDArray[np.void]], name: str) -> NDArray[Any]:

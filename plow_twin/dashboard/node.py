@@ -181,8 +181,8 @@ class NodeWatch:
             name, _, part = status.name.partition(": ")
             if name == self.name:
                 values = {item.key: item.value for item in status.values}
-                known: Part = (int.from_bytes(status.level, "little"), status.message, values)
-                self.feed.part(part, known)
+                part_of_twin: Part = (int.from_bytes(status.level, "little"), status.message, values)
+                self.feed.part(part, part_of_twin)
 
 
 def show_node(

@@ -412,6 +412,6 @@ def _print_places(console: Console, recording: Path, view: Path | None) -> None:
     if view is None:
         console.print("no view: rerun is not installed (pip install 'plow_twin[view]')", markup=False, highlight=False)
         return
-    look = f"{program('rerun', 'rerun')} {shlex.quote(str(view))}"
+    viewer_command = f"{program('rerun', 'rerun')} {shlex.quote(str(view))}"
     console.print(f"view       {view}", highlight=False, soft_wrap=True)
-    console.print(f"  look at it:          {look}", highlight=False, soft_wrap=True)
+    console.print(f"  look at it:          {viewer_command}", highlight=False, soft_wrap=True)

@@ -288,13 +288,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     import rclpy.utilities
 
-    given = list(sys.argv if arguments is None else ["excitation_publisher", *arguments])
+    command_line = list(sys.argv if arguments is None else ["excitation_publisher", *arguments])
     stop = StopSignals()
     try:
-        options = _parse(without_ros(given)[1:])
+        options = _parse(without_ros(command_line)[1:])
         samples = plan(options.scene, options.rate, options.seconds, _cutting(options), options.sensor)
         stop.interrupt = False
-        start_ros(given)
+        start_ros(command_line)
     except StopRequested:
         stop.ignore()
         return 0

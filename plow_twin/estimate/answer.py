@@ -57,32 +57,32 @@ class Answer:
         return json.dumps({**self.estimate.as_dict(), **self.also}, allow_nan=False)
 
 
-def answer(scene: Scene, window: Window, guess: Guess, asked: Requests) -> Answer:
+def answer(scene: Scene, window: Window, guess: Guess, requests: Requests) -> Answer:
     """Return the estimate from a window, by a fit from `guess`, and the requested answers."""
     result, following = estimate_window(scene, window.load, window.pose, window.lost, guess, window.gaps)
     also: dict[str, Any] = {}
-    if asked.members:
+    if requests.members:
         try:
-            also["forces"] = _forces(scene, result, window.load, asked)
+            also["forces"] = _forces(scene, result, window.load, requests)
         except ForcesError as error:
             also |= {"forces": None, "forces_error": str(error)}
-    if asked.plan is not None:
+    if requests.plan is not None:
         try:
-            also["forecast"] = forecast_from(scene, result, window.load, asked.plan)
+            also["forecast"] = forecast_from(scene, result, window.load, requests.plan)
         except LifeError as error:
             also |= {"forecast": None, "forecast_error": str(error)}
     return Answer(result, following, also)
 
 
-def _forces(scene: Scene, result: Estimate, load: Load, asked: Requests) -> dict[str, Any]:
+def _forces(scene: Scene, result: Estimate, load: Load, requests: Requests) -> dict[str, Any]:
     if State.PRIOR in (result.horizontal_state, result.vertical_state):
         raise ForcesError("estimate: got only the prior, expected an estimated clearance")
     if load.constant:
         raise ForcesError("load: got the same value throughout, expected a measured load")
     period = load.period()
     settle, end = _SETTLE_PERIODS * period, float(load.t[-1])
-    measured_load = followed(load.between(end - asked.span_s - settle, end), period)
-    return forces_of(scene, result, measured_load, asked.members, settle, over_time=False).as_dict()
+    measured_load = followed(load.between(end - requests.span_s - settle, end), period)
+    return forces_of(scene, result, measured_load, requests.members, settle, over_time=False).as_dict()
 
 
 def followed(load: Load, period: float) -> Load:
@@ -111,9 +111,11 @@ def under_load(scene: Scene, result: Estimate, load: Load) -> Scene:
     """Return the scene under the load of a window times the estimated gains, if it has enough load periods."""
     gains = [1.0 if gain is None else gain.mean for gain in (result.gain_fx, result.gain_fy, result.gain_m)]
     measured_load = load.thinned() if result.load_harmonics is None else result.load_harmonics.added(load.thinned())
-    seen = replace(scene, loads=(Table("window", measured_load.t - measured_load.t[0], measured_load.wrench * gains),))
+    loaded = replace(
+        scene, loads=(Table("window", measured_load.t - measured_load.t[0], measured_load.wrench * gains),)
+    )
     try:
-        period_of(seen)
+        period_of(loaded)
     except LifeError:
         return scene
-    return seen
+    return loaded

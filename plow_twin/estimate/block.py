@@ -83,7 +83,7 @@ class Impact:
     arm: float
 
 
-def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> Estimate:
+def estimate_block(scene: Scene, load: Load, poses: Poses, prior_estimate: Estimate) -> Estimate:
     """Return the estimate of the clearances around a block from the positions of its impacts.
 
     If only one of two opposite walls has impacts, the sensor's bias along their normal is assumed to be zero, and is
@@ -106,20 +106,22 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> E
     level = noise_level(poses.q)
     unseen = State.NOT_OBSERVABLE
     if len(poses.t) < 2 * _FLIGHT_ROWS[0] or not level.all():
-        why = (
+        reason = (
             f"poses: got {len(poses.t)} complete poses with noise {level.tolist()}, expected at least "
             f"{2 * _FLIGHT_ROWS[0]} with some noise in each component"
         )
-        return replace(known, horizontal_state=unseen, vertical_state=unseen, reasons=(why,))
+        return replace(prior_estimate, horizontal_state=unseen, vertical_state=unseen, reasons=(reason,))
     impacts_found, contacts = impacts(scene, load, poses, level)
-    why = _unfit(impacts_found, contacts)
-    if why:
-        return replace(known, horizontal_state=unseen, vertical_state=unseen, reasons=(why,))
-    met, reasons = _on_walls(scene, [one for one in impacts_found if one.gained < tuning.GAINED], known)
-    value, deviation = _solve(scene, met, known, level)
+    reason = _unfit(impacts_found, contacts)
+    if reason:
+        return replace(prior_estimate, horizontal_state=unseen, vertical_state=unseen, reasons=(reason,))
+    met, reasons = _on_walls(scene, [one for one in impacts_found if one.gained < tuning.GAINED], prior_estimate)
+    value, deviation = _solve(scene, met, prior_estimate, level)
     clearances, states = [], []
     bias: list[Interval | None] = [Interval.normal(*pair) for pair in zip(value[_BIAS], deviation[_BIAS], strict=True)]
-    for axis, (name, before) in enumerate((("horizontal", known.horizontal), ("vertical", known.vertical))):
+    for axis, (name, before) in enumerate(
+        (("horizontal", prior_estimate.horizontal), ("vertical", prior_estimate.vertical))
+    ):
         count = {wall: sum(one.wall == wall for one in met) for wall, (its, _) in WALLS.items() if its == axis}
         share = float(deviation[axis]) / max(before.deviation, 1e-300)
         observed = share < tuning.OBSERVED_SHARE
@@ -139,7 +141,7 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> E
             reasons.append(f"{name}: rough, {counts} leave {got}")
     restitution = {"restitution": float(np.median([one.restitution for one in met]))} if met else {}
     return replace(
-        known,
+        prior_estimate,
         horizontal=clearances[0],
         vertical=clearances[1],
         horizontal_state=states[0],
@@ -165,11 +167,11 @@ def _unfit(impacts: list[Impact], contacts: int) -> str:
     return ""
 
 
-def _on_walls(scene: Scene, every: list[Impact], known: Estimate) -> tuple[list[Impact], list[str]]:
+def _on_walls(scene: Scene, every: list[Impact], prior_estimate: Estimate) -> tuple[list[Impact], list[str]]:
     met: list[Impact] = []
     reasons = []
     for wall, (axis, _) in WALLS.items():
-        clearance = (known.horizontal, known.vertical)[axis]
+        clearance = (prior_estimate.horizontal, prior_estimate.vertical)[axis]
         expected = 0.5 * ((scene.frame.width_m, scene.frame.height_m)[axis] + clearance.mean)
         most = 0.5 * tuning.OUTLYING * clearance.deviation
         own = [one for one in every if one.wall == wall]
@@ -184,11 +186,11 @@ def _on_walls(scene: Scene, every: list[Impact], known: Estimate) -> tuple[list[
     return met, reasons
 
 
-def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tuple[Array, Array]:
+def _solve(scene: Scene, met: list[Impact], prior_estimate: Estimate, level: Array) -> tuple[Array, Array]:
     mean = np.zeros(_SIZE)
-    mean[_CLEARANCES] = known.horizontal.mean, known.vertical.mean
+    mean[_CLEARANCES] = prior_estimate.horizontal.mean, prior_estimate.vertical.mean
     prior = np.zeros(_SIZE)
-    prior[_CLEARANCES] = known.horizontal.deviation, known.vertical.deviation
+    prior[_CLEARANCES] = prior_estimate.horizontal.deviation, prior_estimate.vertical.deviation
     prior[_BIAS] = np.array([quantity.deviation for quantity in QUANTITIES])[BIAS]
     # the prior was chosen for the size of the paper's machine
     prior[_LEVER] = UNSTATED["lever_x"] * geometry.half_diagonal(scene) / PAPER_LENGTH
@@ -233,8 +235,8 @@ def _student(design: Array, off: Array, prior: Array, scales: Array) -> tuple[Ar
             weight = (_FREEDOM + 1.0) / (_FREEDOM * scale**2 + (off - design @ x) ** 2)
             covariance = np.linalg.inv(design.T @ (weight[:, None] * design) + precision)
             x = covariance @ (design.T @ (weight * off))
-        left = (off - design @ x) / scale
-        fits = -0.5 * (_FREEDOM + 1.0) * float(np.log1p(left**2 / _FREEDOM).sum()) - len(off) * math.log(scale)
+        residual = (off - design @ x) / scale
+        fits = -0.5 * (_FREEDOM + 1.0) * float(np.log1p(residual**2 / _FREEDOM).sum()) - len(off) * math.log(scale)
         log.append(fits - 0.5 * ((x / prior) ** 2).sum() + 0.5 * float(np.linalg.slogdet(covariance)[1]))
         modes.append(x)
         variances.append(np.diag(covariance))

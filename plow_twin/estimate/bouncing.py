@@ -221,10 +221,10 @@ def compare(
     By default, the drawn motions have hard contacts. If a vector of unknowns `near` is given, stiffness and damping are
     drawn about its values.
     """
-    eye = MotionFeatures(unknowns, poses, period)
-    measured = eye.features(eye.q)
+    motion_features = MotionFeatures(unknowns, poses, period)
+    measured = motion_features.features(motion_features.q)
     spread = _Spread.hard(unknowns) if near is None else _Spread.near(unknowns, near)
-    drawn = _Drawn(forward, unknowns, eye, spread, np.random.default_rng(seed))
+    drawn = _Drawn(forward, unknowns, motion_features, spread, np.random.default_rng(seed))
     longer = float(np.clip((poses.t[-1] - poses.t[0]) / (10.0 * period), 1.0, _LONGER))
     most_work = forward.work + int(longer * tuning.MOST_WORK[1])
     centre = range_of_motion(unknowns.scene, poses)[0] - tuning.OVERRATED
@@ -239,16 +239,18 @@ def compare(
             return None
         features = np.array(drawn.features)
         if found is None:
-            delay = path_delay(eye, features[:, 5:], drawn.q, measured[5:])
+            delay = path_delay(motion_features, features[:, 5:], drawn.q, measured[5:])
             # the first motions were drawn without a delay
-            paths = [eye.paths(q, _OF_DRAWN_S - delay) for q in drawn.q]
-            drawn.by_phase = [eye.changes_by_phase(q, -delay) for q in drawn.q]
+            paths = [motion_features.paths(q, _OF_DRAWN_S - delay) for q in drawn.q]
+            drawn.by_phase = [motion_features.changes_by_phase(q, -delay) for q in drawn.q]
         else:
-            paths += [eye.paths(q, _OF_DRAWN_S) for q in drawn.q]
+            paths += [motion_features.paths(q, _OF_DRAWN_S) for q in drawn.q]
         drawn.q.clear()
         like, seen, targets = features[:, 5:], measured[5:], np.array(drawn.targets)
         if near is not None and found is not None:
-            likely = _likeliest(features, targets, np.array(paths), measured, eye.paths(eye.q, _OF_DRAWN_S))
+            likely = _likeliest(
+                features, targets, np.array(paths), measured, motion_features.paths(motion_features.q, _OF_DRAWN_S)
+            )
             like, seen = np.concatenate([like, likely[:-1]], axis=1), np.concatenate([seen, likely[-1]])
         found = regress_near(like, targets, seen)
         moved = measured[:2] + found.value[:2] - centre
@@ -275,9 +277,9 @@ def compare(
         found.deviation[2:5],
         (float(found.value[5]), tuning.WIDENED_SOFTNESS * float(found.deviation[5])),
         (float(found.value[6]), float(found.deviation[6])),
-        eye.noise,
+        motion_features.noise,
         found.distance,
-        path_deviate(eye.paths(eye.q, _LAGS_S), features[:, 5:], paths, measured[5:]),
+        path_deviate(motion_features.paths(motion_features.q, _LAGS_S), features[:, 5:], paths, measured[5:]),
         law,
         # near an earlier estimate the odds are not tested, because their limit was tuned for searches without one
         odds if near is None else -math.inf,
@@ -291,7 +293,7 @@ def by_range(unknowns: Unknowns, poses: Poses) -> Bounced:
     The penetration at each wall is assumed to be uniformly distributed between 0 and `tuning.FITTED`.
     """
     span = float(poses.t[-1] - poses.t[0])
-    eye = MotionFeatures(unknowns, poses, span)
+    motion_features = MotionFeatures(unknowns, poses, span)
     yielding = tuning.FITTED / math.sqrt(6.0)
     middle, softness, damping, _ = tuning.HARD_DRAWN
     return Bounced(
@@ -301,12 +303,12 @@ def by_range(unknowns: Unknowns, poses: Poses) -> Bounced:
         np.array([yielding, yielding, yielding / geometry.half_diagonal(unknowns.scene)]),
         (math.log(middle), softness),
         (float(unknowns.nominal()[DAMPING]), damping),
-        eye.noise,
+        motion_features.noise,
         0.0,
         0.0,
         0.0,
         -math.inf,
-        *hidden_by_geometry(unknowns, poses, span, eye.features(eye.q)[:2]),
+        *hidden_by_geometry(unknowns, poses, span, motion_features.features(motion_features.q)[:2]),
     )
 
 
@@ -324,8 +326,8 @@ def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: A
     def moved(width: float = 0.0, height: float = 0.0, scale: Array | float = 0.0) -> Array:
         frame = replace(scene.frame, width_m=scene.frame.width_m + width, height_m=scene.frame.height_m + height)
         other = replace(unknowns, scene=replace(scene, frame=frame))
-        seen = MotionFeatures(other, poses, period)
-        off: Array = np.abs(seen.features(seen.q * (1.0 + scale))[:2] - reach)
+        motion_features = MotionFeatures(other, poses, period)
+        off: Array = np.abs(motion_features.features(motion_features.q * (1.0 + scale))[:2] - reach)
         return off
 
     turned = np.array(
@@ -336,9 +338,9 @@ def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: A
         np.square([moved(width), moved(0.0, height), *scaled]).sum(axis=0) + (0.25 * turned**2).sum(axis=1)
     )
     # a stated radius or deviation of a side includes the effect of rounded corners
-    known = scene.frame.corner_radius_m is not None or any(is_stated(scene, path) for path in _SIDES)
+    stated = scene.frame.corner_radius_m is not None or any(is_stated(scene, path) for path in _SIDES)
     # the sides stay positive
-    across = 0.0 if known else -min(2.0 * priors.ROUNDING, 0.5 * min(scene.frame.width_m, scene.frame.height_m))
+    across = 0.0 if stated else -min(2.0 * priors.ROUNDING, 0.5 * min(scene.frame.width_m, scene.frame.height_m))
     return unseen, moved(across, across) if across else np.zeros(2)
 
 
@@ -371,9 +373,11 @@ class _Drawn:
     """Motions drawn under one contact law, with their features and the targets of the regression."""
 
     def __init__(
-        self, forward: Forward, unknowns: Unknowns, eye: MotionFeatures, spread: _Spread, rng: np.random.Generator
+        self, forward: Forward, unknowns: Unknowns, motion_features: MotionFeatures, spread: _Spread,
+        rng: np.random.Generator,
     ) -> None:  # fmt: skip
-        self.forward, self.unknowns, self.eye, self.spread, self.rng = forward, unknowns, eye, spread, rng
+        self.forward, self.unknowns, self.motion_features = forward, unknowns, motion_features
+        self.spread, self.rng = spread, rng
         self.features: list[Array] = []
         self.targets: list[Array] = []
         self.changes: list[Array] = []
@@ -391,23 +395,23 @@ class _Drawn:
         if self.drawn:  # as many motions as the work allows, if each takes as many steps as those before
             count = min(count, max(int((most_work - before) * self.drawn / max(self.work, 1)), 0))
         motions = [self._draw(centre, about) for _ in range(count)]
-        runs = self.eye.run(self.forward, [start for *_, start in motions], delay)
+        runs = self.motion_features.run(self.forward, [start for *_, start in motions], delay)
         self.drawn += count
         self.work += self.forward.work - before
         for q, (clearance, numbers, _) in zip(runs, motions, strict=True):
             if q is not None:
-                q = self.eye.seen(q, self.rng)
-                seen = self.eye.features(q)
-                self.features.append(seen)
-                self.targets.append(np.concatenate([clearance - seen[:2], -seen[2:5], numbers]))
-                self.changes.append(self.eye.changes(q))
-                self.by_phase.append(self.eye.changes_by_phase(q))
+                q = self.motion_features.with_noise(q, self.rng)
+                features = self.motion_features.features(q)
+                self.features.append(features)
+                self.targets.append(np.concatenate([clearance - features[:2], -features[2:5], numbers]))
+                self.changes.append(self.motion_features.changes(q))
+                self.by_phase.append(self.motion_features.changes_by_phase(q))
                 self.q.append(q)
 
     def _draw(self, centre: Array, about: float) -> tuple[Array, Array, Start]:
         numbers = self._numbers()
         clearance = np.maximum(centre + about * self.rng.standard_normal(2), LEAST_CLEARANCE)
-        return clearance, numbers, self.eye.start(self.unknowns, clearance, numbers, self.rng)
+        return clearance, numbers, self.motion_features.start(self.unknowns, clearance, numbers, self.rng)
 
     def _numbers(self) -> Array:
         mean = np.concatenate([self.spread.mean, np.ones(3)])
@@ -422,7 +426,11 @@ class _Drawn:
 
     def of_other_law(self) -> _Drawn | None:
         other = with_other_law(self.unknowns)
-        return None if other is None else _Drawn(self.forward.of(other.scene), other, self.eye, self.spread, self.rng)
+        return (
+            None
+            if other is None
+            else _Drawn(self.forward.of(other.scene), other, self.motion_features, self.spread, self.rng)
+        )
 
     def like(self) -> Array:
         return np.concatenate([np.array(self.features)[:, 5:], np.array(self.changes)], axis=1)
@@ -432,15 +440,15 @@ class _Drawn:
         return Draws(np.concatenate([self.like(), np.array(self.by_phase)], axis=1), of_draw)
 
 
-def _likeliest(features: Array, targets: Array, paths: Array, measured: Array, seen: Array) -> Array:
+def _likeliest(features: Array, targets: Array, paths: Array, measured: Array, measured_path: Array) -> Array:
     """Return the most likely clearances minus the reaches in m, shape (n + 1, 2).
 
     The rows are for the n drawn motions with the paths `paths`, shape (n, lags, k), and for the measured motion with
-    the path `seen`, shape (lags, k).
+    the path `measured_path`, shape (lags, k).
     """
     before, after = _NO_LAG - 1, _NO_LAG + 1
-    paths, seen = (path[..., : path.shape[-1] // 2] for path in (paths, seen))
-    there = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(seen).all(axis=0)
+    paths, measured_path = (path[..., : path.shape[-1] // 2] for path in (paths, measured_path))
+    there = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(measured_path).all(axis=0)
 
     def motions(features: Array, paths: Array) -> PathFeatures:
         like = np.concatenate([features[:, :2], features[:, 5:]], axis=1)
@@ -452,20 +460,22 @@ def _likeliest(features: Array, targets: Array, paths: Array, measured: Array, s
 
     reach = features[:, :2]
     drawn = np.concatenate([targets[:, :2] + reach, targets[:, 5:]], axis=1)
-    likely = likeliest(drawn, tuning.HARD_DRAWN[3], motions(features, paths), motions(measured[None], seen[None]))
+    likely = likeliest(
+        drawn, tuning.HARD_DRAWN[3], motions(features, paths), motions(measured[None], measured_path[None])
+    )
     off: Array = likely - np.concatenate([reach, measured[None, :2]])
     return off
 
 
-def path_delay(eye: MotionFeatures, features: Array, drawn: list[Array], measured: Array) -> float:
+def path_delay(motion_features: MotionFeatures, features: Array, drawn: list[Array], measured: Array) -> float:
     """Return the delay in s with which the measured path is nearest to the motions `drawn` without a delay."""
-    paths = np.array([eye.paths(q, np.zeros(1))[0] for q in drawn])
-    seen = eye.paths(eye.q, _LAGS_S)
-    there = np.isfinite(paths).all(axis=0) & np.isfinite(seen).all(axis=0)
+    paths = np.array([motion_features.paths(q, np.zeros(1))[0] for q in drawn])
+    measured_path = motion_features.paths(motion_features.q, _LAGS_S)
+    there = np.isfinite(paths).all(axis=0) & np.isfinite(measured_path).all(axis=0)
     if there.sum() < tuning.PATH_PHASES:
         return 0.0
-    value, left = _Near.to(features, measured).left_over(paths[:, there])
-    off = ((seen[:, there] - value) ** 2 / ((left**2).mean(axis=0) + _NO_SCATTER)).sum(axis=1)
+    value, residual = _Near.to(features, measured).left_over(paths[:, there])
+    off = ((measured_path[:, there] - value) ** 2 / ((residual**2).mean(axis=0) + _NO_SCATTER)).sum(axis=1)
     # the delay of a sensor cannot be negative
     return max(float(_LAGS_S[int(np.argmin(off))]), 0.0)
 
@@ -482,9 +492,11 @@ def _of_other_law(
     other, nothing = drawn.of_other_law(), (0.0, -math.inf)
     if other is None:
         return nothing
-    eye, half = drawn.eye, tuning.DRAWS[4] // 2
-    measured = np.concatenate([eye.features(eye.q)[5:], eye.changes(eye.q)])
-    by_phase = np.concatenate([measured, eye.changes_by_phase(eye.q)])
+    motion_features, half = drawn.motion_features, tuning.DRAWS[4] // 2
+    measured = np.concatenate(
+        [motion_features.features(motion_features.q)[5:], motion_features.changes(motion_features.q)]
+    )
+    by_phase = np.concatenate([measured, motion_features.changes_by_phase(motion_features.q)])
     found = nothing
     for count in (half, tuning.DRAWS[4] - half):
         other.add(count, centre, tuning.DRAWN_CLEARANCE[2], delay, most_work)
@@ -497,15 +509,15 @@ def _of_other_law(
     return found
 
 
-def class_deviate(believed: Array, other: Array, measured: Array) -> float:
-    """Return a normal deviate that is large if the features `measured` resemble `other` more than `believed`.
+def class_deviate(own: Array, other: Array, measured: Array) -> float:
+    """Return a normal deviate that is large if the features `measured` resemble `other` more than `own`.
 
-    `believed` and `other` contain the features of motions under two laws, one motion per row; `measured` has the shape
+    `own` and `other` contain the features of motions under two laws, one motion per row; `measured` has the shape
     (m,). A class label is regressed on the features. The deviate is the distance of the prediction for `measured` from
-    the cross-validated predictions for the class `believed`.
+    the cross-validated predictions for the class `own`.
     """
-    features = np.concatenate([believed, other])
-    sizes = [len(believed), len(other)]
+    features = np.concatenate([own, other])
+    sizes = [len(own), len(other)]
     label = np.repeat([0.0, 1.0], sizes)
     weight = np.repeat(0.5 * len(label) / np.array(sizes), sizes)
     z = (features - measured) / (features.std(axis=0) + 1e-12)
@@ -513,21 +525,21 @@ def class_deviate(believed: Array, other: Array, measured: Array) -> float:
     inverse, leverage = ridge(basis, tuning.RIDGE[2], weight)
     beta = inverse @ (basis.T @ (weight * label))
     held_out = label - (label - basis @ beta) / (1.0 - np.minimum(leverage, 0.95))
-    right = held_out[: len(believed)]
+    right = held_out[: len(own)]
     return float((beta[0] - right.mean()) / right.std(ddof=1))
 
 
-def path_deviate(seen: Array, features: Array, drawn: list[Array], measured: Array) -> float:
+def path_deviate(measured_path: Array, features: Array, drawn: list[Array], measured: Array) -> float:
     """Return the distance of the measured path from the drawn motions as a normal deviate; 0 with too few measurements.
 
     Nearby drawn motions have distances of the same size if the model is correct.
     """
     # shape (n, lags, parts), with several lags because the delay is not known exactly
     paths = np.array(drawn)
-    there = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(seen).all(axis=0)
+    there = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(measured_path).all(axis=0)
     if there.sum() < tuning.PATH_PHASES:
         return 0.0
-    paths, off = paths[:, :, there], _distance_of_paths(features, paths[:, :, there], measured, seen[:, there])
+    paths, off = paths[:, :, there], _distance_of_paths(features, paths[:, :, there], measured, measured_path[:, there])
     distance = (((features - measured) / (features.std(axis=0) + 1e-12)) ** 2).mean(axis=1)
     others = []
     for index in np.argsort(distance, kind="stable")[:FEWEST_FOR_SCATTER]:
@@ -537,26 +549,26 @@ def path_deviate(seen: Array, features: Array, drawn: list[Array], measured: Arr
     return float((math.log(off) - ln_others.mean()) / ln_others.std(ddof=1))
 
 
-def _distance_of_paths(features: Array, paths: Array, measured: Array, seen: Array) -> float:
-    """Return the mean square distance of the path `seen`, (lags, k), from the drawn `paths`, (n, lags, k).
+def _distance_of_paths(features: Array, paths: Array, measured: Array, measured_path: Array) -> float:
+    """Return the mean square distance of the path `measured_path`, (lags, k), from the drawn `paths`, (n, lags, k).
 
     It is the Mahalanobis distance at the best lag. The covariance of the residuals is shrunk toward equal variances
     (Ledoit and Wolf, J. Multivar. Anal. 88 (2004) 365).
     """
     near = _Near.to(features, measured)
-    value, left = near.left_over(paths[:, _NO_LAG])
-    variance = (near.weight[:, None] * left**2).sum(axis=0) / near.weight.sum()
+    value, residual = near.left_over(paths[:, _NO_LAG])
+    variance = (near.weight[:, None] * residual**2).sum(axis=0) / near.weight.sum()
     deviation = np.sqrt(variance * (1.0 + near.inverse[0, 0]))
-    left *= np.sqrt(near.weight / near.weight.sum())[:, None] / deviation
-    share, size = tuning.SHRINKAGE[1], left.shape[1]
-    off = (seen - value) / deviation
+    residual *= np.sqrt(near.weight / near.weight.sum())[:, None] / deviation
+    share, size = tuning.SHRINKAGE[1], residual.shape[1]
+    off = (measured_path - value) / deviation
     # a path has more numbers than there are draws, so the smaller matrix L L^T is inverted:
     # (a L^T L + b I)^-1 = (I - L^T (b/a I + L L^T)^-1 L) / b
-    equal = share * float(np.square(left).sum()) / size
-    among = left @ left.T + equal / (1.0 - share) * np.eye(len(left))
-    along = left @ off.T
+    equal = share * float(np.square(residual).sum()) / size
+    among = residual @ residual.T + equal / (1.0 - share) * np.eye(len(residual))
+    along = residual @ off.T
     square = (np.square(off).sum(axis=1) - (along * np.linalg.solve(among, along)).sum(axis=0)) / equal
-    return float(square.min() / seen.shape[1])
+    return float(square.min() / measured_path.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -603,8 +615,8 @@ class _Near:
     def left_over(self, targets: Array) -> tuple[Array, Array]:
         """Return the prediction of `regress` with leave-one-out residuals."""
         value, error = self.regress(targets)
-        left: Array = error / (1.0 - np.minimum(self.leverage, 0.9))[:, None]
-        return value, left
+        residual: Array = error / (1.0 - np.minimum(self.leverage, 0.9))[:, None]
+        return value, residual
 
 
 def regress_near(features: Array, targets: Array, measured: Array) -> _Regressed:
@@ -688,7 +700,7 @@ class MotionFeatures:
         self._scattered = [_Phases.of(np.flatnonzero(there), phase, self._parts) for there in self._there.T]
         self._phases: dict[float, list[_Phases]] = {}
 
-    def look(
+    def simulated(
         self, forward: Forward, unknowns: Unknowns, clearance: Array, numbers: Array, delay: float,
         rng: np.random.Generator,
     ) -> Array | None:  # fmt: skip
@@ -699,7 +711,7 @@ class MotionFeatures:
         one = self.start(unknowns, clearance, numbers, rng)
         edges, t = np.array([0, len(self._t)]), self._t - delay
         run = forward.run(one.scene, one.gain, t[:1] - _BEFORE, one.state[None], edges, t)
-        return None if run is None else self.seen(run.q, rng)
+        return None if run is None else self.with_noise(run.q, rng)
 
     def run(self, forward: Forward, starts: Sequence[Start], delay: float) -> list[Array | None]:
         """Return simulated poses at the times of the measurements minus `delay` s; None after a failure."""
@@ -736,9 +748,9 @@ class MotionFeatures:
             if not phases.known.any():
                 continue
             mean, square = phases.moments(q[:, i])
-            known = phases.known
-            out[0, known, i] = mean[known] - mean[known].mean()
-            out[1, known, i] = 0.5 * np.log(square[known] + _NO_SCATTER)
+            occupied = phases.known
+            out[0, occupied, i] = mean[occupied] - mean[occupied].mean()
+            out[1, occupied, i] = 0.5 * np.log(square[occupied] + _NO_SCATTER)
         return out.ravel()
 
     def _phases_at(self, lag_s: float) -> list[_Phases]:
@@ -752,7 +764,7 @@ class MotionFeatures:
             ]
         return self._phases[lag_s]
 
-    def seen(self, q: Array, rng: np.random.Generator) -> Array:
+    def with_noise(self, q: Array, rng: np.random.Generator) -> Array:
         """Add noise to a motion so that its estimated noise level equals that of the measurement.
 
         Bounces raise the estimated noise level, so the added noise is smaller than the measured level.
@@ -817,8 +829,8 @@ class MotionFeatures:
         """Return mean reaches in m, shape (3, 4), over the load phases with the farthest reaches, at rest."""
         reach, phase = reaches(self._unknowns.scene, q), self._reach_phase
         count = np.bincount(phase, minlength=tuning.PATH_PHASES + 1)
-        known = count > 0
-        means = np.stack([np.bincount(phase, one, len(count))[known] / count[known] for one in reach.T], axis=1)
+        occupied = count > 0
+        means = np.stack([np.bincount(phase, one, len(count))[occupied] / count[occupied] for one in reach.T], axis=1)
         means.sort(axis=0)
         parts = [means[-max(int(share * len(means)), 1) :].mean(axis=0) for share in tuning.FARTHEST_PARTS]
         return np.stack(parts)

@@ -142,10 +142,10 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
     return Coefficient(np.exp(grid), share, clearance, np.sqrt(variance), share @ depths)
 
 
-def _check_fit(history: History, grown: Array) -> None:
-    """Raise `LifeError` if the clearances contradict the growth `grown`, shape (n, 2), in a chi-square test."""
-    weight = 1.0 / (history.deviation**2 + (tuning.PATH_DEVIATION * grown) ** 2)
-    apart = history.clearance - grown
+def _check_fit(history: History, growth: Array) -> None:
+    """Raise `LifeError` if the clearances contradict the growth `growth`, shape (n, 2), in a chi-square test."""
+    weight = 1.0 / (history.deviation**2 + (tuning.PATH_DEVIATION * growth) ** 2)
+    apart = history.clearance - growth
     apart -= (weight * apart).sum(axis=0) / weight.sum(axis=0)
     square, freedom = float((weight * apart**2).sum()), 2 * (len(apart) - 1)
     if chdtrc(freedom, square) < tuning.LEAST_PROBABLE[0]:
@@ -159,9 +159,9 @@ def _check_fit(history: History, grown: Array) -> None:
 
 
 def _growth(path: Path, exposure: Array) -> Array:
-    grown = path.clearance_growth()
-    out = np.stack([np.interp(exposure, path.exposure, column) for column in grown.T], axis=1)
+    growth = path.clearance_growth()
+    out = np.stack([np.interp(exposure, path.exposure, column) for column in growth.T], axis=1)
     if len(path.exposure) > 1:
-        slope = (grown[-1] - grown[-2]) / (path.exposure[-1] - path.exposure[-2])
+        slope = (growth[-1] - growth[-2]) / (path.exposure[-1] - path.exposure[-2])
         out += np.maximum(exposure - path.exposure[-1], 0.0)[:, None] * slope
     return out

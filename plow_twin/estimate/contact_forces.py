@@ -105,7 +105,7 @@ class Cells:
     delay: float
 
 
-class Feeling:
+class ForcesOfFit:
     """Contact forces from the motion of a fit, at the times of the measured forces."""
 
     def __init__(self, problem: Problem, t: Array) -> None:
@@ -152,13 +152,13 @@ def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> t
     return penetration, force
 
 
-def cells_of(feeling: Feeling, solution: Fit, forces: ContactForces) -> tuple[Cells | None, list[str]]:
+def cells_of(forces_of_fit: ForcesOfFit, solution: Fit, forces: ContactForces) -> tuple[Cells | None, list[str]]:
     """Return the usable cells, or None without any, and a reason for each cell that contradicts the motion."""
-    fitted = feeling.at(solution.shared, solution.point.states, 0.0)
+    fitted = forces_of_fit.at(solution.shared, solution.point.states, 0.0)
     if fitted is None:
         return None, []
     delay = _delay(forces, fitted)
-    fitted = feeling.at(solution.shared, solution.point.states, delay)
+    fitted = forces_of_fit.at(solution.shared, solution.point.states, delay)
     if fitted is None:
         return None, []
     offset, noise = np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT)
@@ -177,9 +177,9 @@ def cells_of(feeling: Feeling, solution: Fit, forces: ContactForces) -> tuple[Ce
         there = np.isfinite(measured[:, i]) & (fitted.swing >= 0)
         if not there.any():
             continue
-        why = _contradiction(measured[there], fitted.force[there], i, largest, float(noise[i]))
-        if why:
-            found_out.append(f"contact forces: {name}: {why}")
+        reason = _contradiction(measured[there], fitted.force[there], i, largest, float(noise[i]))
+        if reason:
+            found_out.append(f"contact forces: {name}: {reason}")
         elif (fitted.force[there, i] > 0.0).sum() >= FEWEST_IN_CONTACT:
             pairs.append(i)
     if not (found_out or pairs):
@@ -223,10 +223,10 @@ def _contradiction(measured: Array, fitted: Array, pair: int, largest: float, no
 
 
 def _delay(forces: ContactForces, fitted: FittedForces) -> float:
-    t, measured, given = forces.t, np.nan_to_num(forces.force), np.nan_to_num(fitted.force)
-    pairs = np.flatnonzero(given.any(axis=0) & measured.any(axis=0))
+    t, measured, computed = forces.t, np.nan_to_num(forces.force), np.nan_to_num(fitted.force)
+    pairs = np.flatnonzero(computed.any(axis=0) & measured.any(axis=0))
     lags = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 0.5 * _DELAY_STEP, _DELAY_STEP)
-    alike = [sum(correlation(measured[:, i], np.interp(t - lag, t, given[:, i])) for i in pairs) for lag in lags]
+    alike = [sum(correlation(measured[:, i], np.interp(t - lag, t, computed[:, i])) for i in pairs) for lag in lags]
     return float(lags[int(np.argmax(alike))])
 
 

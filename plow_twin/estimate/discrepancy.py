@@ -294,12 +294,12 @@ class _Linearised:
         # the harmonics are the last quantities, in the slice `waves` of the border
         self.names = list(columns)[: len(columns) - waves]
         self.waves = slice(SIZE + len(self.names), SIZE + len(columns))
-        self._found, self._swing = fitted, fitted.point.swing
+        self._fit, self._swing = fitted, fitted.point.swing
         further = np.stack([one.derivative for one in every], axis=2)
         self._precision = np.concatenate([problem.deviation, [one.deviation for one in every]]) ** -2.0
         # values of the further quantities, and whether the fit includes them, shape (k,) each
         self._value = np.array([one.value or 0.0 for one in every])
-        self._held = np.array([one.value is not None for one in every])
+        self._in_fit = np.array([one.value is not None for one in every])
         self._least = np.array([one.least for one in every])
         self._pull = np.concatenate([problem.mean - fitted.shared, -self._value]) * self._precision
         rows = [np.flatnonzero(self._swing == index) for index in range(problem.window.swings)]
@@ -311,24 +311,24 @@ class _Linearised:
             np.concatenate([linear[some][:, :, :SIZE], further[some]], axis=2).reshape(-1, len(self._precision))
             for some in self._rows
         ]
-        self._own = [
+        self._of_start = [
             np.concatenate([linear[some][:, :, SIZE:], pushes[some]], axis=2).reshape(3 * len(some), -1)
             for some in self._rows
         ]
         self._residual = [np.nan_to_num(residual[some]).ravel() for some in self._rows]
-        self._there = [np.isfinite(residual[some]).ravel() for some in self._rows]
-        self._left = self._residual
+        self._finite = [np.isfinite(residual[some]).ravel() for some in self._rows]
+        self._remaining = self._residual
         self._start_spread = problem.start_spread
         self.inflation, self.load = np.ones(3), np.full(3, tuning.PUSH)
 
     def eliminate(self) -> None:
         held = np.diag(np.concatenate([self._start_spread**-2.0, self.load**-2.0]))
         self._blocks, self._swings = [], []
-        for rows, border, own, residual, there, left in zip(
-            self._rows, self._border, self._own, self._residual, self._there, self._left, strict=True
+        for rows, border, own, residual, there, remaining in zip(
+            self._rows, self._border, self._of_start, self._residual, self._finite, self._remaining, strict=True
         ):
-            variance = (self._found.variance[rows] * self.inflation).ravel()
-            z = np.abs(left) / np.sqrt(variance)
+            variance = (self._fit.variance[rows] * self.inflation).ravel()
+            z = np.abs(remaining) / np.sqrt(variance)
             weight = (there * huber_weight(z) / variance)[:, None]
             cross, score = (weight * border).T @ own, (weight * own).T @ residual
             factor = cho_factor((weight * own).T @ own + held)
@@ -346,12 +346,12 @@ class _Linearised:
             covariance = np.linalg.inv(self._normal)
             step = covariance @ self._score
             square = np.zeros(3)
-            self._left = []
+            self._remaining = []
             for (factor, gain, alone), border, own, residual in zip(
-                self._swings, self._border, self._own, self._residual, strict=True
+                self._swings, self._border, self._of_start, self._residual, strict=True
             ):
                 state = alone - gain @ step
-                self._left.append(residual - border @ step - own @ state)
+                self._remaining.append(residual - border @ step - own @ state)
                 inverse = cho_solve(factor, np.eye(own.shape[1]))
                 spread = np.diag(inverse)[6:] + np.einsum("ij,jk,ik->i", gain[6:], covariance, gain[6:])
                 square += state[6:] ** 2 + spread
@@ -359,23 +359,23 @@ class _Linearised:
 
     def temper(self) -> None:
         """Inflate the variance according to the size of the residuals and the length of their correlation."""
-        left = np.full(self._found.point.residual.shape, np.nan)
-        for rows, some, there in zip(self._rows, self._left, self._there, strict=True):
-            left[rows] = np.where(there, some, np.nan).reshape(-1, 3)
+        remaining = np.full(self._fit.point.residual.shape, np.nan)
+        for rows, some, there in zip(self._rows, self._remaining, self._finite, strict=True):
+            remaining[rows] = np.where(there, some, np.nan).reshape(-1, 3)
         for index in range(3):
-            column = left[:, index]
-            known = np.isfinite(column)
-            if known.sum() < FEWEST_FOR_SCATTER:
+            column = remaining[:, index]
+            finite = np.isfinite(column)
+            if finite.sum() < FEWEST_FOR_SCATTER:
                 continue
-            usual = float(np.median(self._found.variance[known, index]))
-            square = float((column[known] ** 2).mean())
+            usual = float(np.median(self._fit.variance[finite, index]))
+            square = float((column[finite] ** 2).mean())
             self.inflation[index] = max(1.0, square / usual) * _lasting(column, self._swing, square)
 
     def exact(self) -> tuple[Array, Array]:
-        _, mean, covariance = self._given(self._held)
+        _, mean, covariance = self._conditional(self._in_fit)
         return mean, covariance
 
-    def _given(self, differs: NDArray[np.bool_]) -> tuple[float, Array, Array]:
+    def _conditional(self, differs: NDArray[np.bool_]) -> tuple[float, Array, Array]:
         """Return the log evidence, and mean and covariance of the unknowns, if only the marked quantities differ from
         the scene.
         """
@@ -397,21 +397,21 @@ class _Linearised:
         `prior` is the prior probability of a difference. A quantity that the fit includes differs in all samples.
         """
         size, odds = len(self._precision), math.log(prior / (1.0 - prior))
-        known: dict[bytes, tuple[float, Array, Array]] = {}
+        cache: dict[bytes, tuple[float, Array, Array]] = {}
 
         def given(which: NDArray[np.bool_]) -> tuple[float, Array, Array]:
             key = which.tobytes()  # cached, because the sampler visits most sets several times
-            if key not in known:
-                evidence, mean, covariance = self._given(which)
-                known[key] = evidence + odds * int(which.sum()), mean, covariance
-            return known[key]
+            if key not in cache:
+                evidence, mean, covariance = self._conditional(which)
+                cache[key] = evidence + odds * int(which.sum()), mean, covariance
+            return cache[key]
 
-        differs, counted = self._held.copy(), _SWEEPS - _BURNT
+        differs, counted = self._in_fit.copy(), _SWEEPS - _BURNT
         now = given(differs)[0]
         mean, second, often = np.zeros(size), np.zeros((size, size)), np.zeros(len(differs))
         parts = []
         for sweep in range(_SWEEPS):
-            for index in rng.permutation(np.flatnonzero(~self._held)):
+            for index in rng.permutation(np.flatnonzero(~self._in_fit)):
                 other = differs.copy()
                 other[index] = not other[index]
                 instead = given(other)[0]
@@ -485,11 +485,11 @@ def _truncate(mean: Array, covariance: Array, index: int, least: float) -> float
     return log_inside + math.log(2.0)
 
 
-def _lasting(left: Array, swing: NDArray[np.int64], square: float) -> float:
+def _lasting(residual: Array, swing: NDArray[np.int64], square: float) -> float:
     """Return the correlation length of residuals in rows, the sum of their correlations over all lags."""
     rows = 1.0
     for lag in range(1, _LONGEST_LAG):
-        one, other = left[:-lag], left[lag:]
+        one, other = residual[:-lag], residual[lag:]
         both = np.isfinite(one) & np.isfinite(other) & (swing[:-lag] == swing[lag:])
         if both.sum() < FEWEST_FOR_SCATTER:
             break

@@ -131,9 +131,9 @@ class EquationError:
         stiffness, weight = self._force / math.exp(ln_depth), np.ones_like(acceleration)
         for _ in range(_STEPS):
             columns = self._columns(corners, normals, reach, stiffness)
-            fits, left = self._solve(columns, acceleration - self._load, weight)
-            scale = _MAD * np.median(np.abs(left), axis=0) + _SINGULAR
-            weight = np.minimum(1.0, np.sqrt(_HUBER * scale / np.maximum(np.abs(left), _SINGULAR))) / scale
+            fits, residual = self._solve(columns, acceleration - self._load, weight)
+            scale = _MAD * np.median(np.abs(residual), axis=0) + _SINGULAR
+            weight = np.minimum(1.0, np.sqrt(_HUBER * scale / np.maximum(np.abs(residual), _SINGULAR))) / scale
             ln_depth = float(np.clip(math.log(self._force / max(_UNIT * fits[0], 1.0)), *np.log(DEPTHS)))
             stiffness = self._force / math.exp(ln_depth)
             step = np.clip(fits[2:6], -_LONGEST, _LONGEST)
@@ -160,10 +160,10 @@ class EquationError:
         stiffness = self._force / math.exp(ln_depth)
         columns = self._columns(*self._geometry(poses), reach, stiffness)[..., :2]
         contact = columns @ np.array([stiffness, stiffness * damping]) / _UNIT
-        left = (self._weighed(poses, self._curve) - contact) / self._value.sum()
+        required = (self._weighed(poses, self._curve) - contact) / self._value.sum()
         step = float(self._grid[1] - self._grid[0])
         count = max(1, round(tuning.LOAD_AVERAGED / (self._apart * step)))
-        mean = np.stack([np.convolve(column, np.full(count, 1.0 / count), "valid") for column in left.T], axis=1)
+        mean = np.stack([np.convolve(column, np.full(count, 1.0 / count), "valid") for column in required.T], axis=1)
         first = len(self._value) // 2 + 0.5 * (count - 1) * self._apart
         t = self._grid[0] + step * (first + self._apart * np.arange(len(mean)))
         mass, gravity = self._scene.head.mass_kg, self._scene.gravity

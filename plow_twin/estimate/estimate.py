@@ -151,8 +151,8 @@ def _estimate(
         if _unexplained(result) and load.interval() > tuning.COARSEST:
             smooth = load.smooth(0.1 * tuning.COARSEST)
             other, following = _from_motion(scene, smooth, poses, lost, (), forces)
-            why = f"load: a sample every {load.interval():.2g} s, expected {tuning.COARSEST:g} s; taken as averages"
-            result = replace(other, reasons=(why, *other.reasons)) if _known(other) else result
+            reason = f"load: a sample every {load.interval():.2g} s, expected {tuning.COARSEST:g} s; taken as averages"
+            result = replace(other, reasons=(reason, *other.reasons)) if _known(other) else result
     except (np.linalg.LinAlgError, OverflowError) as error:
         result, following = without_fit(Unknowns(scene), poses, lost, f"the fit cannot be computed: {error}"), ()
     if forces is not None and result.forces_measured is None:
@@ -166,12 +166,12 @@ def _estimate(
 
 def _usable(load: Load, poses: Poses) -> tuple[Load, Poses, int]:
     """Return the newest window of the longest stretch of the load, its poses without spikes, and the rows left out."""
-    known, measured, lost = len(load.t), len(poses.t), 0
+    samples, measured, lost = len(load.t), len(poses.t), 0
     load = load.longest_stretch()
     span = float(load.t[0]), float(load.t[-1])
     poses = poses.between(span[0], span[1] + 1e-9)
-    if len(load.t) < known:
-        lost = known - len(load.t) + measured - len(poses.t)
+    if len(load.t) < samples:
+        lost = samples - len(load.t) + measured - len(poses.t)
     load = load.newest(_LONGEST_S)
     load = load.newest(max(MOST_PERIODS * (load.oscillation() or 0.0), MOST_SPAN_S))
     poses = poses.between(float(load.t[0]), span[1] + 1e-9).fresh()
@@ -198,12 +198,12 @@ def _from_motion(
             f"{FEWEST_POSES}"
         )
         return replace(prior_of(unknowns, span, lost), reasons=(few,)), ()
-    lacking = shortages(poses)
+    short_of = shortages(poses)
     some = well_measured(poses)
     if some is not None and not is_dead(load, some):
-        return _from_some_components(unknowns, load, some, lost, lacking), ()
-    if lacking:
-        return not_observable(unknowns, poses, lost, lacking), ()
+        return _from_some_components(unknowns, load, some, lost, short_of), ()
+    if short_of:
+        return not_observable(unknowns, poses, lost, short_of), ()
     if is_dead(load, poses):
         return _without_load(unknowns, load, poses, lost), ()
     if is_idle(scene, load, poses):
@@ -254,7 +254,7 @@ def _without_load(unknowns: Unknowns, load: Load, poses: Poses, lost: int) -> Es
 
 
 def _from_some_components(
-    unknowns: Unknowns, load: Load, poses: Poses, lost: int, lacking: tuple[str, ...]
+    unknowns: Unknowns, load: Load, poses: Poses, lost: int, short_of: tuple[str, ...]
 ) -> Estimate:
     """Return the estimate from poses in which one or two components were never measured."""
     period = _period(load, poses)
@@ -265,11 +265,11 @@ def _from_some_components(
     if found is not None:
         result = summarise(*found, judge(*found, period), lost)
         if _known(result):
-            return replace(result, reasons=(*lacking, *result.reasons))
+            return replace(result, reasons=(*short_of, *result.reasons))
     if poses.measured[:2].all():
-        nothing = replace(prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost), reasons=lacking)
+        nothing = replace(prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost), reasons=short_of)
         return under_uncertain_load(nothing, unknowns, measured_load, poses, period)
-    return not_observable(unknowns, poses, lost, lacking)
+    return not_observable(unknowns, poses, lost, short_of)
 
 
 def _searched(
@@ -345,7 +345,7 @@ def under_uncertain_load(
     if compared is None or compared.distance > tuning.MOST_DISTANCE or compared.ln_depth[0] < math.log(tuning.FITTED):
         return replace(result, figures=figures)
     beside = None if fitted is None else if_it_differs(*fitted)
-    values, known = [], []
+    values, states = [], []
     for index in (GX, GY):
         prior = float(unknowns.nominal()[index]), float(unknowns.deviations()[index])
         mean, deviation = weighted_mean((float(compared.clearance[index]), float(compared.deviation[index])), prior)
@@ -355,7 +355,7 @@ def under_uncertain_load(
                 mean, deviation = weighted_mean_of_one((mean, deviation), by_fit)
         observed = bool(compared.touched[index]) and deviation < tuning.OBSERVED_SHARE * prior[1]
         values.append(Interval.normal(*((mean, deviation) if observed else prior)).above(0.0))
-        known.append(state_of(False, observed, rough=True))
+        states.append(state_of(False, observed, rough=True))
     exponent = unknowns.scene.contact.exponent
     log = Interval.normal(*compared.ln_depth)
     mean, soft, hard = (unknowns.force / math.exp(value) ** exponent for value in (log.mean, log.p95, log.p05))
@@ -363,8 +363,8 @@ def under_uncertain_load(
         result,
         horizontal=values[0],
         vertical=values[1],
-        horizontal_state=known[0],
-        vertical_state=known[1],
+        horizontal_state=states[0],
+        vertical_state=states[1],
         stiffness=Interval(mean, soft, hard),
         damping=damping_interval(unknowns, Interval.normal(*compared.ln_damping)),
         correlation=None,
@@ -402,8 +402,8 @@ def _with_differences(
 
 def _moved_back(result: Estimate, bias: Array) -> Estimate:
     x, y, theta = (
-        None if known is None else Interval(known.mean + by, known.p05 + by, known.p95 + by)
-        for known, by in zip((result.bias_x, result.bias_y, result.bias_theta), bias.tolist(), strict=True)
+        None if interval is None else Interval(interval.mean + by, interval.p05 + by, interval.p95 + by)
+        for interval, by in zip((result.bias_x, result.bias_y, result.bias_theta), bias.tolist(), strict=True)
     )
     motion = None if result.motion is None else result.motion.moved(bias)
     return replace(result, bias_x=x, bias_y=y, bias_theta=theta, motion=motion)

@@ -345,12 +345,12 @@ class Problem:
             inside = np.flatnonzero(swing >= 0)
             # the rows of a swing are consecutive
             inner = np.searchsorted(swing[inside], np.arange(window.swings + 1)).astype(np.int64)
-            asked, ends, edges = times[inside], np.zeros(0, np.int64), inner
+            requested, ends, edges = times[inside], np.zeros(0, np.int64), inner
             if len(self.link):  # each swing except the last is simulated up to the start of the next swing
                 ends = edges[1:-1] + np.arange(len(self.link))
-                asked = np.insert(asked, edges[1:-1], window.starts[1:-1])
+                requested = np.insert(requested, edges[1:-1], window.starts[1:-1])
                 edges = edges + np.minimum(np.arange(window.swings + 1), len(self.link))
-            self._at = _Rows(shift, swing, inside, times[inside], inner, asked, ends, edges)
+            self._at = _Rows(shift, swing, inside, times[inside], inner, requested, ends, edges)
         return self._at
 
     def _point(
@@ -384,11 +384,11 @@ class Problem:
         """
         z = np.abs(point.residual) / np.sqrt(variance)
         loss = huber_loss(z)
-        lacking = np.isnan(loss) & np.isfinite(self.window.poses.q)
+        unpredicted = np.isnan(loss) & np.isfinite(self.window.poses.q)
         shift = (point.shared - self.mean) / self.deviation
         moved = (point.states - self.window.states) / self.start_spread
         linked = np.einsum("si,sij,sj->", point.defect, self.link, point.defect)
-        return float(np.nansum(loss) + lacking.sum() + shift @ shift + (moved * moved).sum() + linked)
+        return float(np.nansum(loss) + unpredicted.sum() + shift @ shift + (moved * moved).sum() + linked)
 
     def linearise(self, point: Point) -> Linear:
         """Return the Jacobians of the predicted measurements and of the ends of the swings."""
@@ -545,9 +545,11 @@ def fit(
     point.cost = problem.cost(point, variance)
     normal, gradient = normal_equations(problem, point, linear, variance)
     factor = normal.factorised()
-    left = factor.solve(gradient)
-    gain_left = float(gradient @ left)
-    return Fit(point, factor.covariance(), factor, noise, variance, jitter, linear, left, gain_left, done, converged)
+    newton_step = factor.solve(gradient)
+    gain_left = float(gradient @ newton_step)
+    return Fit(
+        point, factor.covariance(), factor, noise, variance, jitter, linear, newton_step, gain_left, done, converged
+    )
 
 
 def pieces(problem: Problem, point: Point, linear: Linear, variance: Array) -> Iterator[list[Piece]]:
@@ -633,10 +635,10 @@ def whole_step(
         held = (weights * own).T @ own
         held += np.diag(1e-6 + 1e-9 * np.diag(held))
         gain = np.linalg.solve(held, cross.T).T
-        left = (weights * residual[inside].reshape(-1, 1)).ravel()
+        weighted_residual = (weights * residual[inside].reshape(-1, 1)).ravel()
         normal += (weights * shared).T @ shared - gain @ cross.T
-        gradient += shared.T @ left - gain @ (own.T @ left)
-        alone[swing], gains[swing] = np.linalg.solve(held, own.T @ left), gain
+        gradient += shared.T @ weighted_residual - gain @ (own.T @ weighted_residual)
+        alone[swing], gains[swing] = np.linalg.solve(held, own.T @ weighted_residual), gain
     covariance: Array = np.linalg.inv(normal)
     step = covariance @ gradient
     return step, covariance, alone - step @ gains

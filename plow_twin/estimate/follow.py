@@ -180,11 +180,11 @@ class Follower:
         #: the estimate that the members follow; None for the prior
         self.estimate = Estimate.from_dict(json.loads(text)) if text else None
         self._load_share = _load_share(text)
-        self._known = self._prior if self.estimate is None else _whole(self.estimate, self._prior)
+        self._present_estimate = self._prior if self.estimate is None else _whole(self.estimate, self._prior)
         rng = np.random.default_rng([self._seed, self.drawn])
         # errors of an uncertain load would distort learned parameters
         learns = not self._load_share.any()
-        self._ensemble = Ensemble(self.scene, self._known, self._members, rng, time, self.tol, worn, learns)
+        self._ensemble = Ensemble(self.scene, self._present_estimate, self._members, rng, time, self.tol, worn, learns)
         self._ensemble.set_travel_speed(self._speed)
         self._note_clearance()
 
@@ -287,17 +287,17 @@ class Follower:
         ends = np.zeros(len(t), bool)
         ends[self._ends] = True
         self._ends = _NO_DIGESTS
-        wanted = ends.copy()
-        wanted[-1] = True
+        needed = ends.copy()
+        needed[-1] = True
         if self.every_row or not self.steered:
-            wanted[:] = self.every_row
+            needed[:] = self.every_row
         stops = Counter(digest_after.tolist())
         failed, digests, begin = 0, list[str](), 0
         while begin < len(t):
             end = self._stop(t, begin, stops)
             here = slice(begin, end)
             out = rows[here] if rows is not None else np.zeros(end - begin, ROW)
-            failed += self._advance_first(t[here], wrench[here], out, wanted[here], ends[here])
+            failed += self._advance_first(t[here], wrench[here], out, needed[here], ends[here])
             self.catch_up()
             if end in stops:
                 digests += [self.digest()] * stops[end]
@@ -305,14 +305,14 @@ class Follower:
         return Advanced(failed, digests)
 
     def _advance_first(
-        self, t: Array, wrench: Array, rows: Rows, wanted: NDArray[np.bool_], ends: NDArray[np.bool_]
+        self, t: Array, wrench: Array, rows: Rows, needed: NDArray[np.bool_], ends: NDArray[np.bool_]
     ) -> int:
         """Advance only the median twin, and return the number of failed advances."""
         failed = self._ensemble.advance_first(t, wrench, rows)
-        known = self._clearance.ravel()
-        rows["known_clearance"] = known if self.scene.wear is None else known + self._moved(rows["wear_depth"])
+        clearance = self._clearance.ravel()
+        rows["known_clearance"] = clearance if self.scene.wear is None else clearance + self._moved(rows["wear_depth"])
         self._wrench = wrench[-1].copy()
-        self._behind = _Behind(t, wrench, rows, wanted, ends, self._begins)
+        self._behind = _Behind(t, wrench, rows, needed, ends, self._begins)
         self._begins = False
         return failed
 
@@ -351,11 +351,13 @@ class Follower:
 
     def _note_clearance(self) -> None:
         self._cell = math.floor(self.time * _KNOWN_HZ)
-        known = self._known
+        estimate = self._present_estimate
         if self.estimate is None and self._ensemble.moved:
             self._clearance = self._ensemble.clearance()
             return
-        self._clearance = np.array([[value.mean, value.p05, value.p95] for value in (known.horizontal, known.vertical)])
+        self._clearance = np.array(
+            [[value.mean, value.p05, value.p95] for value in (estimate.horizontal, estimate.vertical)]
+        )
         if self.estimate is not None:
             self._clearance -= self._ensemble.moved_before
 
@@ -387,8 +389,8 @@ class Follower:
     def digest(self) -> str:
         """Return a digest of the exact state, as 16 hexadecimal digits."""
         self.catch_up()
-        learned = (part.tobytes() for part in self._ensemble.learned())
-        state = [*self._ensemble.twins(), self._wrench.tobytes(), self._ensemble.square.tobytes(), *learned]
+        arrays = (part.tobytes() for part in self._ensemble.learned())
+        state = [*self._ensemble.twins(), self._wrench.tobytes(), self._ensemble.square.tobytes(), *arrays]
         return hashlib.blake2b(b"".join(state), digest_size=8).hexdigest()
 
     def snapshot(self) -> bytes:
@@ -639,15 +641,15 @@ def prior(scene: Scene) -> Estimate:
         value = normal[DAMPING]
         damping = Interval(*(unknowns.damping_of(number) for number in (value.mean, value.p05, value.p95)))
     fx, fy, m = normal[GAIN]
-    known = replace(prior_of(unknowns, (0.0, 0.0), 0), damping=damping, gain_fx=fx, gain_fy=fy, gain_m=m)
-    return known if units == Units() else units.in_si(known, scene)
+    prior_estimate = replace(prior_of(unknowns, (0.0, 0.0), 0), damping=damping, gain_fx=fx, gain_fy=fy, gain_m=m)
+    return prior_estimate if units == Units() else units.in_si(prior_estimate, scene)
 
 
-def _whole(estimate: Estimate, known: Estimate) -> Estimate:
+def _whole(estimate: Estimate, previous: Estimate) -> Estimate:
     return replace(
         estimate,
-        damping=estimate.damping or known.damping,
-        gain_fx=estimate.gain_fx or known.gain_fx,
-        gain_fy=estimate.gain_fy or known.gain_fy,
-        gain_m=estimate.gain_m or known.gain_m,
+        damping=estimate.damping or previous.damping,
+        gain_fx=estimate.gain_fx or previous.gain_fx,
+        gain_fy=estimate.gain_fy or previous.gain_fy,
+        gain_m=estimate.gain_m or previous.gain_m,
     )

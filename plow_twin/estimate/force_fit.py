@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
-from plow_twin.estimate.contact_forces import Cells, ContactForces, Feeling, cells_of
+from plow_twin.estimate.contact_forces import Cells, ContactForces, ForcesOfFit, cells_of
 from plow_twin.estimate.fit import Fit, Linear, Point, Problem, freed, huber_loss, pieces
 from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER, FEWEST_IN_CONTACT
 from plow_twin.estimate.result import Cell, ForcesUsed, Interval
@@ -63,7 +63,7 @@ class _Place:
 
 
 @dataclass(frozen=True, eq=False)
-class _At:
+class _Evaluation:
     """Values of the unknowns, with the predicted motion and the predicted forces of the cells, shape (m,)."""
 
     place: _Place
@@ -102,9 +102,9 @@ class _Block:
         )
 
 
-def not_used(why: str) -> JointFit:
-    """Return the result without the forces, for the reason `why`."""
-    return JointFit(ForcesUsed(unused=why))
+def not_used(reason: str) -> JointFit:
+    """Return the result without the forces, for the reason `reason`."""
+    return JointFit(ForcesUsed(unused=reason))
 
 
 def fit_jointly(problem: Problem, fitted: Fit, forces: ContactForces, widened: float) -> JointFit:
@@ -116,20 +116,20 @@ def fit_jointly(problem: Problem, fitted: Fit, forces: ContactForces, widened: f
     if len(forces.t) < FEWEST_FOR_SCATTER:
         return not_used(f"got {len(forces.t)} messages in the window, expected at least {FEWEST_FOR_SCATTER}")
     forces = forces.thinned(_MOST_ROWS)
-    feeling = Feeling(problem, forces.t)
-    cells, against = cells_of(feeling, fitted, forces)
+    forces_of_fit = ForcesOfFit(problem, forces.t)
+    cells, against = cells_of(forces_of_fit, fitted, forces)
     if against:
         return replace(not_used("a cell contradicts the motion"), sensor=tuple(against))
     if cells is None:
         return not_used("the head touches no wall with a load cell")
-    return _Joint(problem, fitted, feeling, cells, widened).solve()
+    return _Joint(problem, fitted, forces_of_fit, cells, widened).solve()
 
 
 class _Joint:
     """The fit of the poses, extended by measured forces. The force of one cell in one row is called an *entry*."""
 
-    def __init__(self, problem: Problem, fitted: Fit, feeling: Feeling, cells: Cells, widened: float) -> None:
-        self._problem, self._found, self._feeling, self._cells = problem, fitted, feeling, cells
+    def __init__(self, problem: Problem, fitted: Fit, forces_of_fit: ForcesOfFit, cells: Cells, widened: float) -> None:
+        self._problem, self._fit, self._forces_of_fit, self._cells = problem, fitted, forces_of_fit, cells
         self._variance = fitted.variance * widened
         self._border = SIZE + 1 + len(cells.pairs)
         self._precision = np.concatenate(
@@ -141,8 +141,8 @@ class _Joint:
         )
 
     def solve(self) -> JointFit:
-        found, cells = self._found, self._cells
-        measured_force = self._feeling.at(found.shared, found.point.states, cells.delay)
+        found, cells = self._fit, self._cells
+        measured_force = self._forces_of_fit.at(found.shared, found.point.states, cells.delay)
         assert measured_force is not None  # `cells_of` has already simulated this motion
         near = np.isfinite(cells.force) & (measured_force.penetration > -2.0 * tuning.HEAD_ROOM)
         near[:, np.setdiff1d(np.arange(near.shape[1]), cells.pairs)] = False
@@ -181,30 +181,30 @@ class _Joint:
         )
 
     def _force(self, place: _Place) -> Array | None:
-        measured_force = self._feeling.at(place.shared, place.states, place.delay)
+        measured_force = self._forces_of_fit.at(place.shared, place.states, place.delay)
         return (
             None
             if measured_force is None
             else np.exp(place.gain[self._cell]) * measured_force.force[self._row, self._pair]
         )
 
-    def _evaluated(self, place: _Place) -> _At | None:
+    def _evaluated(self, place: _Place) -> _Evaluation | None:
         point, force = self._problem.evaluate(place.shared, place.states), self._force(place)
-        return None if point is None or force is None else _At(place, point, force)
+        return None if point is None or force is None else _Evaluation(place, point, force)
 
     def _away(self, place: _Place) -> Array:
         """Return the prior means of the border's unknowns minus their present values."""
         late = self._cells.delay - place.delay
         return np.concatenate([self._problem.mean - place.shared, [late], -place.gain])
 
-    def _cost(self, at: _At) -> float:
+    def _cost(self, at: _Evaluation) -> float:
         z = np.abs(self._measured - at.force) / np.sqrt(self._spread)
         loss = huber_loss(z)
         away = self._away(at.place)[SIZE:]
         prior = float(self._precision[SIZE:] @ away**2)
         return self._problem.cost(at.point, self._variance) + float(np.nansum(loss) + np.isnan(loss).sum()) + prior
 
-    def _linearised(self, at: _At) -> tuple[Linear, Array]:
+    def _linearised(self, at: _Evaluation) -> tuple[Linear, Array]:
         """Return the Jacobian of the poses, and that of the forces (m, b + 6) for the border and the starting state."""
         place, border = at.place, self._border
         out = np.zeros((len(self._row), border + 6))
@@ -233,7 +233,7 @@ class _Joint:
         out: Array = np.nan_to_num((other - one) / (2.0 * step))
         return out
 
-    def _blocks(self, at: _At, linear: Linear, jacobian: Array) -> list[_Block]:
+    def _blocks(self, at: _Evaluation, linear: Linear, jacobian: Array) -> list[_Block]:
         border, out = self._border, []
         places = np.r_[0:SIZE, border : border + 6]
         residual = np.nan_to_num(self._measured - at.force)
@@ -253,7 +253,7 @@ class _Joint:
             out.append(_Block.of(normal, score, border))
         return out
 
-    def _step(self, at: _At, blocks: list[_Block]) -> tuple[Array, Array]:
+    def _step(self, at: _Evaluation, blocks: list[_Block]) -> tuple[Array, Array]:
         """Return the step of the border, shape (b,), and its covariance."""
         normal = np.sum([block.normal for block in blocks], axis=0) + np.diag(self._precision)
         covariance: Array = np.linalg.inv(normal)
@@ -261,7 +261,7 @@ class _Joint:
         score = np.sum([block.score for block in blocks], axis=0) + pull
         return covariance @ score, covariance
 
-    def _descended(self, at: _At, blocks: list[_Block]) -> _At | None:
+    def _descended(self, at: _Evaluation, blocks: list[_Block]) -> _Evaluation | None:
         before, place = self._cost(at), at.place
         step, _ = self._step(at, blocks)
         states = np.stack([block.state + block.answer @ step for block in blocks])
@@ -279,7 +279,7 @@ class _Joint:
                 return other
         return None
 
-    def _unpredicted(self, at: _At, jacobian: Array, blocks: list[_Block]) -> Array:
+    def _unpredicted(self, at: _Evaluation, jacobian: Array, blocks: list[_Block]) -> Array:
         """Return the variance of the forces, shape (m,), that the linearisation does not predict, by random probes."""
         rng, place, total = np.random.default_rng(0), at.place, np.zeros(len(at.force))
         root = np.linalg.cholesky(self._step(at, blocks)[1][:SIZE, :SIZE])
@@ -302,7 +302,7 @@ class _Joint:
         ratio = np.diag(covariance @ meat @ covariance) / np.diag(covariance)
         return freed(count, unknown) * float(ratio[moving].mean())
 
-    def _summary(self, at: _At, covariance: Array) -> JointFit:
+    def _summary(self, at: _Evaluation, covariance: Array) -> JointFit:
         cells, place = self._cells, at.place
         deviation, left_over = np.sqrt(np.diag(covariance)), self._left_over(at)
         cell_of_pair = {}
@@ -318,8 +318,8 @@ class _Joint:
         most, most_together = tuning.MOST_LEFT_OVER
         if together > most_together:
             used = replace(used, unused="the law gives other forces")
-            why = f"contact forces: {together:.1%} of them remain unexplained, expected at most {most_together:.0%}"
-            return JointFit(used, model=(why,))
+            reason = f"contact forces: {together:.1%} of them remain unexplained, expected at most {most_together:.0%}"
+            return JointFit(used, model=(reason,))
         bad = tuple(
             f"contact forces: {name}: {cell.left_over:.0%} remain unexplained, expected at most {most:.0%}"
             for name, cell in cell_of_pair.items()
@@ -332,14 +332,14 @@ class _Joint:
             return JointFit(replace(used, unused=f"{unfitted} of {self._problem.window.swings} swings are not fitted"))
         return JointFit(used, place.shared, covariance[:SIZE, :SIZE])
 
-    def _unfitted(self, at: _At) -> int:
+    def _unfitted(self, at: _Evaluation) -> int:
         """Return the number of swings whose forces do not fit because of a false optimum of the starting state."""
         z = (self._measured - at.force) ** 2 / self._spread
         z, swing = z[np.isfinite(z)], self._swing[np.isfinite(z)]
         count, total = np.bincount(swing), np.bincount(swing, z)
         return int((total > tuning.MOST_MISFIT * np.maximum(count, 1)).sum())
 
-    def _left_over(self, at: _At) -> list[list[float]]:
+    def _left_over(self, at: _Evaluation) -> list[list[float]]:
         out: list[list[float]] = []
         residual, there = self._measured - at.force, np.isfinite(at.force)
         for k, pair in enumerate(self._cells.pairs.tolist()):

@@ -153,8 +153,8 @@ class ForceEnsemble:
                 force[:, part] = quantiles(batch.force[self._good])
             np.maximum(peak, batch.peak.max(axis=1), out=peak)
             impulse += batch.impulse.sum(axis=1)
-        good, left = self._good, int((~self._good).sum())
-        return Forces(start, t, force, quantiles(peak[good]), quantiles(impulse[good]), len(self) - left, left)
+        good, left_out = self._good, int((~self._good).sum())
+        return Forces(start, t, force, quantiles(peak[good]), quantiles(impulse[good]), len(self) - left_out, left_out)
 
 
 def quantiles(values: Array) -> Array:

@@ -48,9 +48,9 @@ class Scenario:
         LifeError
             If the text has a different form, or a multiple is not above 0.
         """
-        name, _, given = text.partition(":")
+        name, _, settings = text.partition(":")
         numbers = {}
-        for part in given.split(","):
+        for part in settings.split(","):
             key, _, value = part.partition("=")
             try:
                 numbers[key.strip()] = float(value)
@@ -134,9 +134,9 @@ class Forecast:
 
         At the end of the path, where a limit is reached, the clearances stop.
         """
-        grown = self.path.clearance_growth()
+        growth = self.path.clearance_growth()
         exposure = np.multiply.outer(self.rate, hours)
-        each = [self.now[:, axis, None] + np.interp(exposure, self.path.exposure, grown[:, axis]) for axis in range(2)]
+        each = [self.now[:, axis, None] + np.interp(exposure, self.path.exposure, growth[:, axis]) for axis in range(2)]
         return np.quantile(np.stack(each, axis=2), (0.1, 0.5, 0.9), axis=0, method="lower")
 
     def as_dict(self) -> dict[str, Any]:
@@ -206,20 +206,27 @@ def forecast(
 
 
 def _forecast(
-    scene: Scene, plan: Plan, deviation_m: tuple[float, float], known: Coefficient | None, multiple: float = 1.0
+    scene: Scene,
+    plan: Plan,
+    deviation_m: tuple[float, float],
+    coefficient_known: Coefficient | None,
+    multiple: float = 1.0,
 ) -> Forecast:
     wear = wear_in_travel(scene)
     if not all(0.0 <= value < math.inf for value in deviation_m):
         raise LifeError(f"deviations: got {deviation_m} m, expected two finite numbers >= 0")
-    if known is None:
+    if coefficient_known is None:
         check_prior(wear)
     low, high = (math.log(value) for value in wear.prior_m2_n)
     travel = plan.horizon_h * HOUR_S * wear.travel_speed_m_s
     rng = np.random.default_rng(plan.seed)
     coefficient = np.exp(rng.normal(0.5 * (low + high), (high - low) / (2.0 * NORMAL_P95), plan.draws))
     load = np.maximum(1.0 + plan.load_deviation * rng.standard_normal(plan.draws), 0.1)
-    if known is not None:
-        coefficient, load = known.draw(plan.draws, rng), 1.0 + tuning.PATH_DEVIATION * rng.standard_normal(plan.draws)
+    if coefficient_known is not None:
+        coefficient, load = (
+            coefficient_known.draw(plan.draws, rng),
+            1.0 + tuning.PATH_DEVIATION * rng.standard_normal(plan.draws),
+        )
     coefficient = coefficient * multiple
     size = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
     # a drawn clearance must stay above zero
@@ -229,10 +236,10 @@ def _forecast(
     spare = tuple(float(value) for value in -now.min(axis=0))
     limit = (plan.limit_horizontal_m + spare[0], plan.limit_vertical_m + spare[1])
     path = wear_path(scene, limit, most)
-    grown = size + path.clearance_growth()
+    clearance = size + path.clearance_growth()
     needed = np.stack(
         [
-            _exposure_at(path.exposure, grown[:, axis], limit_m - now[:, axis])
+            _exposure_at(path.exposure, clearance[:, axis], limit_m - now[:, axis])
             for axis, limit_m in enumerate((plan.limit_horizontal_m, plan.limit_vertical_m))
         ]
     ).min(axis=0)
@@ -247,8 +254,8 @@ def check_prior(wear: Wear) -> None:
     low, high = wear.prior_m2_n
     if not low <= wear.coefficient_m2_n <= high:
         raise LifeError(
-            f"wear.coefficient_m2_n: got {wear.coefficient_m2_n:g} m^2/N, expected one within wear.prior_m2_n, {low:g} "
-            f"to {high:g}: the forecast draws from this prior"
+            f"wear.coefficient_m2_n: got {wear.coefficient_m2_n:g} m^2/N, expected a value within wear.prior_m2_n, "
+            f"{low:g} to {high:g}: the forecast draws from this prior"
         )
 
 
@@ -291,8 +298,8 @@ def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth:
             # each of two opposite walls is assumed to contribute half of the growth of the clearance
             depth += 0.5 * max(horizontal_m - new.horizontal_m, 0.0) * np.abs(NORMAL_X)
             depth += 0.5 * max(vertical_m - new.vertical_m, 0.0) * np.abs(NORMAL_Y)
-    grown = 0.5 * depth @ np.abs(NORMAL_X), 0.5 * depth @ np.abs(NORMAL_Y)
-    clearance = Clearance(horizontal_m - float(grown[0]), vertical_m - float(grown[1]))
+    growth = 0.5 * depth @ np.abs(NORMAL_X), 0.5 * depth @ np.abs(NORMAL_Y)
+    clearance = Clearance(horizontal_m - float(growth[0]), vertical_m - float(growth[1]))
     return replace(scene, clearance=clearance, wear=replace(wear, initial_depth_m=tuple(depth.tolist())))
 
 
@@ -309,8 +316,8 @@ def with_estimate(scene: Scene, facts: Mapping[str, Any]) -> tuple[Scene, tuple[
     if not isinstance(facts, Mapping):
         raise LifeError(f"estimate: got {type(facts).__name__}, expected the output of `plow-twin estimate --json`")
     horizontal, vertical = (_estimated(name, facts.get(name)) for name in ("horizontal", "vertical"))
-    known = any(State(facts[name]["state"]).known for name in ("horizontal", "vertical"))
-    if known and "stiffness" in facts:
+    estimated = any(State(facts[name]["state"]).known for name in ("horizontal", "vertical"))
+    if estimated and "stiffness" in facts:
         damping = _mean("damping", facts["damping"]) if "damping" in facts else None
         scene = replace(scene, contact=contact_with(scene.contact, _mean("stiffness", facts["stiffness"]), damping))
     return with_clearances(scene, horizontal[0], vertical[0]), (horizontal[1], vertical[1])

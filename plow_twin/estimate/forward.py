@@ -187,7 +187,7 @@ class Forward:
     def _in_lanes(self, starts: Sequence[Start], start: float, times: Array) -> list[Array | None]:
         knots = self._knots
         t = np.union1d(knots[(knots > start) & (knots < times[-1])], times)
-        asked, out = np.isin(t, times), []
+        at_times, out = np.isin(t, times), []
         states, gains = np.array([one.state for one in starts]), np.array([one.gain for one in starts])[:, None]
         batch = TwinBatch([one.scene for one in starts], tol=tuning.TOLERANCE, start=start, max_steps=_STEPS)
         batch.move(range(len(starts)), states[:, :3], states[:, 3:])
@@ -198,7 +198,7 @@ class Forward:
             rows = batch.advance_samples(t[inside], self.load.at(t[inside]) * gains)
             self.work += int(rows.steps.sum())
             good &= (rows.status == Status.OK).all(axis=1)
-            out.append(rows.q[:, asked[inside]])
+            out.append(rows.q[:, at_times[inside]])
         q = np.concatenate(out, axis=1)
         good &= np.isfinite(q).all(axis=(1, 2))
         return [q[i] if good[i] else None for i in range(len(starts))]

@@ -106,10 +106,10 @@ def fit_gaps(scene: Scene, gaps: Gaps, poses: Poses) -> GapsFit | str:
     theta = _theta_at(gaps.t, poses)
     fits: list[GapsFit] = []
     unused = "gaps: got no message within the load's span"
-    known = np.isfinite(gaps.gap)
-    sets, counts = np.unique(known, axis=0, return_counts=True)
+    finite = np.isfinite(gaps.gap)
+    sets, counts = np.unique(finite, axis=0, return_counts=True)
     for pairs in sets[np.argsort(counts, kind="stable")]:
-        own = (known == pairs).all(axis=1)
+        own = (finite == pairs).all(axis=1)
         gap_fit = _fit_one_set(
             rows, gaps.t[own], gaps.gap[own][:, pairs], np.flatnonzero(pairs), theta[own], error, scene
         )
@@ -154,13 +154,13 @@ def _fit_one_set(
     unknown[:, 4] = 0.0 if turns else theta
     equations = with_turn if turns else fixed
     inverse = np.linalg.pinv(equations)
-    left = np.zeros_like(gap)
+    residual = np.zeros_like(gap)
     for _ in range(_ROUNDS):
         # the derivatives at theta = 0 suffice for a small theta
         c, s = np.cos(unknown[:, 4]), np.sin(unknown[:, 4])
         reach = c[:, None] * rows[0, pairs] + s[:, None] * rows[1, pairs] + rows[4, pairs]
-        left = gap - (unknown[:, :4] @ fixed.T - reach)
-        unknown[:, : equations.shape[1]] += left @ inverse.T
+        residual = gap - (unknown[:, :4] @ fixed.T - reach)
+        unknown[:, : equations.shape[1]] += residual @ inverse.T
     x, y = _displacement(unknown, scene)
     clearance = np.median(unknown[:, 2:4], axis=0)
     # averaging does not reduce the constant errors of the sensors
@@ -175,7 +175,7 @@ def _fit_one_set(
         for name, pair in GROUPS.items()
         if np.isin(pair, pairs).all()
     }
-    off = np.abs(left.mean(axis=0)).max() / error if len(pairs) > equations.shape[1] else 0.0
+    off = np.abs(residual.mean(axis=0)).max() / error if len(pairs) > equations.shape[1] else 0.0
     return GapsFit(poses, clearance, np.hypot(spread, noise), groups, len(t), float(off))
 
 

@@ -94,8 +94,8 @@ class Harmonics:
     def moved(self, by: Array, variance: Array | None = None) -> Harmonics:
         """Return harmonics with `by`, shape (3 k,), added to the amplitudes, and with the given variances, if any."""
         shape = self.amplitude.shape
-        known = self.variance if variance is None else variance.reshape(shape)
-        return replace(self, amplitude=self.amplitude + by.reshape(shape), variance=known)
+        new_variance = self.variance if variance is None else variance.reshape(shape)
+        return replace(self, amplitude=self.amplitude + by.reshape(shape), variance=new_variance)
 
     def drawn(self, members: int, rng: np.random.Generator) -> Array:
         """Return random amplitudes in N, N, N m, shape (members, k, 3); the first member has the means."""

@@ -98,5 +98,5 @@ def _named(harmonics: Harmonics) -> str:
         if term
         else abs(harmonics.amplitude[0, component])
     )
-    what = f"at {harmonics.multiples[term // 2]} times its frequency" if term else "at rest"
-    return f"load: {COMPONENTS[component]} lacks {size:.1%} of its amplitude {what}"
+    place = f"at {harmonics.multiples[term // 2]} times its frequency" if term else "at rest"
+    return f"load: {COMPONENTS[component]} lacks {size:.1%} of its amplitude {place}"

@@ -41,16 +41,16 @@ class Draws:
     drawn: Array
 
 
-def log_odds(believed: Draws, other: Draws, measured: Array) -> float:
-    """Return the log odds of the law of `other` against the law of `believed`, given m measured features."""
-    both = np.concatenate([believed.like, other.like])
+def log_odds(own: Draws, other: Draws, measured: Array) -> float:
+    """Return the log odds of the law of `other` against the law of `own`, given m measured features."""
+    both = np.concatenate([own.like, other.like])
     middle, scale = both.mean(axis=0), both.std(axis=0) + _LEAST
-    surfaces = [_Surface.through(law.drawn, (law.like - middle) / scale) for law in (believed, other)]
-    left = np.concatenate([surface.left for surface in surfaces])
-    covariance = left.T @ left / len(left)
+    surfaces = [_Surface.through(law.drawn, (law.like - middle) / scale) for law in (own, other)]
+    residuals = np.concatenate([surface.left for surface in surfaces])
+    covariance = residuals.T @ residuals / len(residuals)
     root = shrunk_root(covariance, _LEAST)
-    seen: Array = np.linalg.solve(root, (measured - middle) / scale)
-    one, two = (surface.ln_evidence(root, seen) for surface in surfaces)
+    normalised: Array = np.linalg.solve(root, (measured - middle) / scale)
+    one, two = (surface.ln_evidence(root, normalised) for surface in surfaces)
     return two - one
 
 
@@ -74,18 +74,18 @@ class _Surface:
         terms = _terms(points)
         inverse, leverage = ridge(terms, tuning.RIDGE[3])
         coefficients = inverse @ (terms.T @ like)
-        left = (like - terms @ coefficients) / np.sqrt(np.maximum(1.0 - leverage, tuning.LEAST_FREE))[:, None]
-        return _Surface(coefficients, left, points)
+        residuals = (like - terms @ coefficients) / np.sqrt(np.maximum(1.0 - leverage, tuning.LEAST_FREE))[:, None]
+        return _Surface(coefficients, residuals, points)
 
-    def ln_evidence(self, root: Array, seen: Array) -> float:
-        """Return the logarithm of the evidence of the measured features `seen`, shape (m,).
+    def ln_evidence(self, root: Array, normalised: Array) -> float:
+        """Return the logarithm of the evidence of the measured features `normalised`, shape (m,).
 
         They are whitened by `root`, the Cholesky factor of the residual covariance.
         """
         matrix = np.linalg.solve(root, self.coefficients.T)
 
         def misfit(points: Array) -> tuple[Array, Array]:
-            off = seen - _terms(points) @ matrix.T
+            off = normalised - _terms(points) @ matrix.T
             return (off**2).sum(axis=1) + (points**2).sum(axis=1), off
 
         each, off = misfit(self.points)

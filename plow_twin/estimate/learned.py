@@ -86,11 +86,11 @@ class Learner:
         Time of the estimate in s.
     """
 
-    def __init__(self, drawn: Array, learned: NDArray[np.int64], time: float) -> None:
-        self._all, self.open, self.time = drawn, learned, time
-        own = drawn[:, learned]
+    def __init__(self, drawn: Array, open_columns: NDArray[np.int64], time: float) -> None:
+        self._all, self.open, self.time = drawn, open_columns, time
+        own = drawn[:, open_columns]
         self._least, self._most = own.min(axis=0), own.max(axis=0)
-        self.mean, self.covariance = own[0].copy(), np.cov(own.T).reshape(len(learned), -1)
+        self.mean, self.covariance = own[0].copy(), np.cov(own.T).reshape(len(open_columns), -1)
         self._widest = np.sqrt(np.diag(self.covariance))
         # standardised differences of the members from the mean, zero for the median twin
         white = own - own.mean(axis=0)
@@ -101,9 +101,9 @@ class Learner:
     @classmethod
     def of(cls, drawn: Array, time: float) -> Learner | None:
         """Return a learner of the parameters that have a standard deviation above one unit, or None."""
-        learned = np.flatnonzero(drawn[1:].std(axis=0) > 1.0)
-        enough = len(drawn) >= _MEMBERS * (len(learned) + 1)
-        return cls(drawn, learned, time) if len(learned) and enough else None
+        varied = np.flatnonzero(drawn[1:].std(axis=0) > 1.0)
+        enough = len(drawn) >= _MEMBERS * (len(varied) + 1)
+        return cls(drawn, varied, time) if len(varied) and enough else None
 
     def _begin(self) -> None:
         self._precision, self._score = np.zeros((len(self.open), len(self.open))), np.zeros(len(self.open))
@@ -113,15 +113,15 @@ class Learner:
         both, here, there = np.intersect1d(self.open, before.open, return_indices=True)
         if not len(both):
             return
-        known, off = before.covariance[np.ix_(there, there)], before.mean[there] - self.mean[here]
-        total = known + self.covariance[np.ix_(here, here)]
+        covariance, off = before.covariance[np.ix_(there, there)], before.mean[there] - self.mean[here]
+        total = covariance + self.covariance[np.ix_(here, here)]
         if off @ np.linalg.solve(total, off) > tuning.OUTLYING**2:
             return
         gain = self.covariance[:, here] @ np.linalg.inv(total)
         self.mean = np.clip(self.mean + gain @ off, self._least, self._most)
         self.covariance = self.covariance - gain @ self.covariance[here]
 
-    def add(self, numbers: Array, seen: Array, off: Array, noise: Array) -> None:
+    def add(self, numbers: Array, measured_change: Array, off: Array, noise: Array) -> None:
         """Add the information from a pose.
 
         Parameters
@@ -139,8 +139,8 @@ class Learner:
         middle = own.mean(axis=0)
         apart = own - middle
         spread = np.linalg.inv(apart.T @ apart + 1e-6 * np.eye(len(self.open)))
-        slope = spread @ (apart.T @ seen)
-        rest = seen - apart @ slope
+        slope = spread @ (apart.T @ measured_change)
+        rest = measured_change - apart @ slope
         alone = rest.T @ rest / (len(own) - len(self.open) - 1)
         inverse = np.linalg.inv(alone + np.diag(noise**2))
         # subtract the information in the slope that is due to the random scatter of the members

@@ -69,8 +69,8 @@ def likeliest(drawn: Array, gain: float, motions: PathFeatures, measured: PathFe
     return points
 
 
-def _likeliest(drawn: Array, gain: float, motions: PathFeatures, asked: PathFeatures) -> Array:
-    """Return the most likely clearances in m of the k motions `asked`, shape (k, 2)."""
+def _likeliest(drawn: Array, gain: float, motions: PathFeatures, measured_paths: PathFeatures) -> Array:
+    """Return the most likely clearances in m of the k motions `measured_paths`, shape (k, 2)."""
     middle, scale = drawn.mean(axis=0), drawn.std(axis=0)
     scale[scale <= _SAME] = 1.0
     terms = _terms((drawn - middle) / scale)
@@ -79,17 +79,17 @@ def _likeliest(drawn: Array, gain: float, motions: PathFeatures, asked: PathFeat
     free = np.maximum(1.0 - leverage, tuning.LEAST_FREE)
     error = (motions.like - terms @ surface) / np.sqrt(free)[:, None]
     whiten = np.linalg.inv(shrunk_root(error.T @ error / len(error), _LEAST)).T
-    seen, late, surface = asked.like @ whiten, asked.late @ whiten, surface @ whiten
+    whitened, late, surface = measured_paths.like @ whiten, measured_paths.late @ whiten, surface @ whiten
     # the first four parameters have no prior; the gains and the delay follow
     mean = np.concatenate([np.zeros(4), (1.0 - middle[4:]) / scale[4:], np.zeros(1)])
     weight = np.concatenate([np.full(4, _FREE), gain / scale[4:], np.full(1, tuning.LATE)]) ** -2.0
-    point = np.zeros((len(seen), len(mean)))
+    point = np.zeros((len(whitened), len(mean)))
     for _ in range(_STEPS):
         places = point[:, :-1]
-        left = seen - _terms(places) @ surface - late * point[:, -1:]
+        residual = whitened - _terms(places) @ surface - late * point[:, -1:]
         slope = np.concatenate([_slopes(places) @ surface, late[:, None]], axis=1)
         curvature = slope @ slope.transpose(0, 2, 1) + np.diag(weight)
-        pull = np.einsum("nkm,nm->nk", slope, left) + (mean - point) * weight
+        pull = np.einsum("nkm,nm->nk", slope, residual) + (mean - point) * weight
         step = np.linalg.solve(curvature, pull[:, :, None])[:, :, 0]
         point += np.clip(step, -_LONGEST, _LONGEST)
         np.clip(point, -tuning.OUTLYING, tuning.OUTLYING, out=point)

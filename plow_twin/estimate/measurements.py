@@ -424,8 +424,8 @@ def believed(stated: Deviation, q: Array, own: Array) -> tuple[Array, Deviation]
     deviation : tuple of 3 float
         Root mean square of the deviations of the remaining components, at least `stated`.
     """
-    known = [column[np.isfinite(column)] for column in own.T]
-    usual = np.array([float(np.median(column)) if len(column) else 0.0 for column in known])
+    finite = [column[np.isfinite(column)] for column in own.T]
+    usual = np.array([float(np.median(column)) if len(column) else 0.0 for column in finite])
     worse = own > np.minimum(useless_deviation(), np.where(usual > 0.0, tuning.MUCH_WORSE * usual, np.inf))
     kept = np.where(worse | ~np.isfinite(own), 0.0, own)
     count = np.maximum((np.isfinite(own) & ~worse).sum(axis=0), 1)

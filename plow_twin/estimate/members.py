@@ -81,38 +81,38 @@ class Ensemble:
     """
 
     def __init__(
-        self, scene: Scene, known: Estimate, members: int, rng: np.random.Generator, start: float, tol: float,
+        self, scene: Scene, estimate: Estimate, members: int, rng: np.random.Generator, start: float, tol: float,
         worn: Array, learns: bool = True,
     ) -> None:  # fmt: skip
-        differ = rubs(scene, known)
+        differ = rubs(scene, estimate)
         if differ:
             scene = replace(scene, friction=scene.friction or Friction(0.0))
-        scenes, gain = draw_scenes(scene, known, members, rng) if members > 1 else ([scene], np.ones((1, 3)))
-        scenes[0], gain[0] = middle_of(scene, known)
+        scenes, gain = draw_scenes(scene, estimate, members, rng) if members > 1 else ([scene], np.ones((1, 3)))
+        scenes[0], gain[0] = middle_of(scene, estimate)
         if differ:
-            scenes = _with_friction(scenes, known, rng)
+            scenes = _with_friction(scenes, estimate, rng)
         #: whether poses move the first member; under the prior, they move the second member, a copy of the first member
-        self._steers_first = known.horizontal_state is not State.PRIOR
+        self._steers_first = estimate.horizontal_state is not State.PRIOR
         if not self._steers_first and members > 1:
             scenes[1], gain[1] = scenes[0], gain[0]
         #: wear depths of the pads at the start, and their part of the estimated clearances, shape (2, 1)
         self.worn_before, self.moved_before = worn, np.zeros((2, 1))
         if scene.wear is not None:
-            states = (known.horizontal_state, known.vertical_state)
+            states = (estimate.horizontal_state, estimate.vertical_state)
             self.moved_before = np.where([[state.known] for state in states], widening(scene, worn)[:, None], 0.0)
             scenes = _worn(scenes, replace(scene.wear, initial_depth_m=tuple(worn.tolist())), self.moved_before)
         #: the first member, which is advanced alone so that its forces are available first
         self.first = Twin(scenes[0], tol=tol, excitation="sampled", start=start, max_steps=MOST_STEPS)
         self.others = TwinBatch(scenes[1:], tol=tol, start=start, max_steps=MOST_STEPS) if members > 1 else None
         self._scene, self._gain, self._rng, self._speed = scene, gain, rng, 0.0
-        self._numbers = numbers_of(scenes, gain, draw_biases(known, members, rng))
+        self._numbers = numbers_of(scenes, gain, draw_biases(estimate, members, rng))
         # index of the next member that adopts learned parameters, and number of members that are due
         learns = learns and self._steers_first and members > 1
         self._learner = Learner.of(self._numbers.copy(), start) if learns else None
         self._turn, self._waiting = 0, 0.0
         # harmonics that the measured load lacks, and their amplitudes of each member in N, N, N m, shape (m, k, 3)
-        self._harmonics = known.load_harmonics
-        self._amplitude = amplitudes_of(known, members, rng)
+        self._harmonics = estimate.load_harmonics
+        self._amplitude = amplitudes_of(estimate, members, rng)
         # load error of each member in N, N, N m, and its time in s
         self._load_off, self._drifted = np.zeros((members, 3)), start
         self._walls = np.repeat(penetration_rows(scene)[None], members, axis=0)
@@ -168,11 +168,11 @@ class Ensemble:
         return failed
 
     def advance_others(
-        self, t: Array, wrench: Array, rows: Rows, wanted: NDArray[np.bool_], ends: NDArray[np.bool_]
+        self, t: Array, wrench: Array, rows: Rows, needed: NDArray[np.bool_], ends: NDArray[np.bool_]
     ) -> None:
         """Advance all further members to the time of the first member, and add intervals to the first member's rows.
 
-        `wanted` marks the rows that receive intervals, and `ends` the last rows of spans.
+        `needed` marks the rows that receive intervals, and `ends` the last rows of spans.
         """
         parts = [_bytes(rows[None])]
         if self.others is not None:
@@ -181,7 +181,7 @@ class Ensemble:
         good = whole["status"] == 0
         if len(self.good) == 1:
             self.good[:] = True
-        for place, (now, is_wanted, is_end) in enumerate(zip(t.tolist(), wanted.tolist(), ends.tolist(), strict=True)):
+        for place, (now, is_wanted, is_end) in enumerate(zip(t.tolist(), needed.tolist(), ends.tolist(), strict=True)):
             self.good &= good[:, place]
             np.maximum(self._peak, whole["peak"][:, place], out=self._peak)
             self._impulse += whole["impulse"][:, place]
@@ -344,9 +344,9 @@ class Ensemble:
         use = self._used()
         if not self._steers_first and use[1:].any():
             use = use & (np.arange(len(use)) > 0)
-        about, seen = state - state[use].mean(axis=0), then - then[use].mean(axis=0)
+        about, centred_poses = state - state[use].mean(axis=0), then - then[use].mean(axis=0)
         freedom = max(int(use.sum()) - 1, 1)
-        scatter = seen[use].T @ seen[use] / freedom + np.diag(noise[there] ** 2)
+        scatter = centred_poses[use].T @ centred_poses[use] / freedom + np.diag(noise[there] ** 2)
         center = _off(q, then[use].mean(axis=0), there)
         if (np.abs(center) <= tuning.OUTLYING * np.sqrt(np.diag(scatter))).all():
             self.outlying = 0
@@ -357,12 +357,12 @@ class Ensemble:
         white = self._rng.standard_normal((len(then), len(there)))
         white[0] = 0.0
         if self._learner is not None:
-            self._learner.add(self._numbers[use], seen[use], center, noise[there])
+            self._learner.add(self._numbers[use], centred_poses[use], center, noise[there])
         off = _off(q, then, there)
         # limit the influence of a single wrong pose
         most = tuning.OUTLYING * noise[there]
         self.square += ((off.clip(-most, most) / noise[there]) ** 2).sum(axis=1)
-        weight = np.linalg.solve(scatter, seen[use].T @ about[use] / freedom)
+        weight = np.linalg.solve(scatter, centred_poses[use].T @ about[use] / freedom)
         weight[:, ~np.tile(self._free, len(path) + 2)] = 0.0
         moved = state + (off + noise[there] * white) @ weight
         v, places = moved[:, :3], moved[:, 3:-3].reshape(len(moved), -1, 3).transpose(1, 0, 2)
@@ -419,14 +419,14 @@ class Ensemble:
         if not len(which):
             return
         changed, gain = with_numbers([now[place] for place in which.tolist()], numbers)
-        taken, rest = np.ones(len(which), dtype=bool), which > 0
+        accepted, rest = np.ones(len(which), dtype=bool), which > 0
         if self.others is not None:
-            taken[rest] = self.others.change(which[rest] - 1, changed[-int(rest.sum()) :] if rest.any() else [])
-        which, room, force, before = which[taken], self._room(), self._force(self._depth), self._gain[0].copy()
-        if not taken.any():
+            accepted[rest] = self.others.change(which[rest] - 1, changed[-int(rest.sum()) :] if rest.any() else [])
+        which, room, force, before = which[accepted], self._room(), self._force(self._depth), self._gain[0].copy()
+        if not accepted.any():
             return
-        changed = list(compress(changed, taken))
-        self._numbers[which], self._gain[which] = numbers[taken], gain[taken]
+        changed = list(compress(changed, accepted))
+        self._numbers[which], self._gain[which] = numbers[accepted], gain[accepted]
         self._clearance[which], self._walls[which, 4] = _clearance_of(changed), penetrations_at_centre(changed)
         self._fastest[which] = [fastest_travel(one.wear, one.contact) for one in changed]
         self._stiffness[which] = [one.contact.stiffness for one in changed]
@@ -444,12 +444,12 @@ class Ensemble:
         self._move_toward(self.pose, self._v, force, which)
 
     def _recover(self) -> None:
-        lost, left = np.flatnonzero(~self.good), np.flatnonzero(self.good)
+        lost, good_members = np.flatnonzero(~self.good), np.flatnonzero(self.good)
         self.good[:] = True
-        if not len(lost) or not len(left):
+        if not len(lost) or not len(good_members):
             return
         from_ = np.arange(len(self.good))
-        from_[lost] = np.resize(left, len(lost))
+        from_[lost] = np.resize(good_members, len(lost))
         share = self._shares(self._room()[from_])
         self._path = deque((t, q[from_] * share) for t, q in self._path)
         self._move_toward(self._path[-1][1], self._v[from_], self._force(self._depth)[from_], lost)
@@ -565,9 +565,9 @@ def may_rub(scene: Scene) -> bool:
     return scene.wear is None and (scene.friction is None or scene.friction.stick_stiffness_n_m is None)
 
 
-def rubs(scene: Scene, known: Estimate) -> bool:
+def rubs(scene: Scene, estimate: Estimate) -> bool:
     """Return whether members differ in friction, because the machine's friction probably differs from the scene's."""
-    return may_rub(scene) and known.differs.get(FRICTION, (0.0,))[0] >= _PROBABLE
+    return may_rub(scene) and estimate.differs.get(FRICTION, (0.0,))[0] >= _PROBABLE
 
 
 def compile_friction(scene: Scene, tol: float) -> None:
@@ -577,23 +577,23 @@ def compile_friction(scene: Scene, tol: float) -> None:
     Twin(scenes[0], tol=tol, excitation="sampled").warm_up()
 
 
-def _with_friction(scenes: Sequence[Scene], known: Estimate, rng: np.random.Generator) -> list[Scene]:
+def _with_friction(scenes: Sequence[Scene], estimate: Estimate, rng: np.random.Generator) -> list[Scene]:
     """Return scenes with friction coefficients drawn about those of the scenes."""
-    _, by, deviation = known.differs[FRICTION]
+    _, by, deviation = estimate.differs[FRICTION]
     assert scenes[0].friction is not None
     drawn = scenes[0].friction.coefficient + by + deviation * np.append(0.0, rng.standard_normal(len(scenes) - 1))
     return variants(scenes, {"friction": {"coefficient": np.maximum(drawn, _LEAST_FRICTION)}})
 
 
-def middle_of(scene: Scene, known: Estimate) -> tuple[Scene, Array]:
+def middle_of(scene: Scene, estimate: Estimate) -> tuple[Scene, Array]:
     """Return the scene and the load gains, shape (3,), that have the median values of an estimate."""
-    if known.horizontal_state is State.PRIOR:
+    if estimate.horizontal_state is State.PRIOR:
         return replace(scene, loads=(), wear=None), np.ones(3)
 
     def point(value: Interval | None) -> Interval | None:
         return None if value is None else Interval(value.mean, value.mean, value.mean)
 
-    points: dict[str, Any] = {one.name: point(getattr(known, one.name)) for one in QUANTITIES}
-    middle = replace(known, apparent=None, **points)
+    points: dict[str, Any] = {one.name: point(getattr(estimate, one.name)) for one in QUANTITIES}
+    middle = replace(estimate, apparent=None, **points)
     scenes, gain = draw_scenes(scene, middle, 1, np.random.default_rng(0))
     return scenes[0], gain[0]

@@ -27,18 +27,18 @@ def shortages(poses: Poses) -> tuple[str, ...]:
     if useless:
         return useless
     counts = np.isfinite(poses.q).sum(axis=0).tolist()
-    lacking = tuple(
+    reasons = tuple(
         f"{name}: measured {count} times, expected at least {FEWEST_POSES}"
         for name, count in zip(COMPONENTS, counts, strict=True)
         if count < FEWEST_POSES
     )
-    if lacking:
-        return lacking
+    if reasons:
+        return reasons
     # a flight within a gap is not measured
     apart = max(poses.interval(), poses.gap())
     if apart > tuning.SPARSEST:
-        lacking = (f"poses: got {1.0 / apart:.1f} a second, expected at least {1.0 / tuning.SPARSEST:.1f}",)
-    return lacking
+        reasons = (f"poses: got {1.0 / apart:.1f} a second, expected at least {1.0 / tuning.SPARSEST:.1f}",)
+    return reasons
 
 
 def well_measured(poses: Poses) -> Poses | None:

@@ -257,10 +257,10 @@ def _least(unknowns: Unknowns, poses: Poses, fit: Fit, softness: float, deviatio
     wider = math.exp(NORMAL_P95 * min(deviation, 1.0))
     if fit.finished:
         deepest = np.nanmax(reaches(unknowns.scene, fit.point.predicted), axis=0).reshape(2, 2).max(axis=1)
-        given = 2.0 * wider * np.maximum(deepest - 0.5 * fit.shared[[GX, GY]], 0.0)
+        uncertainty = 2.0 * wider * np.maximum(deepest - 0.5 * fit.shared[[GX, GY]], 0.0)
     else:
-        given = np.full(2, tuning.GIVEN * wider * math.exp(softness))
-    least: Array = range_of_motion(unknowns.scene, poses.moved(-fit.shared[BIAS]))[0] - given
+        uncertainty = np.full(2, tuning.GIVEN * wider * math.exp(softness))
+    least: Array = range_of_motion(unknowns.scene, poses.moved(-fit.shared[BIAS]))[0] - uncertainty
     return least
 
 
@@ -342,8 +342,8 @@ def state_of(withdrawn: bool, observed: bool, rough: bool = False) -> State:
     """Return the state of a clearance."""
     if withdrawn:
         return State.WITHDRAWN
-    known = State.ROUGH if rough else State.ESTIMATED
-    return known if observed else State.NOT_OBSERVABLE
+    published = State.ROUGH if rough else State.ESTIMATED
+    return published if observed else State.NOT_OBSERVABLE
 
 
 def summarise_bounced(
@@ -475,7 +475,7 @@ def not_observable(unknowns: Unknowns, poses: Poses, lost: int, reasons: tuple[s
 
 
 def without_fit(
-    unknowns: Unknowns, poses: Poses, lost: int, why: str = "no motion of the model is near the measured motion"
+    unknowns: Unknowns, poses: Poses, lost: int, reason: str = "no motion of the model is near the measured motion"
 ) -> Estimate:
     """Return the prior as a withdrawn estimate."""
     return replace(
@@ -483,7 +483,7 @@ def without_fit(
         horizontal_state=State.WITHDRAWN,
         vertical_state=State.WITHDRAWN,
         model="suspect",
-        reasons=(why,),
+        reasons=(reason,),
     )
 
 

@@ -125,14 +125,14 @@ def compare_under_uncertain_load(
         Number of solver steps.
     """
     rng = np.random.default_rng(seed)
-    seen = MotionFeatures(unknowns, poses, period)
+    motion_features = MotionFeatures(unknowns, poses, period)
     if measured_load is None:
-        by = _without_load(seen, unknowns, poses, period)
+        by = _without_load(motion_features, unknowns, poses, period)
     elif poses.measured[2]:
-        by = _with_angle(seen, measured_load, unknowns, poses)
+        by = _with_angle(motion_features, measured_load, unknowns, poses)
     else:
-        by = _without_angle(seen, measured_load, unknowns, poses)
-    spread, measured = by.spread, by.features(seen.q)
+        by = _without_angle(motion_features, measured_load, unknowns, poses)
+    spread, measured = by.spread, by.features(motion_features.q)
     rows: list[Array] = []
     targets: list[Array] = []
     work = 0
@@ -142,7 +142,7 @@ def compare_under_uncertain_load(
             clearance, numbers, ln_error = _draw(spread, rng)
             other = _with_exponent(unknowns, rng)
             forward = Forward(other.scene, _with_error(by.load(clearance, numbers), math.exp(ln_error), rng))
-            q = seen.look(forward, other, clearance, numbers, 0.0, rng)
+            q = motion_features.simulated(forward, other, clearance, numbers, 0.0, rng)
             work += forward.work
             if q is not None:
                 rows.append(by.features(q))
@@ -176,18 +176,20 @@ def compare_under_uncertain_load(
     ), work
 
 
-def _without_load(seen: MotionFeatures, unknowns: Unknowns, poses: Poses, period: float) -> _Comparison:
+def _without_load(motion_features: MotionFeatures, unknowns: Unknowns, poses: Poses, period: float) -> _Comparison:
     """Return the comparison for a load that was not measured; motions are compared by reaches and changes."""
     equations = EquationError(unknowns, Load.unmeasured(period), poses.t)
 
     def load(clearance: Array, numbers: Array) -> Load:
-        return equations.required_load(seen.q, np.repeat(0.5 * clearance, 2), numbers[0], math.exp(numbers[1]))
+        return equations.required_load(
+            motion_features.q, np.repeat(0.5 * clearance, 2), numbers[0], math.exp(numbers[1])
+        )
 
     def features(q: Array) -> Array:
-        values = seen.features(q)
-        return np.concatenate([values[:2], values[5:], seen.changes(q)])
+        values = motion_features.features(q)
+        return np.concatenate([values[:2], values[5:], motion_features.changes(q)])
 
-    travel = features(seen.q)[:2]
+    travel = features(motion_features.q)[:2]
     spread = _Spread(
         travel,
         0.0,
@@ -197,17 +199,17 @@ def _without_load(seen: MotionFeatures, unknowns: Unknowns, poses: Poses, period
         tuning.YIELDED[0],
     )
     unexplained = tuning.YIELDED[2], 0.0
-    return _Comparison(features, spread, _moved(seen, poses), tuning.UNCERTAIN_DRAWS[1], unexplained, load)
+    return _Comparison(features, spread, _moved(motion_features, poses), tuning.UNCERTAIN_DRAWS[1], unexplained, load)
 
 
-def _with_angle(seen: MotionFeatures, measured_load: Load, unknowns: Unknowns, poses: Poses) -> _Comparison:
+def _with_angle(motion_features: MotionFeatures, measured_load: Load, unknowns: Unknowns, poses: Poses) -> _Comparison:
     """Return the comparison by the weak form of the equations of motion, which needs load and theta."""
     about, softness, damping = tuning.UNCERTAIN_SPREAD
     equations = EquationError(unknowns, measured_load, poses.t)
-    first = equations.search(seen.q, range_of_motion(unknowns.scene, poses)[0])
-    level = noise_level(seen.q)
+    first = equations.search(motion_features.q, range_of_motion(unknowns.scene, poses)[0])
+    level = noise_level(motion_features.q)
     noise = math.hypot(max(level[0], level[1]), level[2] * geometry.half_diagonal(unknowns.scene))
-    times = equations.touched(seen.q, first, tuning.OUTLYING * noise)
+    times = equations.touched(motion_features.q, first, tuning.OUTLYING * noise)
     start, ln_depth = np.repeat(0.5 * first.clearance, 2), first.ln_depth
 
     def features(q: Array) -> Array:
@@ -221,24 +223,26 @@ def _with_angle(seen: MotionFeatures, measured_load: Load, unknowns: Unknowns, p
     return _Comparison(features, spread, touched, draws, tuning.CORRECTED, lambda clearance, numbers: measured_load)
 
 
-def _without_angle(seen: MotionFeatures, measured_load: Load, unknowns: Unknowns, poses: Poses) -> _Comparison:
+def _without_angle(
+    motion_features: MotionFeatures, measured_load: Load, unknowns: Unknowns, poses: Poses
+) -> _Comparison:
     """Return the comparison by reaches, for a theta that was not measured."""
     nominal, deviations = unknowns.nominal(), unknowns.deviations()
 
     def features(q: Array) -> Array:
-        values = seen.features(q)
+        values = motion_features.features(q)
         return np.concatenate([values[:2], values[5:]])
 
     depth = _middle(DEPTHS)
     damping = (_damping(unknowns), tuning.UNCERTAIN_SPREAD[2])
     spread = _Spread(nominal[:2], float(deviations[:2].max()) / 2.0, depth, damping, _middle(tuning.LOAD_ERRORS))
-    moved, draws = _moved(seen, poses), tuning.UNCERTAIN_DRAWS[1]
+    moved, draws = _moved(motion_features, poses), tuning.UNCERTAIN_DRAWS[1]
     return _Comparison(features, spread, moved, draws, (0.0, 0.0), lambda clearance, numbers: measured_load)
 
 
-def _moved(seen: MotionFeatures, poses: Poses) -> NDArray[np.bool_]:
+def _moved(motion_features: MotionFeatures, poses: Poses) -> NDArray[np.bool_]:
     """Return whether x and y moved by more than their noise, shape (2,)."""
-    moved: NDArray[np.bool_] = np.nanstd(poses.q[:, :2], axis=0) > tuning.RESTS * noise_level(seen.q)[:2]
+    moved: NDArray[np.bool_] = np.nanstd(poses.q[:, :2], axis=0) > tuning.RESTS * noise_level(motion_features.q)[:2]
     return moved
 
 

@@ -72,8 +72,8 @@ class _Simulation:
             return None
         vector = vector.copy()
         vector[BIAS][self.measured] += error.mean(axis=0)
-        left = (error - error.mean(axis=0)) / self.size[self.measured]
-        return float(np.minimum(left**2, 1.0).mean()), vector
+        residual = (error - error.mean(axis=0)) / self.size[self.measured]
+        return float(np.minimum(residual**2, 1.0).mean()), vector
 
     def descend(self, vector: Array, rows: int, scale: Array) -> tuple[Array, float]:
         """Return an improved vector and its cost; `scale`, shape (3,), is the unit of the residuals."""
@@ -161,8 +161,8 @@ def fit_some_components(
         if q is None:
             return None
         if before is not None:
-            known = before.point.predicted
-            q[: len(known)] = np.where(np.isfinite(known), known, q[: len(known)])
+            predicted = before.point.predicted
+            q[: len(predicted)] = np.where(np.isfinite(predicted), predicted, q[: len(predicted)])
         # the division into swings compares poses with their noise
         q = q + shared[BIAS] + np.where(whole.measured, 0.0, noise) * rng.standard_normal(q.shape)
         some = replace(poses, assumed=q).between(float(poses.t[0]), end)

@@ -227,10 +227,10 @@ def _noise_change(fit: Fit, verdict: Verdict) -> None:
     for i, name in enumerate(COMPONENTS):
         residual, swing = fit.point.residual[:, i], fit.point.swing
         parts = [quick_noise(residual[index], swing[index]) for index in np.array_split(np.arange(len(residual)), 5)]
-        known = np.array([part for part in parts if part > 0.0])
-        if len(known) < 3:
+        noises = np.array([part for part in parts if part > 0.0])
+        if len(noises) < 3:
             continue
-        ratio = float(known.max() / np.median(known))
+        ratio = float(noises.max() / np.median(noises))
         verdict.figures[f"noise_ratio_{name}"] = ratio
         if ratio > tuning.MOST_RATIO:
             verdict.sensor.append(f"{name}: the noise of one part of the window is {ratio:.1f} times that of the rest")

@@ -97,7 +97,7 @@ class Windows:
         self._poses: deque[_Pose] = deque(maxlen=MOST_KEPT)
         self._gaps: deque[tuple[int, tuple[int, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
         #: length [s] of the newest checked window, and the larger number of its poses and rows of gaps
-        self._left = (0.0, 0)
+        self._last_extent = (0.0, 0)
         self._newest_ns: int | None = None
         self._end_ns: int | None = None
         self._first_ns: int | None = None
@@ -156,7 +156,7 @@ class Windows:
         window = self._form(self._newest_ns + 1)
         if window is not None:
             return window
-        span_s, rows = self._left
+        span_s, rows = self._last_extent
         least_s = tuning.WINDOW_SHARES[self._early] * self._length_ns * 1e-9
         return (
             f"got {span_s:.3g} s of load without a gap and {rows} poses or gaps in them, expected at least "
@@ -195,7 +195,7 @@ class Windows:
         poses = [row for row in self._poses if start_ns <= row[0] < end_ns]
         measured = [row for row in self._gaps if start_ns <= row[0] < end_ns]
         most = max(len(poses), len(measured))
-        self._left = (end_ns - start_ns) * 1e-9, most
+        self._last_extent = (end_ns - start_ns) * 1e-9, most
         least = tuning.WINDOW_SHARES[self._early]
         if end_ns - start_ns < least * self._length_ns or most < FEWEST_POSES or len(stamps) < 2:
             return None

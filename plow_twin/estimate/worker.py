@@ -57,7 +57,7 @@ ForkingPickler.register(MappingProxyType, lambda view: (_view, (dict(view),)))
 
 
 @dataclass(frozen=True)
-class Found:
+class WindowResult:
     """Result of the estimate of one window.
 
     start_ns : beginning of the window [ns]
@@ -99,7 +99,7 @@ class Worker:
         The answers that are requested in addition to the estimate.
     """
 
-    def __init__(self, scene: Scene, windows: Windows, asked: Requests = _ESTIMATE_ALONE) -> None:
+    def __init__(self, scene: Scene, windows: Windows, requests: Requests = _ESTIMATE_ALONE) -> None:
         near, far = Pipe()
         command = [sys.executable, "-m", "plow_twin.estimate.worker", str(far.fileno()), *loaded_laws()]
         # the far side uses at most one core
@@ -109,7 +109,7 @@ class Worker:
         )
         far.close()
         self._connection = near
-        self._connection.send((scene, windows, asked))
+        self._connection.send((scene, windows, requests))
         self._waiting: deque[tuple[Any, ...]] = deque()
         self._restarts = 0
         #: whether the far side has compiled its kernels
@@ -152,7 +152,7 @@ class Worker:
         """Whether the queue of unsent data is more than a tenth full."""
         return len(self._waiting) > _MOST_WAITING // 10
 
-    def poll(self) -> Found | None:
+    def poll(self) -> WindowResult | None:
         """Return the next result, or None if none has arrived. Results of windows before a restart are dropped."""
         if self.error or self.ended is not None:
             return None
@@ -163,7 +163,7 @@ class Worker:
             return None
         try:
             if self._connection.poll():
-                reply: Found | str | None = self._connection.recv()
+                reply: WindowResult | str | None = self._connection.recv()
                 if reply is None:
                     self.ready = True
                     return None
@@ -205,7 +205,7 @@ class Worker:
 
 def serve(connection: Connection) -> None:
     """Receive data and send estimates until the near side closes the connection."""
-    scene, windows, asked = connection.recv()
+    scene, windows, requests = connection.recv()
     warm_up(scene)
     connection.send(None)  # the kernels are compiled
     guess: Guess = ()
@@ -231,14 +231,14 @@ def serve(connection: Connection) -> None:
             connection.recv()  # raises `EOFError` when the near side closes the connection
         assert due is not None
         begin = time.perf_counter()
-        reply = answer(scene, due, guess, asked)
+        reply = answer(scene, due, guess, requests)
         wall_s = time.perf_counter() - begin
-        if asked.follows and not compiled and rubs(scene, reply.estimate):
+        if requests.follows and not compiled and rubs(scene, reply.estimate):
             # the process of the twin then loads these kernels from the cache
             compile_friction(scene, TOLERANCE)
             compiled = True
         bounds = (due.start_ns, due.end_ns, due.samples, due.poses)
-        connection.send(Found(*bounds, guess, reply.estimate, wall_s, skipped, restarts, reply.text, reply.also))
+        connection.send(WindowResult(*bounds, guess, reply.estimate, wall_s, skipped, restarts, reply.text, reply.also))
         guess, skipped = reply.following, 0
 
 

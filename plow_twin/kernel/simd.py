@@ -255,8 +255,8 @@ def equal(typingctx: Any, array: Any, index: Any, number: Any) -> Any:
         place, sought = (context.cast(builder, arguments[i], signature.args[i], types.int64) for i in (1, 2))
         pointer = _pointer(context, builder, signature.args[0], arguments[0], place)
         loaded = builder.load(builder.bitcast(pointer, _BITS.as_pointer()), align=8)
-        wanted = builder.bitcast(_splatted(builder, builder.bitcast(sought, ir.DoubleType())), _BITS)
-        same = builder.icmp_signed("==", loaded, wanted)
+        pattern = builder.bitcast(_splatted(builder, builder.bitcast(sought, ir.DoubleType())), _BITS)
+        same = builder.icmp_signed("==", loaded, pattern)
         return builder.zext(builder.bitcast(same, ir.IntType(_WIDTH)), ir.IntType(64))
 
     return types.int64(array, index, number), codegen
@@ -392,9 +392,9 @@ def _elementwise(operation: Callable[..., Any], emit: str) -> None:
         metadata = {"target": "cpu"}  # noqa: RUF012
 
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            known = all(isinstance(kind, (Lanes, types.Float, types.Integer)) for kind in args)
+            supported = all(isinstance(kind, (Lanes, types.Float, types.Integer)) for kind in args)
             lane_types = {kind for kind in args if isinstance(kind, Lanes)}
-            if len(args) == 2 and known and len(lane_types) == 1:
+            if len(args) == 2 and supported and len(lane_types) == 1:
                 return signature(*lane_types, *args)
             return None
 

@@ -76,11 +76,11 @@ class Control:
 
     def _answer(self, data: bytes) -> tuple[bool, str]:
         try:
-            asked: Any = json.loads(data)
+            request: Any = json.loads(data)
         except ValueError:
-            asked = None
-        name = asked.get("service") if isinstance(asked, dict) else None
-        text = asked.get("text") if isinstance(asked, dict) else None
+            request = None
+        name = request.get("service") if isinstance(request, dict) else None
+        text = request.get("text") if isinstance(request, dict) else None
         if name not in SERVICES or self.services is None:
             return False, f"service: got {name!r}, expected one of {', '.join(SERVICES)}"
         return self.services.call(name, text if isinstance(text, str) else None)

@@ -211,7 +211,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
         return OK, lifecycle, values
     level = _LEVELS[state]
     values["solver_failures"] = str(runtime.driver.failed.count)
-    said = [state.value, *failures(runtime)]
+    texts = [state.value, *failures(runtime)]
     others, keeper = ", ".join(runtime.inputs.other_senders()), runtime.wear_keeper
     silent = ", ".join(runtime.inputs.silent())
     troubles = [
@@ -230,8 +230,8 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
     for trouble_level, there, text in troubles:
         if there and text:
             level = max(level, trouble_level)
-            said.append(text)
-    return level, "; ".join(said), values
+            texts.append(text)
+    return level, "; ".join(texts), values
 
 
 def failures(runtime: Runtime) -> list[str]:
@@ -327,14 +327,14 @@ class Health:
             **{f"{topic}_dropped": _refused(getattr(inputs, topic)) for topic in OPTIONAL},
             **{f"{topic}_not_followed": one.ignored for topic, one in inputs.optional.items()},
         }
-        grown = self._grown({**counted, **more}, _TROUBLE)
+        increased = self._grown({**counted, **more}, _TROUBLE)
         if peak > inputs.depth // 2:
-            grown.insert(0, f"input queue at {peak} of {inputs.depth}")
+            increased.insert(0, f"input queue at {peak} of {inputs.depth}")
         if runtime.driver.state in (StreamState.STALE, StreamState.ENDED):
-            grown.insert(0, "excitation stale")
-        if "dropped_unstamped" in grown or "dropped_unsteady" in grown:
-            return ERROR, "; ".join(grown), values
-        return (WARN if grown else OK), "; ".join(grown) or "no trouble since the last report", values
+            increased.insert(0, "excitation stale")
+        if "dropped_unstamped" in increased or "dropped_unsteady" in increased:
+            return ERROR, "; ".join(increased), values
+        return (WARN if increased else OK), "; ".join(increased) or "no trouble since the last report", values
 
     def output(self, runtime: Runtime) -> Part:
         """Return the part `output` about the published messages, their latency and their age."""
@@ -433,9 +433,9 @@ class Health:
         return OK, "recording", values
 
     def _grown(self, now: dict[str, int], keys: Iterable[str]) -> list[str]:
-        grown = [key for key in keys if now[key] > self._before.get(key, 0)]
+        increased = [key for key in keys if now[key] > self._before.get(key, 0)]
         self._before |= now
-        return grown
+        return increased
 
 
 #: Counters of the part `input` that cause a warning when they have grown since the last report.

@@ -15,7 +15,7 @@ from plow_twin.estimate.life import LifeError
 from plow_twin.estimate.measurements import Deviation
 from plow_twin.estimate.result import State
 from plow_twin.estimate.window import Windows
-from plow_twin.estimate.worker import Found, Worker
+from plow_twin.estimate.worker import WindowResult, Worker
 from plow_twin.live.parameters import ESTIMATES, Settings
 from plow_twin.model.scene import Scene
 from plow_twin.record import messages as plain
@@ -36,14 +36,14 @@ class Estimation:
         self._frame_id, self._follows = settings.frame_id, settings.follows != "off"
         span = (settings.estimate_window, settings.estimate_interval, settings.rollback_span)
         windows = Windows(*span, settings.head_pose_deviation, settings.excitation_deviation, settings.gaps_deviation)
-        asked = requests_of(settings)
-        self._start = partial(Worker, scene, windows, asked)
+        requests = requests_of(settings)
+        self._start = partial(Worker, scene, windows, requests)
         self.worker = self._start()
         #: number of times that the process was started again
         self.restarts = 0
         self._proven = self._finishing = False  # whether the process has sent an estimate, and whether the input ended
         self._spread: Deviation | None = None
-        sent = {ESTIMATE: True, WINDOW_FORCES: bool(asked.members), FORECAST: asked.plan is not None}
+        sent = {ESTIMATE: True, WINDOW_FORCES: bool(requests.members), FORECAST: requests.plan is not None}
         self._topics = [topic for topic, wanted in sent.items() if wanted]
         #: stamp [ns] at which the wear of the pads was set; None after empty messages have withdrawn the old estimate
         self._set_ns: int | None = None
@@ -163,7 +163,7 @@ class Estimation:
         self.states = dict.fromkeys(self.states, State.PRIOR)
 
 
-def entry_of(answer: Found, session: Session, before: journal.Estimated | None) -> journal.Estimated:
+def entry_of(answer: WindowResult, session: Session, before: journal.Estimated | None) -> journal.Estimated:
     """Return the journal entry of an estimate.
 
     If a clearance is not observable, its shift is that of the previous estimate `before`. If a clearance is withdrawn,
@@ -184,7 +184,7 @@ def entry_of(answer: Found, session: Session, before: journal.Estimated | None) 
     return journal.Estimated(*bounds, answer.guess, tuple(shift.tolist()), answer.text)
 
 
-def message_of(answer: Found, frame_id: str) -> plain.JointState:
+def message_of(answer: WindowResult, frame_id: str) -> plain.JointState:
     """Return the message of an estimate, with the end of its window as stamp.
 
     The message of a withdrawn estimate has no values.
@@ -199,7 +199,7 @@ def message_of(answer: Found, frame_id: str) -> plain.JointState:
     return plain.JointState(answer.end_ns, frame_id, tuple(names), position=np.array(numbers))
 
 
-def forces_message(answer: Found, frame_id: str) -> plain.JointState:
+def forces_message(answer: WindowResult, frame_id: str) -> plain.JointState:
     """Return the message of the contact forces in a window, in the form of the messages on `contact_peaks`.
 
     If the forces were not computed, the message has no values.
@@ -216,7 +216,7 @@ def forces_message(answer: Found, frame_id: str) -> plain.JointState:
     return plain.JointState(answer.end_ns, frame_id, tuple(names), **numbers)
 
 
-def forecast_message(answer: Found, frame_id: str) -> plain.JointState:
+def forecast_message(answer: WindowResult, frame_id: str) -> plain.JointState:
     """Return the message of a forecast.
 
     It contains the time [s], the distance [m], the passes and the shifts until the wear limit is reached.

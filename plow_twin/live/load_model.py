@@ -58,10 +58,10 @@ class LoadModel:
         The signals are `power` [W], `chain_force` [N], `speed` [m/s], `depth` [m] and `position` [m]. A signal may be
         missing or NaN. The result is None if the signals are not sufficient.
         """
-        known = {name: value for name, value in drive.items() if math.isfinite(value)}
-        if abs(known.get("speed", math.inf)) < SLOWEST_M_S and "chain_force" not in known:
+        signals = {name: value for name, value in drive.items() if math.isfinite(value)}
+        if abs(signals.get("speed", math.inf)) < SLOWEST_M_S and "chain_force" not in signals:
             return 0.0, 0.0
-        opinions = [load for load in (self._by_drive(known), self._by_coal(known)) if load is not None]
+        opinions = [load for load in (self._by_drive(signals), self._by_coal(signals)) if load is not None]
         if not opinions:
             return None
         deviations = [max(deviation, 1.0) for _, deviation in opinions]
@@ -91,26 +91,26 @@ class LoadModel:
         )
         return (fx, fy, x * fy - y * fx), deviations
 
-    def _by_drive(self, known: Mapping[str, float]) -> Number | None:
-        if "chain_force" in known:
-            pull, deviation = known["chain_force"], 0.0
-        elif self.efficiency is not None and "power" in known and abs(known.get("speed", 0.0)) >= SLOWEST_M_S:
-            share = known["power"] / abs(known["speed"])
+    def _by_drive(self, signals: Mapping[str, float]) -> Number | None:
+        if "chain_force" in signals:
+            pull, deviation = signals["chain_force"], 0.0
+        elif self.efficiency is not None and "power" in signals and abs(signals.get("speed", 0.0)) >= SLOWEST_M_S:
+            share = signals["power"] / abs(signals["speed"])
             pull, deviation = self.efficiency[0] * share, self.efficiency[1] * abs(share)
         else:
             return None
         return pull - self.idle_force_n[0], math.hypot(deviation, self.idle_force_n[1])
 
-    def _by_coal(self, known: Mapping[str, float]) -> Number | None:
-        if self.specific_force_n_m is None or "depth" not in known:
+    def _by_coal(self, signals: Mapping[str, float]) -> Number | None:
+        if self.specific_force_n_m is None or "depth" not in signals:
             return None
         factor = 1.0
         if self.resistance is not None:
-            if "position" not in known:
+            if "position" not in signals:
                 return None
-            factor = float(np.interp(known["position"], *self.resistance))
+            factor = float(np.interp(signals["position"], *self.resistance))
         force, deviation = self.specific_force_n_m
-        return force * factor * known["depth"], deviation * factor * abs(known["depth"])
+        return force * factor * signals["depth"], deviation * factor * abs(signals["depth"])
 
 
 def read_load_model(path: Path | None) -> LoadModel | None:
@@ -134,5 +134,5 @@ def read_load_model(path: Path | None) -> LoadModel | None:
     return LoadModel(**values)
 
 
-def _floats(given: list[float]) -> tuple[float, ...]:
-    return tuple(map(float, given))
+def _floats(values: list[float]) -> tuple[float, ...]:
+    return tuple(map(float, values))

@@ -295,8 +295,8 @@ def problems(values: Mapping[str, Any]) -> list[Problem]:
     """Return the problems of parameter values. Unknown names are ignored."""
     from plow_twin.scene_file.validation import validate
 
-    known = {name: _bounded(coerce(name, value)) for name, value in values.items() if name in SPECS}
-    problems_found = validate(known, schema(), "parameters")
+    checked = {name: _bounded(coerce(name, value)) for name, value in values.items() if name in SPECS}
+    problems_found = validate(checked, schema(), "parameters")
     return [Problem(problem.key, values.get(problem.key, problem.got), problem.expected) for problem in problems_found]
 
 
@@ -347,20 +347,18 @@ def settings(values: Mapping[str, Any]) -> Settings:
     return made
 
 
-def services_off(given: Settings) -> frozenset[str]:
+def services_off(settings: Settings) -> frozenset[str]:
     """Return the services that the settings switch off."""
-    return frozenset(name.strip() for name in given.services_off.split(",") if name.strip())
+    return frozenset(name.strip() for name in settings.services_off.split(",") if name.strip())
 
 
-def _unknown_services(given: Settings) -> list[Problem]:
-    unknown_names = sorted(services_off(given) - set(SERVICES))
-    return (
-        [Problem("services_off", ", ".join(unknown_names), f"some of {', '.join(SERVICES)}")] if unknown_names else []
-    )
+def _unknown_services(settings: Settings) -> list[Problem]:
+    unknown_names = sorted(services_off(settings) - set(SERVICES))
+    return [Problem("services_off", ", ".join(unknown_names), f"one of {', '.join(SERVICES)}")] if unknown_names else []
 
 
-def _swapped_thresholds(given: Settings) -> list[Problem]:
-    alarms = {name: getattr(given, name) for name in SPECS if name.startswith("alarm_")}
+def _swapped_thresholds(settings: Settings) -> list[Problem]:
+    alarms = {name: getattr(settings, name) for name in SPECS if name.startswith("alarm_")}
     return [
         Problem(name, list(pair), "the warning's threshold, then the larger one of the error")
         for name, pair in alarms.items()
@@ -375,9 +373,9 @@ def outside(settings: Settings) -> list[Problem]:
     root = Path(settings.file_root).resolve()
     named = {name: getattr(settings, name) for name in FILES}
     return [
-        Problem(name, given, f"a path within file_root, {root}")
-        for name, given in named.items()
-        if _is_path(name, given) and not Path(given).resolve().is_relative_to(root)
+        Problem(name, path, f"a path within file_root, {root}")
+        for name, path in named.items()
+        if _is_path(name, path) and not Path(path).resolve().is_relative_to(root)
     ]
 
 
@@ -393,13 +391,13 @@ def refused_changes(before: Settings, after: Settings) -> list[str]:
     ]
 
 
-def _is_path(name: str, given: str) -> bool:
-    return bool(given) and not (name == "scene" and given in PRESETS)
+def _is_path(name: str, value: str) -> bool:
+    return bool(value) and not (name == "scene" and value in PRESETS)
 
 
-def model_changes(given: Settings) -> dict[str, float]:
+def model_changes(settings: Settings) -> dict[str, float]:
     """Return the numbers that replace numbers of the scene, by their keys in the scene file."""
-    values = {key: getattr(given, name) for name, key in MODEL.items()}
+    values = {key: getattr(settings, name) for name, key in MODEL.items()}
     return {key: value for key, value in values.items() if value != -1.0}
 
 

@@ -75,10 +75,10 @@ class Recording:
 
     def publication(self, published: Published, sent: Mapping[str, bytes]) -> None:
         """Record a publication. `sent` contains the bytes of the sent messages by base name, or is empty."""
-        wanted = self._decimation.select(published)
-        if wanted is not None:
-            self.recorder.publication(wanted, sent if wanted is published else {})
-        if published.rows["marked"][0] and not (sent and wanted is published):
+        selected = self._decimation.select(published)
+        if selected is not None:
+            self.recorder.publication(selected, sent if selected is published else {})
+        if published.rows["marked"][0] and not (sent and selected is published):
             stamp_ns = int(published.rows["stamp_ns"][0])
             for topic, message in publication_messages(published, self._frame_id, "", MARKED).items():
                 self.message(topic, stamp_ns, message)
@@ -93,9 +93,9 @@ class Recording:
             self.recorder.publications(published, self._series)
             return
         for number, sequence in enumerate(self._series.tolist()):
-            wanted = self._decimation.select(published.at(number))
-            if wanted is not None:
-                self.recorder.publications(wanted, np.array([sequence]))
+            selected = self._decimation.select(published.at(number))
+            if selected is not None:
+                self.recorder.publications(selected, np.array([sequence]))
 
     def message(self, topic: str, stamp_ns: int, message: Message) -> None:
         """Record a message that does not belong to a publication. `topic` is the base name of its topic."""
@@ -108,10 +108,10 @@ class Recording:
 
     def renew(self, session: Session) -> bool:
         """Write a snapshot to the journal if the recorder needs a snapshot; return whether a snapshot was written."""
-        wanted = self.recorder.snapshot_wanted
-        if wanted:
+        snapshot_due = self.recorder.snapshot_wanted
+        if snapshot_due:
             self.recorder.journal(session.renew())
-        return wanted
+        return snapshot_due
 
 
 class Decimation:
@@ -125,7 +125,7 @@ class Decimation:
     def __init__(self, outputs: str, rate_hz: float) -> None:
         self._outputs = outputs
         self._span_ns = max(1, round(1e9 / rate_hz))
-        self._kept: int | None = None
+        self._last_span: int | None = None
         self._impulse = np.zeros(PAIR_COUNT)
         self._peak = np.zeros(PAIR_COUNT)
 
@@ -144,9 +144,9 @@ class Decimation:
         self._impulse += rows["impulse"][0]
         np.maximum(self._peak, rows["peak"][0], out=self._peak)
         span = int(rows["stamp_ns"][0]) // self._span_ns
-        if span == self._kept and not len(slow):
+        if span == self._last_span and not len(slow):
             return None
-        self._kept, rows = span, rows.copy()
+        self._last_span, rows = span, rows.copy()
         rows["impulse"], rows["peak"] = self._impulse, self._peak
         self._impulse[:] = 0.0
         self._peak[:] = 0.0

@@ -89,7 +89,7 @@ class Runtime:
         #: whether the journal is not open, because the time is unknown; services are refused in this state
         self.waits_for_clock = True
         self._early: list[Arrival] = []
-        self._seen: tuple[Any, ...] = ()
+        self._last_condition: tuple[Any, ...] = ()
         self.wear_keeper: WearKeeper | None = None
         self.identity = scene_identity(self.scene)
         kept = kept_wear.get(self.identity)
@@ -495,9 +495,9 @@ class Runtime:
             while count and self._behind:
                 time.sleep(_CATCH_UP_S)
                 count -= 1
-        seen = (self.driver.state, tuple(self.inputs.other_senders()), self.unsteady)
-        if seen != self._seen:
-            self._seen = seen
+        condition = (self.driver.state, tuple(self.inputs.other_senders()), self.unsteady)
+        if condition != self._last_condition:
+            self._last_condition = condition
             self._front.changed()
 
     @property

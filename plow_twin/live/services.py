@@ -20,7 +20,7 @@ class Services:
 
     def __init__(self, runtime: Runtime, changed: Callable[[], None]) -> None:
         self._runtime, self._changed = runtime, changed
-        self._kept: Snapshot | None = None
+        self._snapshot: Snapshot | None = None
 
     def call(self, name: str, text: str | None = None) -> tuple[bool, str]:
         """Call the service `name`, unless the parameter `services_off` contains it; `text` is the text of a mark."""
@@ -46,28 +46,28 @@ class Services:
 
     def snapshot(self) -> tuple[bool, str]:
         """Write the exact state to the journal, and store it for the service `restore`."""
-        self._kept = self._runtime.driver.snapshot()
-        return True, f"the state at {self._kept.stamp_ns} ns is stored, and written to the journal"
+        self._snapshot = self._runtime.driver.snapshot()
+        return True, f"the state at {self._snapshot.stamp_ns} ns is stored, and written to the journal"
 
     def restore(self) -> tuple[bool, str]:
         """Restore the motion from the stored snapshot."""
-        if self._kept is None:
+        if self._snapshot is None:
             return False, "no snapshot has been taken since configure"
-        self._runtime.driver.restore(self._runtime.stamp_ns, self._kept)
+        self._runtime.driver.restore(self._runtime.stamp_ns, self._snapshot)
         self._changed()
         return (
             True,
-            f"the motion at {self._kept.stamp_ns} ns is restored, the wear is not; the next sample continues it",
+            f"the motion at {self._snapshot.stamp_ns} ns is restored, the wear is not; the next sample continues it",
         )
 
     def acknowledge_alarms(self) -> tuple[bool, str]:
         """Release the latched alarms."""
         alarms = self._runtime.alarms
-        left = alarms.acknowledge()
+        active = alarms.acknowledge()
         self._runtime.driver.session.apply(Parameter(ACKNOWLEDGED, self._runtime.stamp_ns))
         self._runtime.send_alarms()
         values = dict(alarms_message(alarms, "", "").values)
-        return True, f"still active: {'; '.join(alarm_texts(values, newest=True))}" if left else "no alarm is active"
+        return True, f"still active: {'; '.join(alarm_texts(values, newest=True))}" if active else "no alarm is active"
 
     def forecast(self) -> tuple[bool, str]:
         """Return the last forecast as JSON."""

@@ -26,7 +26,7 @@ class ToolForces:
             for load in scene.loads
             if isinstance(load, Harmonic | Constant) and np.any(load_direction(load))
         }
-        self._known = frozenset(load.name for load in scene.loads)
+        self._load_names = frozenset(load.name for load in scene.loads)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -41,7 +41,7 @@ class ToolForces:
         named = set(names)
         if len(efforts) != len(names) or len(named) != len(names):
             return None
-        if not self._directions.keys() <= named <= self._known:
+        if not self._directions.keys() <= named <= self._load_names:
             return None
         total = np.zeros(3)
         for name, effort in zip(names, efforts, strict=True):

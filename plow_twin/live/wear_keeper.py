@@ -51,7 +51,7 @@ class WearKeeper:
         self._claim: int | None = claim_folder(folder)
         self._identity = scene_identity(scene)
         self._saved: tuple[float, ...] | None = None
-        self._own: tuple[bytes, ...] = ()  # contents that the file may have after the last read or write
+        self._own_contents: tuple[bytes, ...] = ()  # contents that the file may have after the last read or write
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="wear")
         self._writing: Future[None] | None = None
         #: reason why the last attempt to save the wear failed; empty after a success
@@ -65,13 +65,13 @@ class WearKeeper:
         """
         stored = read_wear(self.folder)
         if stored is not None:
-            self._own = (stored,)
+            self._own_contents = (stored,)
             self._saved = parse_wear(stored, self.folder / FILE_NAME, self._head, self._scene)
         return kept.depth_m if kept is not None and stored in (None, *kept.older_files) else self._saved
 
     def kept(self, depth: NDArray[np.float64]) -> KeptWear:
         """Return the wear depths [m] for the next runtime of the process. `close` must be called before."""
-        return KeptWear(tuple(depth.tolist()), self._own if self.error else ())
+        return KeptWear(tuple(depth.tolist()), self._own_contents if self.error else ())
 
     def save(self, depth: NDArray[np.float64]) -> None:
         """Begin to save wear depths [m] in the thread, unless the same depths are already saved."""
@@ -102,16 +102,16 @@ class WearKeeper:
                 self.release()
                 self._claim = claim_folder(self.folder)
             stored = read_wear(self.folder)
-            if stored not in (None, *self._own):
+            if stored not in (None, *self._own_contents):
                 raise WearStateError(
                     f"{self.folder / FILE_NAME} is not the file that this twin has read or written and is left as it "
                     "is: clean up and configure to continue with its wear, or move it away to save the wear of "
                     "this twin"
                 )
             content = wear_content(self._head, self._identity, values)
-            self._own = (content,) if stored is None else (stored, content)
+            self._own_contents = (content,) if stored is None else (stored, content)
             save_wear(self.folder, content)
-            self._own = (content,)
+            self._own_contents = (content,)
         except (OSError, WearStateError) as error:
             self.error = f"{self.folder}: wear not saved: {error}"
         else:

@@ -608,20 +608,20 @@ def check_travel_speed(scene: Scene, speed_m_s: float) -> None:
 
 def _check_contact(contact: Contact) -> Iterator[Problem]:
     law = LAWS[contact.law]
-    given = {"damping": contact.damping, "restitution": contact.restitution}
-    names = [name for name, value in given.items() if value is not None]
+    values = {"damping": contact.damping, "restitution": contact.restitution}
+    names = [name for name, value in values.items() if value is not None]
     allowed = [
         name for name, possible in (("damping", law.takes_damping), ("restitution", law.takes_restitution)) if possible
     ]
     if len(names) > 1:
-        yield Problem("contact", given, "either damping or restitution, not both")
+        yield Problem("contact", values, "either damping or restitution, not both")
     for name in names:
         if name not in allowed:
             yield Problem(
-                f"contact.{name}", given[name], f"{' or '.join(allowed) or 'no damping at all'} for {contact.law}"
+                f"contact.{name}", values[name], f"{' or '.join(allowed) or 'no damping at all'} for {contact.law}"
             )
     if allowed and not names:
-        yield Problem("contact", given, f"{' or '.join(allowed)} for {contact.law}")
+        yield Problem("contact", values, f"{' or '.join(allowed)} for {contact.law}")
     yield from _check_fall(contact)
     if law.exponent is not None and contact.exponent != law.exponent:
         yield Problem("contact.exponent", contact.exponent, f"{law.exponent:g} for {contact.law}")
@@ -640,8 +640,8 @@ def _check_fall(contact: Contact) -> Iterator[Problem]:
                 yield Problem(f"contact.{name}", getattr(contact, name), "nothing without contact.restitution")
         return
     if (contact.restitution_fall is None) != (contact.restitution_speed_m_s is None):
-        given = {name: getattr(contact, name) for name in ("restitution_fall", "restitution_speed_m_s")}
-        yield Problem("contact", given, "both or neither")
+        values = {name: getattr(contact, name) for name in ("restitution_fall", "restitution_speed_m_s")}
+        yield Problem("contact", values, "both or neither")
     if contact.restitution_fall is None and contact.restitution_mass_power is not None:
         expected = "nothing without contact.restitution_fall"
         yield Problem("contact.restitution_mass_power", contact.restitution_mass_power, expected)

@@ -109,10 +109,10 @@ def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: M
     for name, column in columns.items():
         if column not in guess.names:
             raise RecordingError(f"column of {name}: got {column!r}, expected one of {', '.join(guess.names)}")
-    known = {key[1]: key for key in _NAMES}
-    unknown = [name for name in (*columns, *units) if name not in known and name != "t"]
+    quantities = {key[1]: key for key in _NAMES}
+    unknown = [name for name in (*columns, *units) if name not in quantities and name != "t"]
     if unknown:
-        raise UnitError(f"column or unit of {unknown[0]}: expected one of t, {', '.join(known)}")
+        raise UnitError(f"column or unit of {unknown[0]}: expected one of t, {', '.join(quantities)}")
     numbers = {
         name: np.array([_number(row[index]) for row in rows])
         for index, name in enumerate(guess.names)
@@ -136,11 +136,11 @@ def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: M
             )
         if missing := int(np.isnan(numbers[column]).sum()):
             guess.because[name] += f"; {missing} of {len(cells)} cells have no number"
-    left = [name for name in guess.names if name not in guess.columns.values() and name != guess.time]
+    undecided = [name for name in guess.names if name not in guess.columns.values() and name != guess.time]
     for _, name in _NEEDED:
         if ("excitation", name) not in guess.columns:
-            guess.open.setdefault(name, tuple(name for name in left if np.isfinite(numbers[name]).any()))
-    guess.open = {name: choices for name, choices in guess.open.items() if name == "t" or known[name] in _NEEDED}
+            guess.open.setdefault(name, tuple(name for name in undecided if np.isfinite(numbers[name]).any()))
+    guess.open = {name: choices for name, choices in guess.open.items() if name == "t" or quantities[name] in _NEEDED}
     _find_units(guess, numbers, scene, units)
     return guess
 
@@ -204,16 +204,16 @@ def _find_time(
         guess.because["t"] += "; its unit by the rate of the samples"
 
 
-def _find_units(guess: Guess, numbers: Mapping[str, Array], scene: Scene, given: Mapping[str, str]) -> None:
+def _find_units(guess: Guess, numbers: Mapping[str, Array], scene: Scene, units: Mapping[str, str]) -> None:
     for key, column in guess.columns.items():
-        unit = given.get(key[1]) or _unit_of(column)
-        known = UNITS[QUANTITIES[key]]
-        if given.get(key[1]) and unit not in known:
-            raise UnitError(f"unit of {key[1]}: got {unit!r}, expected one of {', '.join(known)}")
-        if unit in known:
+        unit = units.get(key[1]) or _unit_of(column)
+        units_of_quantity = UNITS[QUANTITIES[key]]
+        if units.get(key[1]) and unit not in units_of_quantity:
+            raise UnitError(f"unit of {key[1]}: got {unit!r}, expected one of {', '.join(units_of_quantity)}")
+        if unit in units_of_quantity:
             guess.units[key[1]] = unit
-            guess.because[key[1]] += f", {unit} as stated" if key[1] in given else f", {unit} in its name"
-        guess.values[key] = numbers[column] * known.get(unit or "", 1.0)
+            guess.because[key[1]] += f", {unit} as stated" if key[1] in units else f", {unit} in its name"
+        guess.values[key] = numbers[column] * units_of_quantity.get(unit or "", 1.0)
     stated = set(guess.units)
     for doubt in unit_doubts(guess.values, guess.stamps_s[np.isfinite(guess.stamps_s)], scene):
         if doubt.advice:

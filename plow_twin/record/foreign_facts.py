@@ -13,7 +13,7 @@ from plow_twin.record.sources import open_source
 
 
 @dataclass
-class _Seen:
+class _SignalStatistics:
     """Statistics of the messages of one role. The ranges are those of the `used` messages, which fit the role."""
 
     used: int = 0
@@ -70,14 +70,14 @@ def foreign_facts(path: Path, mapping: Path | None, units: Mapping[str, str]) ->
     source = open_source(path)
     topics = source.topics()
     roles = with_units(read_map(mapping, topics), units)
-    seen = {name: _Seen() for name in roles}
+    signals = {name: _SignalStatistics() for name in roles}
     for name, _, reading in readings(messages_of(source, roles), roles):
-        seen[name].add(reading)
+        signals[name].add(reading)
     lost = {key: count for key, count in source.losses.counts.items() if count}
     facts = {
         "file": str(path),
         "topics": {topic: str(kind) for topic, kind in topics.items()},
-        "roles": {name: seen_signal.facts(roles[name].topic) for name, seen_signal in seen.items()},
+        "roles": {name: seen_signal.facts(roles[name].topic) for name, seen_signal in signals.items()},
         "lost": lost,
     }
-    return facts, bool(lost) or any(signal.unfit for signal in seen.values())
+    return facts, bool(lost) or any(signal.unfit for signal in signals.values())

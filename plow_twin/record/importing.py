@@ -64,9 +64,10 @@ class Feed:
         if not self.intake.used:
             topic = self.roles["excitation"].topic if "excitation" in self.roles else "none"
             refused = ", ".join(f"{verdict.value} {count}" for verdict, count in self.intake.counts.items() if count)
-            why = "".join(f"; {why}" for why in self.unfit if why.startswith("excitation: "))
+            reason = "".join(f"; {text}" for text in self.unfit if text.startswith("excitation: "))
             raise RecordingError(
-                f"excitation: got no usable sample (topic {topic}: {refused or 'no message'}{why}), expected some"
+                f"excitation: got no usable sample (topic {topic}: {refused or 'no message'}{reason}), "
+                "expected at least one"
             )
         for walker in self.walkers:
             walker.close()

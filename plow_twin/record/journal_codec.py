@@ -125,8 +125,8 @@ def _from_json(text: str, source: str) -> journal.Entry | Dropped:
     try:
         values = json.loads(text, parse_constant=_no_number)
         kind = values["kind"]
-        given = [read(values[name]) for name, read in _FIELDS[kind] if name in values or name not in _OPTIONAL]
-        entry: journal.Entry | Dropped = _KINDS[kind](*given)
+        fields = [read(values[name]) for name, read in _FIELDS[kind] if name in values or name not in _OPTIONAL]
+        entry: journal.Entry | Dropped = _KINDS[kind](*fields)
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise RecordingError(f"{source}: got {text[:120]!r}, expected an entry of the journal ({error!r})") from error
     return entry

@@ -84,13 +84,13 @@ def read_map_file(path: Path) -> dict[str, Any]:
     A role may state one scale, offset, unit or limit for all its quantities. In the result, the value is repeated for
     each quantity. Raise `MapError` if the file cannot be read or is invalid.
     """
-    given, problems = read_yaml(path, "mapping", ", ".join(ROLES))
-    if isinstance(given, dict):
-        given = {role: _nodes_as_fields(role, _for_each(role, entry)) for role, entry in given.items()}
-    problems = problems or validate(given, map_schema(), "mapping")
+    document, problems = read_yaml(path, "mapping", ", ".join(ROLES))
+    if isinstance(document, dict):
+        document = {role: _nodes_as_fields(role, _for_each(role, entry)) for role, entry in document.items()}
+    problems = problems or validate(document, map_schema(), "mapping")
     if problems:
         raise MapError(problems, str(path))
-    checked: dict[str, Any] = given
+    checked: dict[str, Any] = document
     return checked
 
 

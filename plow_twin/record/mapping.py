@@ -321,8 +321,8 @@ def read_map(path: Path | None, topics: Mapping[str, TopicType] | None) -> dict[
     if path is None:
         topics = topics or {}
         return {role: guess for role in _NAMES if (guess := _guess(role, topics)) is not None}
-    given = read_map_file(path)
-    return {role: _role(path, role, entry, topics) for role, entry in given.items() if role != LOAD_MODEL}
+    document = read_map_file(path)
+    return {role: _role(path, role, entry, topics) for role, entry in document.items() if role != LOAD_MODEL}
 
 
 def _role(path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str, TopicType] | None) -> Role:
@@ -341,7 +341,7 @@ def _role(path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str, 
         entry.get("offset", {}),
         str(entry.get("stamp", "header")),
         {name: UNITS[QUANTITIES[role, name]][unit] for name, unit in units.items()},
-        {name: _limits(path, f"{role}.limits.{name}", given) for name, given in entry.get("limits", {}).items()},
+        {name: _limits(path, f"{role}.limits.{name}", limit) for name, limit in entry.get("limits", {}).items()},
         entry.get("stamp_unit", "s"),
         round(entry.get("clock_offset", 0.0) * 1e9),
         str(entry.get("sequence", "")),
@@ -388,17 +388,17 @@ def with_units(roles: Mapping[str, Role], units: Mapping[str, str]) -> dict[str,
             there = sorted({field for role in roles.values() for field in role.fields} | {"t"})
             raise UnitError(f"unit of {name}: got an unknown name, expected one of {', '.join(there)}")
         for key in having:
-            known = UNITS[QUANTITIES[key, name]]
-            if unit not in known:
-                raise UnitError(f"unit of {name}: got {unit!r}, expected one of {', '.join(known)}")
-            changed[key] = replace(changed[key], factor={**changed[key].factor, name: known[unit]})
+            factors = UNITS[QUANTITIES[key, name]]
+            if unit not in factors:
+                raise UnitError(f"unit of {name}: got {unit!r}, expected one of {', '.join(factors)}")
+            changed[key] = replace(changed[key], factor={**changed[key].factor, name: factors[unit]})
     return changed
 
 
-def _limits(path: Path, key: str, given: float | list[float]) -> tuple[float, float]:
-    low, high = given if isinstance(given, list) else (-given, given)
+def _limits(path: Path, key: str, limits: float | list[float]) -> tuple[float, float]:
+    low, high = limits if isinstance(limits, list) else (-limits, limits)
     if not low < high:
-        raise map_error(path, key, given, "the smallest number, then the largest")
+        raise map_error(path, key, limits, "the smallest number, then the largest")
     return float(low), float(high)
 
 
@@ -416,15 +416,15 @@ def _check_columns(path: Path, name: str, role: Role) -> None:
 
 
 def _check_stamp_unit(path: Path, name: str, role: Role) -> None:
-    kind, why = role.message_type, ""
+    kind, reason = role.message_type, ""
     if role.stamp == "log":
-        why = "none with stamp: log"
+        reason = "none with stamp: log"
     elif role.stamp == "header" and isinstance(kind, Columns) and not set(TIMES) & set(kind.names):
-        why = f"also a stamp with the name of its column: the {kind} have none of {', '.join(TIMES)}"
+        reason = f"also a stamp with the name of its column: the {kind} have none of {', '.join(TIMES)}"
     elif role.stamp == "header" and not isinstance(kind, Columns) and kind != "json":
-        why = f"none: {kind} has stamps in ns"
-    if why:
-        raise map_error(path, f"{name}.stamp_unit", role.stamp_unit, why)
+        reason = f"none: {kind} has stamps in ns"
+    if reason:
+        raise map_error(path, f"{name}.stamp_unit", role.stamp_unit, reason)
 
 
 def _topic(

@@ -175,31 +175,31 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
         if scene is None and not file.is_file():
             raise RecordingError(f"{path}: not a run of plow_twin: a scene is needed, expected --scene or {file}")
         model = load_scene(scene_path(str(file)))
-        rows, begins, lost, why = _collect([path], mapping, ("excitation", "head_pose", "gaps", "forces"), "")
+        rows, begins, lost, reason = _collect([path], mapping, ("excitation", "head_pose", "gaps", "forces"), "")
         loads, gaps, gaps_deviation = rows["excitation"], rows["gaps"], 0.0
     else:
-        given = scene is not None
-        model = load_scene(scene_path(str(scene))) if given else own.header.scene(own.path)
+        other_scene = scene is not None
+        model = load_scene(scene_path(str(scene))) if other_scene else own.header.scene(own.path)
         lost = Counter[str]()
         loads, begins, journalled, gaps, spread, brought = _journal(own, lost)
         gaps_deviation = float(own.header.parameters.get("gaps_deviation", 0.0))
         of_poses, of_load = stated(own.header.parameters)
         journalled[:, 1:], of_poses = believed(of_poses, journalled[:, 1:], brought)
         deviations = of_poses, tuple(np.maximum(of_load, spread).tolist())
-        rows, why = {"head_pose": journalled}, ""
+        rows, reason = {"head_pose": journalled}, ""
         if mapping is not None or not (len(journalled) or len(gaps)):
             folder = path if path.is_dir() else path.parent
             places = [folder, *readable_beside(folder, lost)]
-            rows, _, unread, why = _collect(places, mapping, ("head_pose", "forces"), own.header.node)
+            rows, _, unread, reason = _collect(places, mapping, ("head_pose", "forces"), own.header.node)
             unread.pop("missing_parts", 0)  # missing parts are counted below, in `own.lost_parts`
             lost.update(unread)
         lost.update(own.lost, damaged_chunks=own.damaged_chunks, **own.lost_parts)
     poses = rows["head_pose"]
     measured = len(poses) + len(gaps)
     # a load that does not fit its role is an error of the mapping
-    for name, found in (("load", len(loads) or (measured and not why)), ("measured pose", measured)):
+    for name, found in (("load", len(loads) or (measured and not reason)), ("measured pose", measured)):
         if not found:
-            raise RecordingError(f"{path}: got no {name}, expected some{why}")
+            raise RecordingError(f"{path}: got no {name}, expected at least one row{reason}")
     origin, count = next(table[0, 0] for table in (loads, poses, gaps) if len(table)), len(loads)
     loads = _longest(loads, begins)
     lost["samples_of_other_stretches"] = count - len(loads)
@@ -259,17 +259,17 @@ def _longest(rows: Array, begins: list[int]) -> Array:
 
 
 def _collect(
-    places: list[Path], mapping: Path | None, wanted: tuple[str, ...], node: str
+    places: list[Path], mapping: Path | None, role_names: tuple[str, ...], node: str
 ) -> tuple[dict[str, Array], list[int], Counter[str], str]:
     """Return the messages of the wanted roles in several recordings.
 
     The results are the stamps [ns] and values of the messages of each role, the rows of the load before which messages
     are missing, the losses by reason, and, for an error message, the reasons why messages do not fit their roles.
     """
-    rows = {name: _Rows(1 + len(ROLES[name])) for name in wanted}
+    rows = {name: _Rows(1 + len(ROLES[name])) for name in role_names}
     lost, begins = Counter[str](), list[int]()
     for source, roles in roles_by_source([*map(open_source, places)], mapping, f"{node}/" if node else ""):
-        roles = {name: role for name, role in roles.items() if name in wanted}
+        roles = {name: role for name, role in roles.items() if name in role_names}
         for name, arrived, found in readings(messages_of(source, roles), roles):
             if arrived.after_hole:
                 begins.append(rows["excitation"].came if "excitation" in rows else 0)
@@ -282,7 +282,12 @@ def _collect(
     tables = {name: _counted(found, lost) for name, found in rows.items()}
     if "excitation" in rows:
         begins = [row - rows["excitation"].dropped for row in begins]
-    return tables, begins, lost, "".join(f"; {why.removeprefix(UNFIT)}" for why in lost if why.startswith(UNFIT))
+    return (
+        tables,
+        begins,
+        lost,
+        "".join(f"; {reason.removeprefix(UNFIT)}" for reason in lost if reason.startswith(UNFIT)),
+    )
 
 
 def _read(path: Path, lost: Counter[str], columns: tuple[str, ...], some: tuple[str, ...] = ()) -> Array:

@@ -139,11 +139,13 @@ class RunReader:
         if not self._place.is_dir():
             return 0
         there = {self.number(file) for file in self.parts}
-        known = sorted(self._headers[file].part for file in self.parts if file in self._headers)
-        between = known[-1] - known[0] + 1 - len({number for number in there if known[0] <= number <= known[-1]})
+        numbers = sorted(self._headers[file].part for file in self.parts if file in self._headers)
+        between = (
+            numbers[-1] - numbers[0] + 1 - len({number for number in there if numbers[0] <= number <= numbers[-1]})
+        )
         missing = missing_files(self._place, {file.name for file in self.foreign})
         named = {part_number(Path(name))[0] for name in missing} - there
-        return between + sum(number >= 0 and not known[0] < number < known[-1] for number in named)
+        return between + sum(number >= 0 and not numbers[0] < number < numbers[-1] for number in named)
 
     @property
     def lost(self) -> dict[str, int]:
@@ -230,12 +232,12 @@ class RunReader:
     def _parts_to_read(self) -> Iterator[Path]:
         """Yield the parts in order. With a tail, parts that the recorder starts during the iteration are included."""
         done: list[Path] = []
-        while left := [part for part in self.parts if part not in done]:
-            done.append(left[0])
-            if left[0].exists():
-                yield left[0]
+        while unread := [part for part in self.parts if part not in done]:
+            done.append(unread[0])
+            if unread[0].exists():
+                yield unread[0]
             elif len(self.parts) > 1:  # the recorder has removed this part
-                self.parts.remove(left[0])
+                self.parts.remove(unread[0])
             if self.tail is not None and not self.tail.stopped:
                 self._look_for_parts()
 
@@ -252,13 +254,13 @@ class RunReader:
 
         If a part has no index, the time is estimated from the size of the files.
         """
-        first_ns, last_ns, known = self._received_ns()
-        return float(last_ns - first_ns) * 1e-9 if known else self.size() / _BYTES_PER_S
+        first_ns, last_ns, has_messages = self._received_ns()
+        return float(last_ns - first_ns) * 1e-9 if has_messages else self.size() / _BYTES_PER_S
 
     def began_ns(self) -> int | None:
         """Return the first receive time [ns], or None if a part has no index."""
-        first_ns, _, known = self._received_ns()
-        return first_ns if known else None
+        first_ns, _, has_messages = self._received_ns()
+        return first_ns if has_messages else None
 
     def _received_ns(self) -> tuple[int, int, bool]:
         from mcap.reader import make_reader
@@ -410,9 +412,9 @@ class _Merger:
 
 
 def _of(messages: Messages, channels: list[int]) -> Messages:
-    wanted = np.zeros(int(messages.channel.max(initial=0)) + 1, bool)
-    wanted[channels] = True
-    chosen = wanted[messages.channel]
+    selected = np.zeros(int(messages.channel.max(initial=0)) + 1, bool)
+    selected[channels] = True
+    chosen = selected[messages.channel]
     return messages if chosen.all() else messages[np.flatnonzero(chosen)]
 
 

@@ -152,15 +152,15 @@ class Recording:
         RecordingError
             A file cannot be read.
         """
-        wanted = names or self.names
+        chosen = names or self.names
         templates = publication_templates(self.header.frame_id, self.header.child_frame_id)
-        sent = [name for name in wanted if name in templates]
+        sent = [name for name in chosen if name in templates]
         topics = {self.header.topic(name): name for name in sent}
         for batch in self._read(outputs=bool(sent)):
             batched: dict[str, Batched] = {}
-            if "excitation" in wanted and batch.entries.sample.any():
+            if "excitation" in chosen and batch.entries.sample.any():
                 batched["excitation"] = Batched(*batch.entries.samples())
-            if "head_pose" in wanted and (poses := _poses(batch)) is not None:
+            if "head_pose" in chosen and (poses := _poses(batch)) is not None:
                 batched["head_pose"] = poses
             if sent:
                 rows = rows_by_topic(batch.outputs, topics, templates)

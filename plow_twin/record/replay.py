@@ -233,12 +233,12 @@ class _Replay:
 
     def _compare_alarms(self, batch: Batch) -> None:
         topic = self.header.topic(ALARMS)
-        said = []
+        recorded = []
         for part in batch.outputs:
             channels = [channel for channel, (name, _) in part.topics.items() if name == topic]
             places = np.flatnonzero(np.isin(part.messages.channel, channels)).tolist() if channels else []
-            said += [(int(part.sequence[place]), part.record(place)) for place in places]
-        for _, record in sorted(said, key=lambda found: found[0]):
+            recorded += [(int(part.sequence[place]), part.record(place)) for place in places]
+        for _, record in sorted(recorded, key=lambda found: found[0]):
             self.alarms.recorded(record)
         for difference in self.alarms.differences():
             self._note(Divergence(*difference))
@@ -357,9 +357,11 @@ class _Replay:
         ]
         self.alarms.published(computed.first_sequence & _SEQUENCE_MASK, first_step + computed.taken, published, poses)
         compared = self.outputs_synced | ~_IS_CUMULATIVE
-        for name, count, known in zip(PUBLICATION_TOPICS, computed.counts.tolist(), compared.tolist(), strict=True):
+        for name, count, comparable in zip(
+            PUBLICATION_TOPICS, computed.counts.tolist(), compared.tolist(), strict=True
+        ):
             if count or name not in FOLLOWED_TOPICS:
-                (self.report.compared if known else self.report.not_compared)[name] += count
+                (self.report.compared if comparable else self.report.not_compared)[name] += count
         computed.expect(published, self.templates, compared)
         differences, begin = [], span[0]
         for messages, from_, to in sent.pieces(*span):

@@ -38,7 +38,7 @@ class RingWriter(RunWriter):
         sync_dumps: bool = False,
     ) -> None:
         self._ring_s, self._sync_dumps = ring_s, sync_dumps
-        self._kept: list[tuple[float, PartFacts, bytes]] = []  # start [s], description and content of each part
+        self._finished: list[tuple[float, PartFacts, bytes]] = []  # start [s], description and content of each part
         self._begun = time.monotonic()
         super().__init__(folder, header, chunk_size, min_free_bytes)
         self.path = folder
@@ -52,7 +52,7 @@ class RingWriter(RunWriter):
     @property
     def bytes_written(self) -> int:
         """Size of the parts in memory [B]."""
-        return sum(len(content) for _, _, content in self._kept) + self.part_bytes
+        return sum(len(content) for _, _, content in self._finished) + self.part_bytes
 
     def shortage(self) -> str | None:
         """Return None, because a ring uses no disk space."""
@@ -63,10 +63,10 @@ class RingWriter(RunWriter):
         old = self._part
         super().split(loss, 0)
         assert isinstance(old.file.out, MemoryFile)
-        self._kept.append((self._begun, self._done.pop(), bytes(old.file.out.content)))
+        self._finished.append((self._begun, self._done.pop(), bytes(old.file.out.content)))
         self._bytes_before, self._begun = 0, time.monotonic()
-        while len(self._kept) > 1 and self._kept[1][0] <= self._begun - self._ring_s:
-            self._kept.pop(0)
+        while len(self._finished) > 1 and self._finished[1][0] <= self._begun - self._ring_s:
+            self._finished.pop(0)
 
     def dump(self, folder: Path, loss: Mapping[str, int]) -> None:
         """Write all completed parts to a new folder, and remove them from memory.
@@ -81,14 +81,14 @@ class RingWriter(RunWriter):
             undone.pop_all()
         if self._sync_dumps:
             sync_path(folder.parent)
-        self._kept = []
+        self._finished = []
 
     def _dump(self, folder: Path, loss: Mapping[str, int], undone: ExitStack) -> None:
         """Write the parts to a folder, and register the removal of each file with `undone`."""
         if (short := shortage(folder, self._min_free_bytes)) is not None:
             raise RecordingError(short)
         facts = []
-        for _, part, content in self._kept:
+        for _, part, content in self._finished:
             name = f"{folder.name}_{part.name.rpartition('_')[2]}"
             try:
                 with (folder / name).open("xb") as stream:
@@ -105,7 +105,7 @@ class RingWriter(RunWriter):
 
     def close(self, loss: Mapping[str, int], stop_reason: str | None = None) -> None:
         """Remove all parts from memory."""
-        self._kept = []
+        self._finished = []
 
 
 def _remove(folder: Path) -> None:

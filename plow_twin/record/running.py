@@ -19,7 +19,7 @@ def find_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False
     """
     run = running_run(path, wait_s, stop)
     if run is None and not path.exists():
-        raise RecordingError(f"{path}: got no recording within {wait_s:g} s, expected one that is being written")
+        raise RecordingError(f"{path}: got no recording within {wait_s:g} s, expected a recording in progress")
     return run or path
 
 

@@ -234,7 +234,7 @@ class McapSource:
                 hole = True
                 continue
             reader = ChunkReader(part)
-            known: dict[int, bool] = {}
+            is_chosen: dict[int, bool] = {}
             damaged = 0
             for messages in reader:
                 hole, damaged = hole or reader.damaged > damaged, reader.damaged
@@ -243,9 +243,9 @@ class McapSource:
                     if channel is None:
                         self.losses.counts["undeclared"] += 1
                         continue
-                    if number not in known:
-                        known[number] = wanted(channel.topic) and decoder.reads(channel)
-                    if not known[number]:
+                    if number not in is_chosen:
+                        is_chosen[number] = wanted(channel.topic) and decoder.reads(channel)
+                    if not is_chosen[number]:
                         continue
                     content = decoder.decode(messages.data(index), channel.message_type)
                     if content is not None:
@@ -300,8 +300,8 @@ class SqliteSource:
             with self._reading(part) as (_, topics):
                 types |= {name: kind for _, name, kind in topics}
         if len(self._damaged) == len(self.parts):
-            part, why = next(iter(self._damaged.items()))
-            raise RecordingError(f"{part}: not a recording of rosbag2: {why}")
+            part, reason = next(iter(self._damaged.items()))
+            raise RecordingError(f"{part}: not a recording of rosbag2: {reason}")
         return types
 
     @contextmanager

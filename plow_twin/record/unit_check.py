@@ -108,7 +108,7 @@ def small_thresholds(thresholds: Sequence[float], scene: Scene) -> str:
     small = [threshold for threshold in thresholds if 0.0 < threshold < _IDLE_SHARE * usual]
     if not small:
         return ""
-    return f"alarm_force: got {small[0]:g} N, expected some {usual:.2g} N as in the scene; is it in kN?"
+    return f"alarm_force: got {small[0]:g} N, expected about {usual:.2g} N as in the scene; is it in kN?"
 
 
 def large_loads(values: Mapping[tuple[str, str], Array], units: Mapping[str, str], scene: Scene) -> dict[str, str]:
@@ -124,10 +124,10 @@ def large_loads(values: Mapping[tuple[str, str], Array], units: Mapping[str, str
         largest = _usual_magnitude(values.get(key, np.zeros(0)))
         if not 0.0 < most < largest:
             continue
-        known = UNITS[QUANTITIES[key]]
-        si = next(iter(known))
-        raw = largest / known[units.get(name, si)]
-        likely = next((unit for unit, factor in reversed(known.items()) if raw * factor <= most), "")
+        factors = UNITS[QUANTITIES[key]]
+        si = next(iter(factors))
+        raw = largest / factors[units.get(name, si)]
+        likely = next((unit for unit, factor in reversed(factors.items()) if raw * factor <= most), "")
         remedy = f"state the unit: --unit {name}={likely.replace(' ', '')}" if likely else "is it this machine's scene?"
         expected = f"at most {most:.2g} {si}, ten times the scene's"
         messages[name] = f"{name}: got {largest:.3g} {si}, expected {expected}: {remedy}"
@@ -182,8 +182,8 @@ def _stated(doubt: UnitDoubt, roles: Mapping[str, Role]) -> bool:
 
 def _usual_magnitude(values: Array, percent: float = 99.0) -> float:
     """Return a percentile of the magnitudes; unlike the maximum, it does not depend on outliers."""
-    known = np.abs(values)[np.isfinite(values)]
-    return float(np.percentile(known, percent)) if known.size else 0.0
+    magnitudes = np.abs(values)[np.isfinite(values)]
+    return float(np.percentile(magnitudes, percent)) if magnitudes.size else 0.0
 
 
 def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[UnitDoubt]:
@@ -197,7 +197,7 @@ def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
     doubts = []
     for unit, size in _SMALLER.items():
         if _BROKEN_SHARE * size * usual < largest < _IDLE_SHARE * size * usual:
-            expected = f"some {usual:.2g} N as in the scene"
+            expected = f"about {usual:.2g} N as in the scene"
             doubts = [UnitDoubt("excitation", ("fx", "fy"), f"{largest:.3g}", expected, unit)]
             largest *= UNITS["force"][unit]
     if largest < _IDLE_SHARE * usual:
@@ -206,7 +206,7 @@ def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
     beside = float(compile_loads(scene.loads).largest()[2]) * min(1.0, largest / usual) if usual else 0.0
     moment = magnitudes.get(("excitation", "m"), 0.0)
     if _BROKEN_SHARE * beside < moment < _IDLE_SHARE * beside:
-        expected = f"some {beside:.2g} N m with such forces, as in the scene"
+        expected = f"about {beside:.2g} N m with such forces, as in the scene"
         doubts.append(UnitDoubt("excitation", ("m",), f"{moment:.3g}", expected, "kN m"))
     return doubts
 

@@ -48,7 +48,8 @@ class InputCounts:
     def facts(self) -> dict[str, dict[str, int]]:
         """Return all counts except zeros."""
         return {
-            topic: {why: count for why, count in reasons.items() if count} for topic, reasons in self.counts.items()
+            topic: {reason: count for reason, count in reasons.items() if count}
+            for topic, reasons in self.counts.items()
         }
 
     def _count(self, topic: str, reason: str, count: int) -> None:

@@ -233,15 +233,15 @@ class RunWriter:
         self._close_full_chunks()
 
     def _channel(self, topic: str, message_type: str) -> int:
-        known = self._part.channels.get(topic)
-        if known is None:
+        channel = self._part.channels.get(topic)
+        if channel is None:
             qos = qos_text(self._base_names.get(topic, ""))
             metadata = {"offered_qos_profiles": qos, "topic_type_hash": type_hash(message_type)}
             number = self._part.file.channel(topic, message_type, schema_text(message_type).encode(), metadata)
-            known = self._part.channels[topic] = (number, message_type, qos)
-        if known[1] != message_type:
-            raise RecordingError(f"{topic}: got a {message_type}, expected a {known[1]} as before")
-        return known[0]
+            channel = self._part.channels[topic] = (number, message_type, qos)
+        if channel[1] != message_type:
+            raise RecordingError(f"{topic}: got a {message_type}, expected a {channel[1]} as before")
+        return channel[0]
 
     def _close_full_chunks(self) -> None:
         if self._journal.size + self._outputs.size >= self._chunk_size:

@@ -145,8 +145,8 @@ def _in_full(own: QoSProfile) -> QoSProfile:
     )
 
 
-def _reason(other: Any, kind: str, offered: Any, asked: Any) -> str:
+def _reason(other: Any, kind: str, offered: Any, requested: Any) -> str:
     if other.topic_type != kind:
         return f"type: got {other.topic_type}, expected {kind}"
-    compatibility, reason = qos_check_compatible(offered, asked)
+    compatibility, reason = qos_check_compatible(offered, requested)
     return f"incompatible quality of service: {reason}" if compatibility == QoSCompatibility.ERROR else ""

@@ -62,8 +62,8 @@ class RosFront:
         node = self._node
         self.runtime = runtime = Runtime(self, settings, prepared, kept_wear)
         made.callback(lambda: self._lost.extend(runtime.close()))
-        wanted = (settings.estimate, settings.estimate_forces, any(settings.forecast_limits))
-        without = [topic for topic, one in zip(ESTIMATES, wanted, strict=True) if not (settings.estimate and one)]
+        enabled = (settings.estimate, settings.estimate_forces, any(settings.forecast_limits))
+        without = [topic for topic, one in zip(ESTIMATES, enabled, strict=True) if not (settings.estimate and one)]
         # the node publishes on the topic `status`, because the topic exists before configure
         if settings.follows != "full":
             without += FOLLOWED_TOPICS

@@ -127,17 +127,17 @@ class InputLoop:
 
     def _run(self) -> None:
         try:
-            left: list[int] = []  # queues that may still contain messages
+            unfinished: list[int] = []  # queues that may still contain messages
             while not self._stopped:
-                pause_s = 0.0 if left else max(0.0, self._due - time.monotonic())
+                pause_s = 0.0 if unfinished else max(0.0, self._due - time.monotonic())
                 ready = select.select(self._signs, (), (), pause_s)[0]
                 if self._wake in ready:
                     os.eventfd_read(self._wake)
                     ready.remove(self._wake)
-                if left:
-                    ready = list({*left, *ready})
+                if unfinished:
+                    ready = list({*unfinished, *ready})
                 with self._turns:
-                    left = [fd for fd in ready if self._receive(fd)]
+                    unfinished = [fd for fd in ready if self._receive(fd)]
                     if time.monotonic() >= self._due:
                         self._look_at_timers()
         except Exception as error:  # any error is reported, because the twin stops when the thread ends

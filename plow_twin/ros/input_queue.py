@@ -100,10 +100,10 @@ class InputQueue:
         except BlockingIOError:
             signs = 0
         self._signs += signs
-        wanted = most if all_there_are else min(most, self._signs)
-        received = self._read(wanted)
+        count = most if all_there_are else min(most, self._signs)
+        received = self._read(count)
         # if the queue has overflowed, it contains fewer messages than were signalled
-        self._signs = max(0, self._signs - len(received)) if len(received) == wanted else 0
+        self._signs = max(0, self._signs - len(received)) if len(received) == count else 0
         return received, self._signs > 0 or (all_there_are and len(received) == most)
 
     def close(self) -> None:

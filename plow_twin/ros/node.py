@@ -211,8 +211,8 @@ class TwinNode(WithoutEvents, LifecycleNode):
             try:
                 return change(request, response)
             except RuntimeError as error:
-                asked = request.transition.label or request.transition.id
-                self.get_logger().warning(f"transition {asked!r} refused in state {self.lifecycle}: {error}")
+                transition = request.transition.label or request.transition.id
+                self.get_logger().warning(f"transition {transition!r} refused in state {self.lifecycle}: {error}")
                 response.success = False
                 return response
 

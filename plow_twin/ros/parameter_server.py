@@ -73,12 +73,12 @@ class ParameterServer:
         self._changed = changed
         self._refusals = refusals
         declared: dict[str, Any] = dict(node.get_parameters_by_prefix(""))
-        given = {name: parameter.value for name, parameter in declared.items()}
-        self.unknown = dict(parameters.unknown(given))
+        values = {name: parameter.value for name, parameter in declared.items()}
+        self.unknown = dict(parameters.unknown(values))
         for name, nearest in self.unknown.items():
             hint = f"; did you mean {nearest}?" if nearest else ""
-            node.get_logger().warning(f"unknown parameter {name}: {given[name]!r} is not used{hint}")
-        self.settings: Settings = parameters.settings(given)
+            node.get_logger().warning(f"unknown parameter {name}: {values[name]!r} is not used{hint}")
+        self.settings: Settings = parameters.settings(values)
         for name, spec in SPECS.items():
             if node.has_parameter(name):
                 node.undeclare_parameter(name)
@@ -87,15 +87,15 @@ class ParameterServer:
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._after)
 
-    def _before(self, asked: list[Parameter]) -> list[Parameter]:
+    def _before(self, proposed: list[Parameter]) -> list[Parameter]:
         """Convert integers to doubles, and log all invalid values. rclpy reports only the first invalid value."""
-        problems = parameters.problems({parameter.name: parameter.value for parameter in asked})
+        problems = parameters.problems({parameter.name: parameter.value for parameter in proposed})
         if problems:
             self._node.get_logger().warning(str(parameters.ParameterError(problems, "parameters refused")))
-        return [_converted(parameter) for parameter in asked]
+        return [_converted(parameter) for parameter in proposed]
 
-    def _check(self, asked: list[Parameter]) -> SetParametersResult:
-        values = {parameter.name: parameter.value for parameter in asked}
+    def _check(self, proposed: list[Parameter]) -> SetParametersResult:
+        values = {parameter.name: parameter.value for parameter in proposed}
         reasons = [str(problem) for problem in parameters.problems(values)]
         if not self._unconfigured():
             # an unchanged value is accepted, because a parameter file may set all parameters
@@ -109,8 +109,8 @@ class ParameterServer:
             if values.get("use_sim_time", self._sim_time()) != self._sim_time():
                 reasons.append(f"use_sim_time: takes effect {Effect.CONFIGURE.value}")
         if not reasons:
-            known = {name: parameters.coerce(name, value) for name, value in values.items() if name in SPECS}
-            after = replace(self.settings, **known)
+            checked = {name: parameters.coerce(name, value) for name, value in values.items() if name in SPECS}
+            after = replace(self.settings, **checked)
             reasons += refused_changes(self.settings, after) or self._refusals(after)
         return SetParametersResult(successful=not reasons, reason="; ".join(reasons))
 

@@ -54,7 +54,7 @@ class Subscriptions:
         self._connections = Connections(node)
         self._taken_from: dict[str, Subscription] = {}
         #: publishers of each input at the last lookup
-        self._found: dict[str, list[bytes]] = {}
+        self._publishers: dict[str, list[bytes]] = {}
         self._tool_forces = ToolForces(runtime.scene)
         self._source, depth = runtime.settings.excitation_source, self._inputs.depth
         self._names: dict[tuple[str, bytes], str] = {}
@@ -74,12 +74,12 @@ class Subscriptions:
 
     def look(self) -> None:
         """Update the publishers of all inputs. The lock is not held during the lookup, so that samples do not wait."""
-        found = {topic: self._connections.publishers(taken) for topic, taken in self._taken_from.items()}
+        found = {topic: self._connections.publishers(subscription) for topic, subscription in self._taken_from.items()}
         present = {topic: self._noted(topic, publishers) for topic, (publishers, _) in found.items()}
         refused = sum(count for _, count in found.values())
-        if present == self._found and not refused:
+        if present == self._publishers and not refused:
             return
-        self._found = present
+        self._publishers = present
         with self._turns:
             self._inputs.refused_publishers += refused
             self._inputs.publishers |= {topic: len(publishers) for topic, publishers in present.items()}
@@ -132,8 +132,8 @@ class Subscriptions:
         except (RuntimeError, TypeError, ParameterException) as error:
             prefix = f"qos_overrides.{self._node.resolve_topic_name(topic)}.subscription"
             names = self._node.get_parameters_by_prefix(prefix)
-            given = {name: self._node.get_parameter(f"{prefix}.{name}").value for name in names}
-            raise ArgumentError(f"{prefix}: got {given}, expected {EXPECTED} ({error})") from error
+            policies = {name: self._node.get_parameter(f"{prefix}.{name}").value for name in names}
+            raise ArgumentError(f"{prefix}: got {policies}, expected {EXPECTED} ({error})") from error
         if topic == self._source:
             self._since_ns, self._before = time.time_ns(), frozenset(self._present(topic))
             self._inputs.senders.start(self._before)
@@ -184,14 +184,14 @@ class Subscriptions:
         newest = {message.sender: message for message in batch}
         for sender, (first, counted) in list(self._appeared.items()):
             last = newest.get(sender, first)
-            heard, missed = last.number - first.number, first.number - 1
-            if heard <= 0:
+            span_of_numbers, missed = last.number - first.number, first.number - 1
+            if span_of_numbers <= 0:
                 continue
-            sending_ns = missed * (last.sent_ns - first.sent_ns) / heard
+            sending_ns = missed * (last.sent_ns - first.sent_ns) / span_of_numbers
             lost = missed if sending_ns <= first.received_ns - self._since_ns else 0
             if lost != counted and self._inputs.lost_at_first(sender, lost - counted):
                 self._appeared[sender] = first, lost
-            if heard >= _RATE_KNOWN:
+            if span_of_numbers >= _RATE_KNOWN:
                 del self._appeared[sender]
 
     def _samples(self, topic: str, batch: list[Received]) -> None:
@@ -201,12 +201,12 @@ class Subscriptions:
         followed = inputs.senders.followed
         for message in batch:
             stamp, values, fits, out_of_plane = self._read(topic, message.data)
-            wanted = inputs.wanted(message.sender, message.number, stamp, values, fits)
+            is_used = inputs.wanted(message.sender, message.number, stamp, values, fits)
             if inputs.senders.followed != followed:
                 # the samples in `arrived` are from the previously followed publisher
                 self._step(arrived)
                 arrived, followed = [], inputs.senders.followed
-            if wanted:
+            if is_used:
                 self._intake.out_of_plane += out_of_plane
                 fx, fy, moment = values
                 arrived.append((stamp, (fx, fy, moment)))
@@ -261,9 +261,9 @@ class Subscriptions:
             self._runtime.add_pose(stamp, (pose.position.x, pose.position.y, theta), deviation)
 
     def _messages(self, topic: str, kind: type, intake: Intake, batch: list[Received]) -> Iterator[Any]:
-        for taken in batch:
-            self._inputs.arriving = (topic, taken.sender)
-            message = _message(taken.data, kind)
+        for received in batch:
+            self._inputs.arriving = (topic, received.sender)
+            message = _message(received.data, kind)
             if message is None:
                 intake.refuse(Verdict.MALFORMED)
             else:

@@ -132,9 +132,9 @@ class TopicRecorder:
         )
         self._loop.add(InputQueue(self._node, subscription), _Subscription(self, quality, number), name)
 
-    def add(self, name: str, quality: _Quality, number: int, taken: list[Received]) -> None:
+    def add(self, name: str, quality: _Quality, number: int, messages: list[Received]) -> None:
         """Write the messages that a subscription received, without duplicates."""
-        for message in taken:
+        for message in messages:
             key = (name, message.sender)
             # a best-effort subscription receives the messages of reliable publishers in addition
             if self._taken_as.setdefault(key, quality) != quality:

@@ -205,7 +205,7 @@ class _Run:
         lanes: np.record = self._local.lanes
         return lanes
 
-    def _look(self, motion: Motion | None = None) -> None:
+    def _check_time(self, motion: Motion | None = None) -> None:
         if self.stopped.is_set() or _time.perf_counter() > self._end:
             raise OutOfTimeError
 
@@ -219,17 +219,19 @@ class _Run:
         """Run some members in lanes. Their scenes must fit (`fits_lanes`)."""
         waiting = share
         while len(waiting):
-            self._look()
+            self._check_time()
             is_done = run.go_on(waiting, self._work(), self._lanes())
             done, waiting = waiting[is_done], waiting[~is_done]
             self._store(done, run.totals[done], run.states[done], run.status[done])
             self._report_progress(len(done))
 
     def _run_alone(self, index: int) -> None:
-        self._look()
+        self._check_time()
         compiled, ensemble = self._compiled[index], self._ensemble
         motion = Motion.start(compiled, ensemble.q[index], ensemble.v[index])
-        status, _ = run_events(compiled, motion, ensemble.t, self._t_end, self._work(), self._max_steps, self._look)
+        status, _ = run_events(
+            compiled, motion, ensemble.t, self._t_end, self._work(), self._max_steps, self._check_time
+        )
         self._store(index, motion.totals, motion.state, status)
         self._report_progress(1)
 

@@ -98,14 +98,14 @@ class LaneRun:
 def _joined(compiled: Sequence[CompiledScene], members: Sequence[int]) -> tuple[NDArray[np.void], NDArray[np.int64]]:
     """Return all members' harmonics in one array, and for each member its first index and its count, shape (m, 2)."""
     parts, extent, begin = [np.zeros(0, HARMONIC)], np.zeros((len(compiled), 2), np.int64), 0
-    known: dict[int, tuple[int, int]] = {}
+    spans: dict[int, tuple[int, int]] = {}
     for index in members:
         harmonics = compiled[index].parts.harmonics
         if harmonics is None:
             continue
-        if id(harmonics) not in known:
-            known[id(harmonics)] = begin, len(harmonics)
+        if id(harmonics) not in spans:
+            spans[id(harmonics)] = begin, len(harmonics)
             parts.append(harmonics)
             begin += len(harmonics)
-        extent[index] = known[id(harmonics)]
+        extent[index] = spans[id(harmonics)]
     return np.concatenate(parts), extent

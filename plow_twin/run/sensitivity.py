@@ -257,10 +257,10 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
         The solver cannot continue a motion.
     """
     refuse_support(scene)
-    known = sensitivity_parameters(scene)
+    available = sensitivity_parameters(scene)
     for path in parameters:
-        if path not in known:
-            raise ArgumentError(f"sensitivity: got {path!r}, expected some of {', '.join(known)}")
+        if path not in available:
+            raise ArgumentError(f"sensitivity: got {path!r}, expected one of {', '.join(available)}")
     free = free_places(scene)
     scale, size = scale_of(compile_scene(scene, tol))[free], len(free)
 

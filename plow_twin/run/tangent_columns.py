@@ -25,10 +25,10 @@ def fits_tangents(compiled: CompiledScene) -> bool:
     """
     terms, contact = compiled.parts.terms, compiled.scene.contact
     there = {name for name, term in zip(Terms._fields, terms, strict=True) if term is not None}
-    known = terms.fraction is None or contact.exponent == 1.5
+    supported = terms.fraction is None or contact.exponent == 1.5
     explicit = compiled.parts.implicit is None or contact.restitution is not None
     alike = not (options(compiled.scene).corners or options(compiled.scene).falling)
-    return known and explicit and there <= _COVERED and alike
+    return supported and explicit and there <= _COVERED and alike
 
 
 def is_curved(terms: Terms) -> int | None:

@@ -72,11 +72,11 @@ class TwinSensitivity:
         if twin.excitation != "sampled":
             raise ArgumentError("twin: got excitation='scene', expected excitation='sampled'")
         refuse_support(twin.scene)
-        scene, known = twin.scene, sensitivity_parameters(twin.scene)
+        scene, available = twin.scene, sensitivity_parameters(twin.scene)
         for path in parameters:
-            if path not in known or path.startswith("loads."):
-                allowed = ", ".join(name for name in known if not name.startswith("loads."))
-                raise ArgumentError(f"parameters: got {path!r}, expected some of {allowed}")
+            if path not in available or path.startswith("loads."):
+                allowed = ", ".join(name for name in available if not name.startswith("loads."))
+                raise ArgumentError(f"parameters: got {path!r}, expected one of {allowed}")
         self._twin = twin
         self._changed = [ChangedScene.of(scene, path, SHADOW_TOLERANCE) for path in parameters]
         compiled = compile_scene(scene, SHADOW_TOLERANCE, sampled=True)

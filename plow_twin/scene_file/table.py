@@ -30,7 +30,7 @@ def read_table(path: Path, columns: Sequence[str] | None = None, key: str = "fil
     SceneError
         The file, a column or a number is missing. The error lists all bad lines.
     """
-    wanted = tuple(columns or TABLE_COLUMNS)
+    names = tuple(columns or TABLE_COLUMNS)
     try:
         with open_csv(path) as file:
             rows = list(csv_rows(file, "#"))
@@ -40,9 +40,9 @@ def read_table(path: Path, columns: Sequence[str] | None = None, key: str = "fil
     header = [name.strip() for name in rows[0][1]] if rows else []
     if columns is None and "t" not in header:
         header = ["t" if name == "time" else name for name in header]
-    if any(header.count(name) != 1 for name in wanted):
-        raise SceneError([Problem(key, header, f"a header line with {', '.join(wanted)}, each once")])
-    return _parse(rows[1:], [header.index(name) for name in wanted], key)
+    if any(header.count(name) != 1 for name in names):
+        raise SceneError([Problem(key, header, f"a header line with {', '.join(names)}, each once")])
+    return _parse(rows[1:], [header.index(name) for name in names], key)
 
 
 def _parse(rows: list[tuple[int, list[str]]], places: list[int], key: str) -> Samples:

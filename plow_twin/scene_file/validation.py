@@ -141,11 +141,11 @@ def _brief(problem: Problem) -> Problem:
     return Problem(problem.key, shown, problem.expected)
 
 
-def _unknown_keys(key: str, instance: dict[Any, Any], known: Schema) -> Iterator[Problem]:
+def _unknown_keys(key: str, instance: dict[Any, Any], properties: Schema) -> Iterator[Problem]:
     for name in instance:
-        if name not in known:
-            near = get_close_matches(str(name)[:_LONGEST], known, n=1, cutoff=0.5)
-            expected = f"a known key; did you mean {near[0]}?" if near else f"a known key: {', '.join(known)}"
+        if name not in properties:
+            near = get_close_matches(str(name)[:_LONGEST], properties, n=1, cutoff=0.5)
+            expected = f"a known key; did you mean {near[0]}?" if near else f"a known key: {', '.join(properties)}"
             yield Problem(_join(key, name), instance[name], expected)
 
 

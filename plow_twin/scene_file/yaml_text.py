@@ -144,10 +144,10 @@ def _excess(text: str, most_values: float) -> Problem | None:
                 sizes[anchor] = outer
             outer, is_mapping, anchor = stack.pop()
         elif kind is yaml.AliasEvent:
-            known = sizes.get(event.anchor, scalar)  # the composer reports an alias without an anchor
-            if known is None:
+            size = sizes.get(event.anchor, scalar)  # the composer reports an alias without an anchor
+            if size is None:
                 return Problem(_place(event.start_mark), "an alias to itself", "an alias to an earlier node")
-            node = known
+            node = size
             repeated += node.values
             if repeated > MOST_REPEATED:
                 return _above(event, repeated, MOST_REPEATED, "values by aliases")

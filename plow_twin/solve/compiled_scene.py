@@ -188,18 +188,18 @@ class _Shared:
 
     def __init__(self, most: float = math.inf) -> None:
         self._most = most
-        self._known: OrderedDict[tuple[Any, ...], tuple[Any, Any]] = OrderedDict()
+        self._entries: OrderedDict[tuple[Any, ...], tuple[Any, Any]] = OrderedDict()
 
     def of(self, compute: Callable[..., _Found], *sources: object, given: tuple[Any, ...] | None = None) -> _Found:
         """Return compute(*sources), or compute(*given). The sources must determine `given`."""
         key = (compute, *map(id, sources))
-        known = self._known.get(key)
-        if known is None:
+        stored = self._entries.get(key)
+        if stored is None:
             # the id of a deleted source could belong to a new object, so the sources are stored
-            known = self._known[key] = sources, compute(*(sources if given is None else given))
-            if len(self._known) > self._most:
-                self._known.popitem(last=False)
-        found: _Found = known[1]
+            stored = self._entries[key] = sources, compute(*(sources if given is None else given))
+            if len(self._entries) > self._most:
+                self._entries.popitem(last=False)
+        found: _Found = stored[1]
         return found
 
 

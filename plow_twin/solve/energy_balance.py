@@ -134,9 +134,9 @@ def _powers_under(p, offset, free, slip, stick, state, wear_depth, y, ground, lo
 
 
 @kernel()
-def _balance(p, support, seen, frame, balance, start) -> None:
+def _balance(p, support, relative, frame, balance, start) -> None:
     """Compute energy and momentum from the state, and update the largest imbalances."""
-    sums, y = balance.sums, _on_ground(support, seen, frame, balance)
+    sums, y = balance.sums, _on_ground(support, relative, frame, balance)
     m, inertia = 1.0 / p.inverse_mass, 1.0 / p.inverse_inertia
     c, s = along(p, math.cos(y[THETA]), math.sin(y[THETA]))
     sums.energy[1] = 0.5 * m * (y[VX] * y[VX] + y[VY] * y[VY]) + 0.5 * inertia * y[OMEGA] * y[OMEGA]

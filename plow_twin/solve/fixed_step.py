@@ -94,12 +94,12 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
     state.bounded += 1
     for n in range(bound.steps):
         _runge_kutta(p, acts, state, start + n * dt, dt, z, trial, k, bound.load)
-        left = target - start - (n + 1) * dt
+        remaining = target - start - (n + 1) * dt
         for j in range(3):
             radius = p.radius if j == 2 else 1.0
             moving = size // 2 + j
             off, drift = abs(k[1, j] - k[2, j]), abs(k[1, moving] - k[2, moving])
-            bound.error += radius * dt / 3.0 * (off + (left + dt) * drift)
+            bound.error += radius * dt / 3.0 * (off + (remaining + dt) * drift)
         if not all_finite(z):
             return _NON_FINITE
         state.steps += 1

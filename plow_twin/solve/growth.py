@@ -68,12 +68,12 @@ def _larger_norm(a, height, most, gram, power, square) -> float:
 
 
 @kernel(fast=True)
-def _multiply_all(matrix, since, count, grown) -> None:
+def _multiply_all(matrix, since, count, product) -> None:
     """Write the products of `matrix` and each matrix since[:, i, :]. `since[k]` contains row k of all matrices."""
     size = len(matrix)
     length = count * size
     for i in range(size):
-        out = grown[i].reshape(-1)
+        out = product[i].reshape(-1)
         out[:length] = 0.0
         for k in range(size):
             factor, row = matrix[i, k], since[k].reshape(-1)
@@ -82,26 +82,26 @@ def _multiply_all(matrix, since, count, grown) -> None:
 
 
 @kernel(fast=True)
-def _largest(grown, count, height, scratch) -> float:
+def _largest(product, count, height, scratch) -> float:
     """Return the largest spectral norm of the first `height` rows of the matrices grown[:, i, :], at least 1.
 
     The sum of squares of a matrix is an upper bound of its squared norm. After the norm of the matrix with the largest
     sum, few norms have to be computed.
     """
-    most, begin, size = 1.0, 0, len(grown)
+    most, begin, size = 1.0, 0, len(product)
     squares = scratch[5:].reshape(-1)
     for i in range(count):
         squares[i] = 0.0
         for row in range(height):
             for column in range(size):
-                squares[i] += grown[row, i, column] ** 2
+                squares[i] += product[row, i, column] ** 2
         if squares[i] > squares[begin]:
             begin = i
     for j in range(count):
         i = (begin + j) % count
         if not squares[i] <= most * most:
             for row in range(height):
-                scratch[4, row] = grown[row, i]
+                scratch[4, row] = product[row, i]
             most = _larger_norm(scratch[4], height, most, scratch[0], scratch[1], scratch[2])
     return most
 
@@ -165,13 +165,13 @@ def follow_growth(matrices, changes, ends, since, kept, whole, basis, scratch, t
     most = since.shape[2]
     for index in range(len(matrices)):
         matrix, count = matrices[index], kept[0]
-        grown, size = since[1], len(matrix)
-        _multiply_all(matrix, since[0], count, grown)
+        product, size = since[1], len(matrix)
+        _multiply_all(matrix, since[0], count, product)
         # growth since the beginning of the current stretch
         for k in range(size):
-            copy_into(grown[k, count], matrix[k])
+            copy_into(product[k, count], matrix[k])
         ended = ends[index] == 1
-        growth[index] = _largest(grown, count + 1, size if ended else size // 2, scratch)
+        growth[index] = _largest(product, count + 1, size if ended else size // 2, scratch)
         _multiply(matrix, whole[0], totals[index])
         for i in range(changes.shape[1]):
             for j in range(size):
@@ -188,4 +188,4 @@ def follow_growth(matrices, changes, ends, since, kept, whole, basis, scratch, t
         kept[0] = (count + step) // step
         for i in range(kept[0]):
             for k in range(size):
-                copy_into(since[0, k, i], grown[k, i * step])
+                copy_into(since[0, k, i], product[k, i * step])

@@ -99,8 +99,8 @@ def _impact_speed(number, rate, energy) -> float:
     for _ in range(_BISECTIONS):
         speed = 0.5 * (low + high)
         u = number * rate / speed
-        left = np.inf if u <= -1.0 else u - math.log1p(u)
-        if left + number * number * energy / (speed * speed) > full:
+        unspent = np.inf if u <= -1.0 else u - math.log1p(u)
+        if unspent + number * number * energy / (speed * speed) > full:
             low = speed
         else:
             high = speed

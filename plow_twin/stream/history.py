@@ -127,9 +127,9 @@ class History:
     def _make_samples(self) -> None:
         oldest_ns = self._snapshots[0][0] if self._snapshots else 0
         for stamps_ns, wrench in self._later:
-            wanted = stamps_ns > oldest_ns
-            rows = [(row[0], row[1], row[2]) for row in wrench[wanted].tolist()]
-            stamps = stamps_ns[wanted].tolist()
+            recent = stamps_ns > oldest_ns
+            rows = [(row[0], row[1], row[2]) for row in wrench[recent].tolist()]
+            stamps = stamps_ns[recent].tolist()
             self._samples += [Sample(stamp, row) for stamp, row in zip(stamps, rows, strict=True)]
             self._stamps_ns += stamps
         self._later.clear()

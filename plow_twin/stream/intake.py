@@ -127,8 +127,8 @@ class Intake:
         """Number of missing samples, from the expected rate and the time between the first and the newest stamp."""
         if self._newest_ns is None or self.expected_rate_hz <= 0.0:
             return self._missing_before
-        asked = round((self._newest_ns - self._first_ns) * self.expected_rate_hz / NS_PER_S) + 1
-        return self._missing_before + max(0, asked - self._since_first)
+        expected = round((self._newest_ns - self._first_ns) * self.expected_rate_hz / NS_PER_S) + 1
+        return self._missing_before + max(0, expected - self._since_first)
 
     @property
     def used(self) -> int:

@@ -226,9 +226,9 @@ Entry = (
 
 def pose_entry(stamp_ns: int, pose: tuple[float, ...], deviation: tuple[float, ...] = ()) -> Pose | PartOfPose:
     """Return the entry of a measured pose (x, y [m], theta [rad]), in which a missing component is NaN."""
-    known = tuple(index for index, value in enumerate(pose) if math.isfinite(value))
-    if len(known) < len(pose):
-        return PartOfPose(stamp_ns, known, tuple(pose[index] for index in known))
+    measured = tuple(index for index, value in enumerate(pose) if math.isfinite(value))
+    if len(measured) < len(pose):
+        return PartOfPose(stamp_ns, measured, tuple(pose[index] for index in measured))
     return Pose(stamp_ns, pose, deviation)
 
 
@@ -236,5 +236,5 @@ def whole_pose(entry: Pose | PartOfPose) -> tuple[float, ...]:
     """Return x, y [m] and theta [rad] of a pose, with NaN for each component that was not measured."""
     if isinstance(entry, Pose):
         return entry.pose
-    known = dict(zip(entry.components, entry.values, strict=True))
-    return tuple(known.get(index, math.nan) for index in range(3))
+    values = dict(zip(entry.components, entry.values, strict=True))
+    return tuple(values.get(index, math.nan) for index in range(3))

@@ -298,17 +298,17 @@ class Outputs:
         if not index.size:
             return _NO_SLOW
         stamps, wear_depth = stamps[index], rows["wear_depth"][index]
-        elapsed_s, grown = np.ones(len(stamps)), np.zeros(wear_depth.shape)
-        elapsed_s[1:], grown[1:] = np.diff(stamps) * 1e-9, np.diff(wear_depth, axis=0)
+        elapsed_s, growth = np.ones(len(stamps)), np.zeros(wear_depth.shape)
+        elapsed_s[1:], growth[1:] = np.diff(stamps) * 1e-9, np.diff(wear_depth, axis=0)
         if before_ns is not None and stamps[0] > before_ns:
-            elapsed_s[0], grown[0] = (stamps[0] - before_ns) * 1e-9, wear_depth[0] - self._slow_wear_depth
+            elapsed_s[0], growth[0] = (stamps[0] - before_ns) * 1e-9, wear_depth[0] - self._slow_wear_depth
         self._slow_ns, self._slow_wear_depth = int(stamps[-1]), wear_depth[-1].copy()
         slow = np.zeros(len(index), SLOW)
         slow["stamp_ns"], slow["row"] = stamps, index
-        slow["clearance"], slow["wear_rate"] = self._clearance(wear_depth), grown / elapsed_s[:, None]
-        known = np.flatnonzero(rows["followed"][index])
-        if known.size:
-            slow["clearance"][known[:, None], _KNOWN] = rows["known_clearance"][index[known]]
+        slow["clearance"], slow["wear_rate"] = self._clearance(wear_depth), growth / elapsed_s[:, None]
+        followed = np.flatnonzero(rows["followed"][index])
+        if followed.size:
+            slow["clearance"][followed[:, None], _KNOWN] = rows["known_clearance"][index[followed]]
         return slow
 
     def _clearance(self, wear_depth: Array) -> Array:

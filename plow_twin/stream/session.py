@@ -491,12 +491,12 @@ class Session:
         """
         corrected_ns = self.outputs.correct(stamp_ns, self.history.correction_limit_ns(stamp_ns))
         again = self._rewind(corrected_ns, *travels)
-        known = [sample for sample in again if sample.stamp_ns < corrected_ns]
-        if known:
-            self._run(known)
+        earlier = [sample for sample in again if sample.stamp_ns < corrected_ns]
+        if earlier:
+            self._run(earlier)
             self._store_snapshot(kept=False)
         self.outputs.begin_correction()
-        return self._run(sorted([*again[len(known) :], *late], key=lambda sample: sample.stamp_ns))
+        return self._run(sorted([*again[len(earlier) :], *late], key=lambda sample: sample.stamp_ns))
 
     def _rewind(self, stamp_ns: int, *more: journal.Travel) -> list[journal.Sample]:
         """Go back to the newest snapshot before `stamp_ns`; return the samples after the snapshot.
@@ -517,8 +517,8 @@ class Session:
                 else:
                     self._measured.append(one)
         # a speed with the stamp of the snapshot may occur twice
-        known = {travel.stamp_ns: travel for travel in (*self._travels, *travels, *pending, *more)}
-        self._travels = sorted(known.values(), key=lambda travel: travel.stamp_ns)
+        by_stamp = {travel.stamp_ns: travel for travel in (*self._travels, *travels, *pending, *more)}
+        self._travels = sorted(by_stamp.values(), key=lambda travel: travel.stamp_ns)
         return samples
 
     def _apply_hold(self, entry: journal.Hold | journal.Unload) -> Rows:

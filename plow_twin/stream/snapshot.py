@@ -67,13 +67,13 @@ class SessionState(NamedTuple):
     @staticmethod
     def unpack(snapshot: bytes) -> SessionState:
         """Return the state in a snapshot."""
-        known, origin_ns, stamp_ns, advances, held, speed, count = _HEADER.unpack_from(snapshot)
+        has_origin, origin_ns, stamp_ns, advances, held, speed, count = _HEADER.unpack_from(snapshot)
         wear = _HEADER.size + count * _TRAVEL.size
         outputs = wear + _WEAR_BYTES
         twin = outputs + STATE_BYTES
         return SessionState(
-            origin_ns if known else None,
-            stamp_ns if known else None,
+            origin_ns if has_origin else None,
+            stamp_ns if has_origin else None,
             advances,
             held,
             speed,

@@ -72,15 +72,15 @@ def _paths_of(part: Any, path: str) -> list[str]:
 
 def check_path(scene: Scene, path: str) -> str:
     """Return the path if the scene has it; otherwise raise a `StudyError` with the nearest paths."""
-    known = parameter_paths(scene)
-    if path not in known:
-        raise StudyError(f"parameter: got {path!r}, expected one of {', '.join(known)}{nearest_of(path, known)}")
+    paths = parameter_paths(scene)
+    if path not in paths:
+        raise StudyError(f"parameter: got {path!r}, expected one of {', '.join(paths)}{nearest_of(path, paths)}")
     return path
 
 
-def nearest_of(path: str, known: Iterable[str]) -> str:
+def nearest_of(path: str, paths: Iterable[str]) -> str:
     """Return a hint with the most similar known paths, or an empty text if no path is similar."""
-    near = get_close_matches(path, known, n=3, cutoff=0.6)
+    near = get_close_matches(path, paths, n=3, cutoff=0.6)
     return f"; nearest: {', '.join(near)}" if near else ""
 
 
@@ -112,9 +112,9 @@ def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
     SceneError
         The scene cannot be used with these values; the error lists every problem.
     """
-    known = parameter_paths(scene)
+    paths = parameter_paths(scene)
     for path, value in values.items():
-        if path not in known:
+        if path not in paths:
             check_path(scene, path)
         words = path in WORDS
         if words != isinstance(value, str):

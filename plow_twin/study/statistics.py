@@ -77,42 +77,42 @@ def statistics_of(members: Ensemble, scenes: Sequence[Scene], paths: Sequence[st
         groups.setdefault(tuple(sorted(scenes[index].frame.labels.items())), []).append(index)
     for rows in groups.values():
         part = replace(members, **{name: getattr(members, name)[rows] for name in names})
-        known = _statistics_of_scene(scenes[rows[0]])
+        by_path = _statistics_of_scene(scenes[rows[0]])
         for column, path in enumerate(paths):
-            result[rows, column] = (known.get(path) or statistic(scenes[rows[0]], path))(part)
+            result[rows, column] = (by_path.get(path) or statistic(scenes[rows[0]], path))(part)
     return result
 
 
 def _statistics_of_scene(scene: Scene) -> Mapping[str, Statistic]:
-    known: dict[str, Statistic] = {}
+    by_path: dict[str, Statistic] = {}
     for kind, reduce in _OF_PAIRS.items():
         for suffix, pairs in _groups(scene).items():
-            known[f"{kind}{suffix}"] = partial(reduce, pairs=pairs)
+            by_path[f"{kind}{suffix}"] = partial(reduce, pairs=pairs)
     for row, sense in enumerate(SENSES):
         for name, mask in _sets(scene).items():
-            known[f"contact_sets.{sense}.{name}"] = partial(_share, row=row, masks=[mask])
-            known[f"contact_set_time.{sense}.{name}"] = partial(_set_time, row=row, mask=mask)
+            by_path[f"contact_sets.{sense}.{name}"] = partial(_share, row=row, masks=[mask])
+            by_path[f"contact_set_time.{sense}.{name}"] = partial(_set_time, row=row, mask=mask)
         for count in (1, 2, 3, 4):
             masks = [mask for mask in range(1, 16) if mask.bit_count() == count]
-            known[f"contact_points.{sense}.{count}"] = partial(_share, row=row, masks=masks)
-    known["events"] = lambda members: members.events.astype(np.float64)
-    known["steps"] = lambda members: members.steps.astype(np.float64)
-    return known
+            by_path[f"contact_points.{sense}.{count}"] = partial(_share, row=row, masks=masks)
+    by_path["events"] = lambda members: members.events.astype(np.float64)
+    by_path["steps"] = lambda members: members.steps.astype(np.float64)
+    return by_path
 
 
 def statistic(scene: Scene, path: str) -> Statistic:
     """Return the statistic at a path; raise a `StudyError` with the most similar paths if the path is unknown."""
-    known = _statistics_of_scene(scene)
+    by_path = _statistics_of_scene(scene)
     # a user may write the letters of a set in any order
     head, _, last = path.rpartition(".")
-    key = path if path in known else f"{head}.{''.join(sorted(last))}"
-    if key not in known:
+    key = path if path in by_path else f"{head}.{''.join(sorted(last))}"
+    if key not in by_path:
         kinds = ", ".join(f"{name}.ccw.{scene.frame.corner_labels[CORNER_NAMES[0]]}" for name in _OF_PAIRS)
         raise StudyError(
             f"statistic: got {path!r}, expected e.g. {kinds}, max.{PAIR_NAMES[0]}, contact_sets.ccw.<corners>, "
-            f"contact_set_time.ccw.<corners>, contact_points.ccw.2, events, steps{nearest_of(path, known)}"
+            f"contact_set_time.ccw.<corners>, contact_points.ccw.2, events, steps{nearest_of(path, by_path)}"
         )
-    return known[key]
+    return by_path[key]
 
 
 def unit_of(path: str) -> str:

@@ -65,10 +65,12 @@ class Store:
             stored, self.chunk = facts["arguments"], int(facts["chunk"])
         except (ValueError, KeyError, TypeError):
             raise StudyError(f"{path}: cannot be read, expected a sweep (--fresh discards it)") from None
-        asked = self.sweep.arguments()
-        differing = [key for key in asked if stored.get(key) != asked[key]]
+        requested = self.sweep.arguments()
+        differing = [key for key in requested if stored.get(key) != requested[key]]
         if differing or facts.get("format") != FORMAT:
-            difference = "; ".join(_difference(key, stored.get(key), asked[key]) for key in differing) or "its format"
+            difference = (
+                "; ".join(_difference(key, stored.get(key), requested[key]) for key in differing) or "its format"
+            )
             raise StudyError(
                 f"{self.folder}: contains another sweep, which differs in {difference}. Use another --out or --fresh"
             )
@@ -113,7 +115,7 @@ class Store:
         return self._chunks / f"{index:05d}.npz"
 
 
-def _difference(key: str, stored: Any, asked: Any) -> str:
+def _difference(key: str, stored: Any, requested: Any) -> str:
     if key == "scene_yaml":
         return "the scene"
-    return f"{key} (stored {json.dumps(stored)}, asked {json.dumps(asked)})"
+    return f"{key} (stored {json.dumps(stored)}, asked {json.dumps(requested)})"

@@ -36,7 +36,7 @@ class Influx:
         self._write, self._bucket = self._client.write_api(SYNCHRONOUS), bucket
         self._waiting: deque[str] = deque()
         #: lines of the present request, and the task that writes them
-        self._asked: list[str] = []
+        self._being_sent: list[str] = []
         self._writing: asyncio.Task[None] | None = None
         self._wait_s, self._again_s = 0.0, 0.0
 
@@ -62,21 +62,21 @@ class Influx:
             await self.turn()
         if self._writing is not None:
             await asyncio.wait([self._writing], timeout=patience_s)
-        self.state.lost += len(self._waiting) + len(self._asked)
+        self.state.lost += len(self._waiting) + len(self._being_sent)
         self._client.close()
 
     async def _write_all(self) -> None:
         """Write the queued lines, but not during the wait after a failed attempt."""
         while self._waiting and time.monotonic() >= self._again_s:
-            self._asked = [self._waiting.popleft() for _ in range(min(len(self._waiting), _AT_ONCE))]
+            self._being_sent = [self._waiting.popleft() for _ in range(min(len(self._waiting), _AT_ONCE))]
             try:
-                await asyncio.to_thread(self._write.write, self._bucket, record="\n".join(self._asked))
+                await asyncio.to_thread(self._write.write, self._bucket, record="\n".join(self._being_sent))
             except Exception as error:  # the type depends on the answer of the database
                 self._fail(error)
             else:
-                self.state.sent += len(self._asked)
+                self.state.sent += len(self._being_sent)
                 self.state.connected, self.state.trouble, self._wait_s = True, "", 0.0
-                self._asked = []
+                self._being_sent = []
 
     def _fail(self, error: Any) -> None:
         """Record a failure; drop the lines if the database has rejected their content."""
@@ -84,17 +84,17 @@ class Influx:
         status = getattr(error, "status", None)
         reason = f"{status} {error.reason}" if status else str(error) or type(error).__name__
         self.state.trouble = f"not written: {reason}"[:300]
-        asked, self._asked = self._asked, []
+        lines, self._being_sent = self._being_sent, []
         if status in (400, 413, 422):
-            self.state.lost += len(asked)
+            self.state.lost += len(lines)
         else:
-            self._waiting.extendleft(reversed(asked))
+            self._waiting.extendleft(reversed(lines))
             self._limit()
         self._wait_s = min(max(2.0 * self._wait_s, _FIRST_WAIT_S), _LONGEST_WAIT_S)
         self._again_s = time.monotonic() + self._wait_s
 
     def _limit(self) -> None:
-        while len(self._waiting) + len(self._asked) > _WAITING:
+        while len(self._waiting) + len(self._being_sent) > _WAITING:
             self._waiting.popleft()
             self.state.lost += 1
 

@@ -21,8 +21,8 @@ def open_output(front: BridgeFront, output: OutputSpec, rate_hz: float, source: 
     def answer(action: str, text: str) -> tuple[bool, str]:
         return services.call("acknowledge_alarms") if action == "acknowledge" else (False, "not possible here")
 
-    asked: Callable[[str, str], tuple[bool, str]] | None = answer if output.may_acknowledge else None
-    outlet = Outlet(output, facts_of(runtime.scene, asdict(runtime.settings), source), asked, front.say_error)
+    on_request: Callable[[str, str], tuple[bool, str]] | None = answer if output.may_acknowledge else None
+    outlet = Outlet(output, facts_of(runtime.scene, asdict(runtime.settings), source), on_request, front.say_error)
     front.attach(outlet.feed)
     front.more_parts[output.name] = outlet.part
     front.timers.append(Timer(1.0 / rate_hz, outlet.turn))

@@ -93,8 +93,8 @@ class Broker:
         while self.state.connected and (self._waiting or self._unacknowledged) and time.monotonic() < give_up:
             await asyncio.sleep(0.01)
         with self.lock:
-            left = [message for message in self._waiting if message is not last]
-            self.state.lost += len(left) + len(self._unacknowledged)
+            unsent = [message for message in self._waiting if message is not last]
+            self.state.lost += len(unsent) + len(self._unacknowledged)
         self.client.on_disconnect = None
         self.client.disconnect()
         self.client.loop_stop()

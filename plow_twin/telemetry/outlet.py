@@ -65,8 +65,8 @@ class Outlet(Beside):
         values |= {key: str(report[key]) for key in ("sent", "lost")}
         values |= {"not_taken": str(self.feed.not_taken), "trouble": report["trouble"]}
         ended = "its process has ended" if self.link.broken else ""
-        said = ended or report["trouble"]
-        return int(bool(said)), said, values
+        message = ended or report["trouble"]
+        return int(bool(message)), message, values
 
     def close(self) -> None:
         """Send the newest values, wait for the receiver, and end the process."""

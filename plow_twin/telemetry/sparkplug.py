@@ -79,7 +79,7 @@ class Sparkplug:
         self._sent: dict[tuple[str, str], Value] = {}
         # messages that are queued during a break are dropped, because the next birth contains all newest values
         self._broker = Broker(will=self._next_death, on_connected=self._born, keeps=False, **options)
-        self._broker.client.on_message = self._asked
+        self._broker.client.on_message = self._on_command
         self.state = self._broker.state
 
     async def open(self, link: Link, newest: Newest) -> None:
@@ -138,12 +138,12 @@ class Sparkplug:
         payload.seq, self._number = self._number, (self._number + 1) % 256
         return Message(self._topic.format(kind), payload.SerializeToString(), qos=0)
 
-    def _asked(self, client: Any, data: Any, message: Any) -> None:
+    def _on_command(self, client: Any, data: Any, message: Any) -> None:
         try:
-            asked = Payload.FromString(message.payload)
+            payload = Payload.FromString(message.payload)
         except DecodeError:
             return
-        self._rebirth |= any(metric.name == REBIRTH and metric.boolean_value for metric in asked.metrics)
+        self._rebirth |= any(metric.name == REBIRTH and metric.boolean_value for metric in payload.metrics)
 
 
 def _payload(groups: Mapping[str, Group], *, with_units: bool) -> Any:

@@ -48,7 +48,7 @@ class ContactSets:
         self._at: int | None = None
         self._last: tuple[int, int] | None = None
         #: Newest set of the present span that has not been written, and the step of its row.
-        self._left: tuple[str, int] | None = None
+        self._pending: tuple[str, int] | None = None
         names: dict[str, Color] = {}
         for ccw, cw in product(range(16), range(16)):
             mask = self._pairs(ccw, True) | self._pairs(cw, False)
@@ -83,7 +83,7 @@ class ContactSets:
             name = self.name(int(masks[row]))
             span = int(stamps[row]) // self._span_ns if self._span_ns else None
             if span is not None and span == self._at:
-                self._left = name, int(steps[row])
+                self._pending = name, int(steps[row])
             elif name != self._before:
                 self._states.add(int(stamps[row]), int(steps[row]), state=[name])
                 self._before, self._at = name, span
@@ -92,23 +92,23 @@ class ContactSets:
 
     def _end_span(self, stamp_ns: int) -> None:
         """Write the last set of the present span if the stamp lies after the span."""
-        if self._left is None or self._at is None or stamp_ns // self._span_ns == self._at:
+        if self._pending is None or self._at is None or stamp_ns // self._span_ns == self._at:
             return
-        name, step = self._left
+        name, step = self._pending
         if name != self._before:
             self._states.add((self._at + 1) * self._span_ns, step, state=[name])
-        self._before, self._left = name, None
+        self._before, self._pending = name, None
 
     def finish(self) -> None:
         """Write the last set of the last span."""
-        if self._left is not None and self._at is not None:
+        if self._pending is not None and self._at is not None:
             self._end_span((self._at + 1) * self._span_ns)
 
     def end(self) -> None:
         """End the curve. After this call, the set is unknown."""
         if self._last is not None:
             self._states.add(*self._last, state=[])
-        self._before = self._at = self._last = self._left = None
+        self._before = self._at = self._last = self._pending = None
 
     def flush(self) -> None:
         """Send the buffered changes."""

@@ -230,8 +230,8 @@ class Drawing:
             near = np.abs(age) <= _LARGEST_AGE_NS
             self.age.add(at[near], steps[samples][near], age[near, None] / 1e6)
             interval = np.diff(at, prepend=at[0] if self._sample_ns is None else self._sample_ns)
-            known = slice(1 if self._sample_ns is None else 0, None)
-            self.interval.add(at[known], steps[samples][known], interval[known, None] / 1e6)
+            after_first = slice(1 if self._sample_ns is None else 0, None)
+            self.interval.add(at[after_first], steps[samples][after_first], interval[after_first, None] / 1e6)
             self._sample_ns = int(at[-1])
         for index in sorted(entries.others):
             self._back(samples[: np.searchsorted(samples, index)], stamps, steps)
@@ -307,9 +307,9 @@ class Drawing:
         self._band_end = stamps[-1:], steps[-1:], total[-1:]
         if len(stamps) > 1 and not self.band.span_ns:
             rows = np.arange(0.0, len(stamps) - 1, 1.0 / _BAND_ROWS)
-            known = np.arange(len(stamps))
-            total = np.stack([np.interp(rows, known, column) for column in total.T], axis=1)
-            stamps = stamps[0] + np.interp(rows, known, stamps - stamps[0]).astype(np.int64)
+            indices = np.arange(len(stamps))
+            total = np.stack([np.interp(rows, indices, column) for column in total.T], axis=1)
+            stamps = stamps[0] + np.interp(rows, indices, stamps - stamps[0]).astype(np.int64)
             steps = steps[rows.astype(np.int64)]
         if not self._band_colored and len(stamps) > 1:
             self._color_bands(stamps, steps)

@@ -29,12 +29,12 @@ class Envelope:
         #: Width of a bin [s]; 0 as long as all rows are stored.
         self._bin_s = 0.0
         # `place` is the time [s] of a row, or the number of its bin
-        self._kept = _Rows(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, width)), np.zeros((0, width)))
+        self._merged = _Rows(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, width)), np.zeros((0, width)))
         self._added: list[_Rows] = []
         self._added_rows = 0
 
     def __bool__(self) -> bool:
-        return bool(self._added_rows or len(self._kept.place))
+        return bool(self._added_rows or len(self._merged.place))
 
     def add(self, times_s: Array, values: Array) -> None:
         """Add times [s], shape (n,), and values, shape (n, width)."""
@@ -61,7 +61,7 @@ class Envelope:
         The time of a bin is the middle of the bin.
         """
         self._merge()
-        rows = self._kept
+        rows = self._merged
         times = (rows.place + 0.5) * self._bin_s if self._bin_s else rows.place
         breaks = np.flatnonzero(np.diff(rows.segment)) + 1
         times, least, largest = (
@@ -76,17 +76,17 @@ class Envelope:
             return
         if self._bin_s:
             added = added.binned(self._bin_s)
-        self._kept = _Rows.joined([self._kept, added])
+        self._merged = _Rows.joined([self._merged, added])
         if not self._bin_s:
-            if len(self._kept.place) <= self._most_rows:
+            if len(self._merged.place) <= self._most_rows:
                 return
-            self._bin_s = max(2.0 * float(np.ptp(self._kept.place)) / self._most_bins, 1e-9)
-            self._kept = self._kept.binned(self._bin_s)
-        self._kept = self._kept.merged()
+            self._bin_s = max(2.0 * float(np.ptp(self._merged.place)) / self._most_bins, 1e-9)
+            self._merged = self._merged.binned(self._bin_s)
+        self._merged = self._merged.merged()
         # bins of different segments are never merged, so the limit may not be reached
-        while len(self._kept.place) > self._most_bins and np.ptp(self._kept.place) > 1.0:
+        while len(self._merged.place) > self._most_bins and np.ptp(self._merged.place) > 1.0:
             self._bin_s *= 2.0
-            self._kept = self._kept.binned(2.0).merged()
+            self._merged = self._merged.binned(2.0).merged()
 
 
 class _Rows:

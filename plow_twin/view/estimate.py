@@ -39,9 +39,9 @@ def estimate_picture(
 
 
 def _value(label: str, value: Interval, prior: Interval | None, factor: float, digits: str, state: str) -> FittedValue:
-    known = None if prior is None else _scaled(prior, factor)
+    scaled_prior = None if prior is None else _scaled(prior, factor)
     logarithmic = label.startswith(("stiffness", "damping"))
-    return FittedValue(label, _scaled(value, factor), known, digits, state, logarithmic)
+    return FittedValue(label, _scaled(value, factor), scaled_prior, digits, state, logarithmic)
 
 
 def _scaled(value: Interval, factor: float) -> tuple[float, float, float]:

@@ -54,7 +54,7 @@ def run_figure(reader: RunReader, curves: RunCurves) -> Figure:
     from matplotlib.figure import Figure
 
     if not curves:
-        raise RecordingError(f"{reader.path}: got no row to draw ({reader.status.value}), expected some")
+        raise RecordingError(f"{reader.path}: got no row to draw ({reader.status.value}), expected at least one")
     section = Section.of(reader.header.scene(reader.path))
     figure = Figure(figsize=(15, 8.5), layout="constrained")
     grid = figure.add_gridspec(3, 3)

@@ -93,17 +93,17 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def page_port(asked: int) -> int:
+def page_port(requested: int) -> int:
     """Return the given port for a page, or a free port for 0. Raise `RecordingError` if the port is in use."""
-    if not asked:
+    if not requested:
         return free_port()
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind((LOOPBACK, asked))
+            probe.bind((LOOPBACK, requested))
         except OSError as error:
-            raise RecordingError(f"web port: got {asked}, expected a free port, or 0 ({error.strerror})") from error
-    return asked
+            raise RecordingError(f"web port: got {requested}, expected a free port, or 0 ({error.strerror})") from error
+    return requested
 
 
 def _answers(port: int) -> bool:

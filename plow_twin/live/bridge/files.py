@@ -153,7 +153,7 @@ class _Dated:
 
     def __init__(self, pattern: Path) -> None:
         self._pattern, self.topic = pattern, pattern.stem
-        self._known: set[Path] = set()
+        self._seen_files: set[Path] = set()
         self._tails: list[_Tail] = []
         self._look_s = 0.0
 
@@ -174,17 +174,17 @@ class _Dated:
             return arrived_rows
         self._look_s = time.monotonic() + _LOOK_FOR_FILES_S
         there = self.files()
-        new = [file for file in there if file not in self._known]
-        if new and not self._known:
+        new = [file for file in there if file not in self._seen_files]
+        if new and not self._seen_files:
             new = [max(new, key=_changed_ns)]
-        self._known.update(there)
+        self._seen_files.update(there)
         for file in new:
             rows = self._tails[-1].rows if self._tails else Rows()
-            left = 0
+            unread = 0
             for tail in self._tails[:-1]:
-                left += tail.lines.begun
+                unread += tail.lines.begun
                 tail.close()
-            self._tails = [*self._tails[-1:], _Tail(file, self.topic, rows=rows, left=left)]
+            self._tails = [*self._tails[-1:], _Tail(file, self.topic, rows=rows, left=unread)]
         return self.read() if new else arrived_rows
 
     def close(self) -> None:

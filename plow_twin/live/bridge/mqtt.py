@@ -49,7 +49,7 @@ class Mqtt(Bridge):
         self._from_before = True
         self._queue: deque[tuple[str, bytes, int, bool]] = deque()
         #: total sizes of the payloads that entered the queue and left it [B]; only one thread changes each number
-        self._came = self._left = 0
+        self._bytes_received = self._bytes_taken = 0
         self._arrived = threading.Event()
         self._answer = threading.Event()
         self._client = self._make_client(tls)
@@ -73,18 +73,18 @@ class Mqtt(Bridge):
         answered = self._answer.wait(self._connect_s)
         trouble = self.trouble if answered else f"no answer within {self._connect_s:g} s"
         if trouble:
-            seen = f"; {self.trouble}" if self.trouble and not answered else ""
+            reason = f"; {self.trouble}" if self.trouble and not answered else ""
             self.close()
-            raise BridgeError(f"{self._access.url}: {trouble}{seen}")
+            raise BridgeError(f"{self._access.url}: {trouble}{reason}")
 
     def poll(self, timeout_s: float) -> list[Arrived]:
         """Return the messages that have arrived."""
         if not self._queue:
             self._arrived.wait(timeout_s)
         self._arrived.clear()
-        taken = [self._queue.popleft() for _ in range(len(self._queue))]
-        self._left += sum(len(payload) for _, payload, _, _ in taken)
-        return [Arrived(topic, time_ns, read_json(payload), retained) for topic, payload, time_ns, retained in taken]
+        messages = [self._queue.popleft() for _ in range(len(self._queue))]
+        self._bytes_taken += sum(len(payload) for _, payload, _, _ in messages)
+        return [Arrived(topic, time_ns, read_json(payload), retained) for topic, payload, time_ns, retained in messages]
 
     def close(self) -> None:
         """Disconnect. The broker stores messages until the session is resumed."""
@@ -132,10 +132,10 @@ class Mqtt(Bridge):
     def _on_message(self, client: Any, data: Any, message: Any) -> None:
         # a payload that is too long is replaced by an empty payload, which is counted as an invalid message
         payload = message.payload if len(message.payload) <= LONGEST else b""
-        if len(self._queue) >= _QUEUE or self._came - self._left + len(payload) > _QUEUED_BYTES:
+        if len(self._queue) >= _QUEUE or self._bytes_received - self._bytes_taken + len(payload) > _QUEUED_BYTES:
             self.lost += 1
             return
-        self._came += len(payload)
+        self._bytes_received += len(payload)
         self._queue.append((message.topic, payload, time.time_ns(), message.retain and self._from_before))
         self._arrived.set()
 

@@ -171,8 +171,8 @@ def _undo(s, lanes, bits) -> None:
 
 @kernel()
 def _steps_since(lanes, lane) -> int:
-    taken: int = lanes.counts[STEPS, lane] - lanes.kept_counts[STEPS, lane]
-    return taken
+    steps: int = lanes.counts[STEPS, lane] - lanes.kept_counts[STEPS, lane]
+    return steps
 
 
 @kernel()
@@ -373,9 +373,9 @@ def _go_on(s, lanes, passed) -> int:
 @kernel()
 def _limit_steps(lanes) -> int:
     """Write the longest admissible step of each lane. Return a bit mask of lanes that have not reached a sample."""
-    left, longest = exact_row(lanes.stop, 0) - exact_row(lanes.time, 0), exact_splat(LONGEST_STEP)
-    ahead = below(exact_splat(0.0), left)
-    whole = choose(below(left, longest), left, longest)
+    remaining, longest = exact_row(lanes.stop, 0) - exact_row(lanes.time, 0), exact_splat(LONGEST_STEP)
+    ahead = below(exact_splat(0.0), remaining)
+    whole = choose(below(remaining, longest), remaining, longest)
     # an empty lane needs finite results
     set_row(lanes.whole, 0, choose(ahead, whole, exact_row(lanes.whole, 0)))
     return ahead
@@ -394,13 +394,13 @@ def _look(s, rest, lanes, lane, budget, in_range, ahead) -> int:
     state = s.states[member]
     if not in_range and not lane_in_range(lanes, s.params[member], state, lane):
         return _RANGE
-    taken = _steps_since(lanes, lane)
+    steps = _steps_since(lanes, lane)
     if not ahead:
         return _AT_SAMPLE
-    if taken >= budget:
+    if steps >= budget:
         return _BUDGET
     if rest is not None:  # noqa: SIM102 - left out by types
-        if taken >= _MAY_REST and _is_steady(lanes, lane):
+        if steps >= _MAY_REST and _is_steady(lanes, lane):
             write_place(state, lanes, lane)
             if slow_enough(s.params[member], state.y):
                 return OTHER_METHOD
@@ -413,7 +413,7 @@ def _get_ready(s, viscous, hysteretic, power, fraction, slip, rest, lanes, budge
     while True:
         if lanes.live[0] == 0 and not _next_block(s, hysteretic, power, slip, lanes):
             return False
-        in_range, ahead, failed, left = bits_in_range(lanes), _limit_steps(lanes), 0, 0
+        in_range, ahead, failed, remaining = bits_in_range(lanes), _limit_steps(lanes), 0, 0
         reached = lanes.live[0] & in_range & ~ahead & ~lanes.failed[0]
         for lane in range(WIDTH):
             if lanes.member[lane] < 0 or reached >> lane & 1:
@@ -425,7 +425,7 @@ def _get_ready(s, viscous, hysteretic, power, fraction, slip, rest, lanes, budge
                 reached |= 1 << lane
             elif code == OTHER_METHOD:
                 _leave(s, lanes, lane)
-                left |= 1 << lane
+                remaining |= 1 << lane
             elif code != _OK:
                 _fail(s, lanes, lane, code)
                 failed |= 1 << lane
@@ -434,10 +434,10 @@ def _get_ready(s, viscous, hysteretic, power, fraction, slip, rest, lanes, budge
             _write_outputs(lanes, reached, viscous, hysteretic, power, fraction)
             _write_rows(s, lanes, reached)
             _clear_sums(s, lanes, reached)
-        if left | failed != 0:
+        if remaining | failed != 0:
             note_modes(lanes)
         ready = _go_on(s, lanes, reached | failed)
-        if left | failed == 0 and ready == reached:
+        if remaining | failed == 0 and ready == reached:
             return True
 
 

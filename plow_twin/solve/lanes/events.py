@@ -214,10 +214,10 @@ def _choose_guards(lanes, at, hysteretic, fraction) -> int:
     for lane in range(WIDTH):
         busy |= 1 << lane if lanes.todo[lane] != 0 else 0
     while busy != 0 and count < WIDTH:
-        left = busy
-        while left != 0 and count < WIDTH:
-            lane = lowest_bit(left)
-            left &= left - 1
+        remaining = busy
+        while remaining != 0 and count < WIDTH:
+            lane = lowest_bit(remaining)
+            remaining &= remaining - 1
             todo = lanes.todo[lane]
             guard, todo = lowest_bit(todo), todo & todo - 1
             lanes.todo[lane] = todo
@@ -430,10 +430,10 @@ def _search(lanes, w, at, order, bits) -> None:
         found |= _isolate_first(lanes, guard, w, order, several)
     if found != 0:
         cross(lanes, guard, order, found)
-    left = single | several
-    while left != 0:
-        i = lowest_bit(left)
-        left &= left - 1
+    remaining = single | several
+    while remaining != 0:
+        i = lowest_bit(remaining)
+        remaining &= remaining - 1
         lane, begin, root = lanes.owner[at, i], lanes.begin[i], lanes.root[i]
         if found >> i & 1 == 0:
             column = w.column[0]

@@ -122,10 +122,10 @@ def _fill_rows(members, lanes, order, fraction, t) -> None:
     """Write the output rows within the steps of all lanes, one row of each lane at a time."""
     at, due = lanes.root, lanes.live[0]
     while True:
-        left, due = due, 0
-        while left != 0:
-            lane = lowest_bit(left)
-            left &= left - 1
+        remaining, due = due, 0
+        while remaining != 0:
+            lane = lowest_bit(remaining)
+            remaining &= remaining - 1
             i = members.first[lanes.member[lane]]
             if i < t.size and t[i] < end_of(lanes, lane, fraction):
                 at[lane] = sigma_of(lanes, lane, max(t[i] - lanes.time[lane], 0.0), fraction)
@@ -133,10 +133,10 @@ def _fill_rows(members, lanes, order, fraction, t) -> None:
         if due == 0:
             return
         _evaluate(lanes, order, exact_row(at, 0))
-        left = due
-        while left != 0:
-            lane = lowest_bit(left)
-            left &= left - 1
+        remaining = due
+        while remaining != 0:
+            lane = lowest_bit(remaining)
+            remaining &= remaining - 1
             member = lanes.member[lane]
             i = members.first[member]
             q, v, out = members.q[member, i], members.v[member, i], lanes.out
@@ -213,10 +213,10 @@ def _touch_or_release(p, lanes, pair, lane) -> None:
 
 @kernel()
 def _switch(p, sums, lanes, lane, hysteretic, fraction) -> None:
-    left = lanes.switching[lane]
-    while left != 0:
-        pair = lowest_bit(left)
-        left &= left - 1
+    remaining = lanes.switching[lane]
+    while remaining != 0:
+        pair = lowest_bit(remaining)
+        remaining &= remaining - 1
         new, old = lanes.switch[pair, lane], lanes.mode[pair, lane]
         lanes.mode[pair, lane] = new
         lanes.counts[EVENTS, lane] += 1

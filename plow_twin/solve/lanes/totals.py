@@ -212,10 +212,10 @@ def find_peaks(lanes, w, order) -> None:
     for k in range(order, -1, -1):
         top = fused(top, at, exact_row(lanes.bulge, k))
     set_row(lanes.root, 0, top)
-    left = single | several
-    while left != 0:
-        i = lowest_bit(left)
-        left &= left - 1
+    remaining = single | several
+    while remaining != 0:
+        i = lowest_bit(remaining)
+        remaining &= remaining - 1
         if several >> i & 1:
             force = w.column[0]
             for k in range(order + 1):

@@ -282,12 +282,12 @@ def _bodies(p, support, state, implicit, i) -> None:
     """Write the body coordinates at the start (i = 0) or at a node, and those relative to a frame on springs."""
     z, y = implicit.z[i], implicit.body[i]
     if support is not None:
-        seen, frame = implicit.seen[i], implicit.frame[i]
-        to_body_both(p, z, seen, implicit.rate[0, :6])
-        to_ground(seen, implicit.rate[0, :6], y)
+        relative, frame = implicit.seen[i], implicit.frame[i]
+        to_body_both(p, z, relative, implicit.rate[0, :6])
+        to_ground(relative, implicit.rate[0, :6], y)
         frame[FRAME_X], frame[FRAME_Y], frame[FRAME_THETA] = z[3], z[4], z[5]
         frame[FRAME_VX], frame[FRAME_VY], frame[SPIN] = z[9], z[10], z[11]
-        frame[RELATIVE_COS], frame[RELATIVE_SIN] = seen[COS], seen[SIN]
+        frame[RELATIVE_COS], frame[RELATIVE_SIN] = relative[COS], relative[SIN]
     else:
         to_body(p, state.y, z, y)
 
@@ -303,10 +303,10 @@ def _relative_nodes(support, implicit):
 @kernel()
 def _measure(p, support, state, implicit) -> None:
     """Write the acting force, the force by the law, and the penetration rate of each pair at the nodes."""
-    pairs, seen = implicit.pairs, _relative_nodes(support, implicit)
+    pairs, relative = implicit.pairs, _relative_nodes(support, implicit)
     for i in range(implicit.nodes.size):
         _bodies(p, support, state, implicit, i + 1)
-        y = seen[i + 1]
+        y = relative[i + 1]
         for pair in range(PAIR_COUNT):
             r = rate_of(p, pair, y)
             pairs[0, i, pair], pairs[1, i, pair], pairs[2, i, pair] = 0.0, 0.0, r
@@ -321,11 +321,11 @@ def _measure(p, support, state, implicit) -> None:
 def _wear_at_nodes(p, support, state, h, implicit, sliding, running_in) -> float:
     """Compute the wear rate and wear depth of each pad at the nodes. Return the largest change of a depth in m."""
     worn, rates, a, s, change = implicit.wear_depth, implicit.wearing, implicit.weights, implicit.nodes.size, 0.0
-    seen = _relative_nodes(support, implicit)
+    relative = _relative_nodes(support, implicit)
     _measure(p, support, state, implicit)
     for i in range(s):
         for pair in range(PAIR_COUNT):
-            faster = rubbing(p, pair, seen[i + 1], worn[i + 1, pair], sliding, running_in)
+            faster = rubbing(p, pair, relative[i + 1], worn[i + 1, pair], sliding, running_in)
             rates[i, pair] = p.wear_per_impulse[pair] * faster * max(implicit.pairs[0, i, pair], 0.0)
     for i in range(s):
         for pair in range(PAIR_COUNT):
@@ -413,15 +413,15 @@ def _interpolate(values, coefficients, h, out) -> None:
 def _relative_series(support, h, w, implicit):
     """Return the series of the body coordinates relative to the frame, and write the series of a frame on springs."""
     if support is not None:
-        frame, s, seen = implicit.frame, implicit.nodes.size, w.seen
-        _interpolate(implicit.seen, implicit.from_values, h, seen)
+        frame, s, relative = implicit.frame, implicit.nodes.size, w.seen
+        _interpolate(implicit.seen, implicit.from_values, h, relative)
         _interpolate(frame, implicit.from_values, h, w.frame)
         _interpolate(frame[1:], implicit.from_stages, h, w.left)
         for i in (FRAME_VX, FRAME_VY, SPIN):
             for k in range(s):
                 w.frame[k, i] = w.left[k, i]
             w.frame[s, i] = 0.0
-        return seen
+        return relative
     return w.series
 
 
@@ -455,13 +455,13 @@ def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float
         for k in range(s):
             w.series[k, i] = scratch[k, i]
         w.series[s, i] = 0.0
-    seen = _relative_series(support, h, w, implicit)
+    relative = _relative_series(support, h, w, implicit)
     _interpolate(pairs[0], implicit.from_stages, h, w.force)
     if wear is not None:
         _interpolate(implicit.wearing, implicit.from_stages, h, scratch)
     _interpolate(pairs[2], implicit.from_stages, h, w.rate)
     for k in range(s + 1):
-        y = seen[k]
+        y = relative[k]
         penetration = row_values(p.penetration_rows, y[COS], y[SIN], y[X], y[Y])
         if k == 0:
             penetration = penetration + row(p.penetration_rows, 4) - row(state.wear_depth, 0)
@@ -472,7 +472,7 @@ def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float
         set_row(w.penetration, k, penetration)
     size = grip = 0.0
     if stick is not None:
-        _write_grip(p, state, h, w, implicit, _relative_nodes(support, implicit), seen)
+        _write_grip(p, state, h, w, implicit, _relative_nodes(support, implicit), relative)
         grip = _last_of_guards(p, state, w, h)
     if ramp is not None:
         size = _write_ramp(p, h, w, implicit)
@@ -491,11 +491,11 @@ def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float
 
 
 @kernel()
-def _write_grip(p, state, h, w, implicit, seen, series) -> None:
+def _write_grip(p, state, h, w, implicit, relative, series) -> None:
     """Write the series of the slip rates and of the tangential forces (`solve.grip`)."""
     s, rates = implicit.nodes.size, w.right
     for i in range(s):
-        y = seen[i + 1]
+        y = relative[i + 1]
         for pair in range(PAIR_COUNT):
             rates[i, pair] = slip_rate(p, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
     _interpolate(rates, implicit.from_stages, h, w.slip[0])

@@ -467,7 +467,7 @@ def _walk_other(
         f"dropped_{verdict.value}": count for verdict, count in intake.counts.items() if not verdict.used and count
     }
     losses = {**source.losses.counts, **dropped}
-    losses |= {f"{UNFIT}{why}": count for why, count in feed.unfit.items()}
+    losses |= {f"{UNFIT}{reason}": count for reason, count in feed.unfit.items()}
     losses |= _failures(walkers)
     if writer is not None:
         writer.close({})

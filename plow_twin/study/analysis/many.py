@@ -50,19 +50,19 @@ def run_many(
 
 def _here(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> None:
     while waiting:
-        left = _round(tasks, waiting, workers, done)
+        remaining = _round(tasks, waiting, workers, done)
         # a task has killed its worker, so the first tasks run one at a time until this task is found
-        if len(left) == len(waiting):
-            left, first = left[workers:], left[:workers]
+        if len(remaining) == len(waiting):
+            remaining, first = remaining[workers:], remaining[:workers]
             for number in first:
                 if _round(tasks, [number], 1, done):
                     done(number, {"run": str(tasks[number].path), "error": "the worker was killed, twice"})
-        waiting = left
+        waiting = remaining
 
 
 def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> list[int]:
     """Run the waiting tasks once. Return the tasks that are unfinished because their worker died."""
-    left = []
+    remaining = []
     others = active_children()
     pool = ProcessPoolExecutor(min(workers, len(waiting)), get_context("spawn"), _begin, (loaded_laws(),))
     try:
@@ -71,14 +71,14 @@ def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _On
             try:
                 done(futures[future], future.result())
             except BrokenProcessPool:
-                left.append(futures[future])
+                remaining.append(futures[future])
     except BaseException:  # the next call repeats unfinished analyses
         for worker in set(active_children()).difference(others):
             worker.kill()
         raise
     finally:
         pool.shutdown(cancel_futures=True)
-    return sorted(left)
+    return sorted(remaining)
 
 
 def _begin(laws: tuple[str, ...]) -> None:

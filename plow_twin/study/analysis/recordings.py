@@ -67,7 +67,7 @@ def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
         if not inside and any(path.glob(f"*{SUFFIX}")):
             inside = [path]
         if not inside:
-            raise RecordingError(f"{path}: got a folder without recordings, expected some{packed(path)}")
+            raise RecordingError(f"{path}: got a folder without recordings, expected at least one{packed(path)}")
         recordings += inside
     return recordings
 
@@ -75,17 +75,17 @@ def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
 def counted_once(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
     """Return the recordings without repetitions of a path or a run, and a message for each repetition."""
     kept: dict[object, Path] = {}
-    left: list[str] = []
+    left_out: list[str] = []
     for path in paths:
         keys = path.resolve(), _identity(path)
-        known = next((kept[key] for key in keys if key in kept), None)
-        if known is None:
+        first = next((kept[key] for key in keys if key in kept), None)
+        if first is None:
             kept |= dict.fromkeys(keys, path)
-        elif known == path:
-            left.append(f"{path}: given twice, used once")
+        elif first == path:
+            left_out.append(f"{path}: given twice, used once")
         else:
-            left.append(f"{path}: left out: the same run as {known}")
-    return list(dict.fromkeys(kept.values())), left
+            left_out.append(f"{path}: left out: the same run as {first}")
+    return list(dict.fromkeys(kept.values())), left_out
 
 
 def _identity(path: Path) -> object:

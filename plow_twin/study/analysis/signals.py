@@ -63,8 +63,8 @@ def compare(t: Array, predicted: Array, t_measured: Array, measured: Array) -> C
 
 
 def _correlation(one: Array, other: Array) -> float | None:
-    known = np.isfinite(one) & np.isfinite(other)
-    one, other = one[known], other[known]
+    finite = np.isfinite(one) & np.isfinite(other)
+    one, other = one[finite], other[finite]
     if len(one) < _FEWEST:
         return None
     one, other = one - one.mean(), other - other.mean()
@@ -90,14 +90,14 @@ def _correlations(longer: Array, shorter: Array) -> Array:
     """
     from scipy.signal import correlate
 
-    known = np.flatnonzero(np.isfinite(longer))
+    finite = np.flatnonzero(np.isfinite(longer))
     n, begin = len(shorter), np.arange(len(longer) - len(shorter) + 1)
-    if not known.size:
+    if not finite.size:
         return np.full(len(begin), -1.0)
-    one, other = longer - longer[known].mean(), shorter - shorter.mean()
-    one[: known[0]] = one[known[-1] + 1 :] = 0.0
-    low = np.clip(known[0] - begin, 0, n)
-    high = np.clip(known[-1] + 1 - begin, low, n)
+    one, other = longer - longer[finite].mean(), shorter - shorter.mean()
+    one[: finite[0]] = one[finite[-1] + 1 :] = 0.0
+    low = np.clip(finite[0] - begin, 0, n)
+    high = np.clip(finite[-1] + 1 - begin, low, n)
     count = np.maximum(high - low, 1)
 
     def sums(series: Array, first: Any, last: Any) -> Array:

@@ -77,11 +77,11 @@ class Task:
         if self.out is None:
             return None
         try:
-            asked = json.loads((self.out / _INPUTS).read_text(encoding="utf-8"))
+            inputs = json.loads((self.out / _INPUTS).read_text(encoding="utf-8"))
             facts: dict[str, Any] = json.loads((self.out / "analysis.json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return None
-        return {**facts, "lossy": bool(facts["lost"])} if asked == self._asked() else None
+        return {**facts, "lossy": bool(facts["lost"])} if inputs == self._input_facts() else None
 
     def clear(self, inputs: Sequence[Path] = ()) -> None:
         """Remove the files of an earlier analysis. A run that a twin has recorded is not removed.
@@ -133,15 +133,15 @@ class Task:
     def run(self, on_progress: OnProgress = lambda share: None) -> dict[str, Any]:
         """Do the analysis, write its files and return its result, or raise a `PlowTwinError`."""
         self.clear()
-        asked = self._asked()  # the files may change during the analysis
+        inputs = self._input_facts()  # the files may change during the analysis
         analysis = self.analyse(on_progress=on_progress)
         analysis.left_out = self.left_out
         if self.out is not None:
             write_report(analysis, self.out)
-            write_whole(self.out / _INPUTS, json.dumps(asked, indent=1).encode(), sync=True)
+            write_whole(self.out / _INPUTS, json.dumps(inputs, indent=1).encode(), sync=True)
         return {**analysis.facts(), "lossy": analysis.lossy}
 
-    def _asked(self) -> dict[str, Any]:
+    def _input_facts(self) -> dict[str, Any]:
         """Return the inputs that determine the result."""
         folder = self.path if self.path.is_dir() else self.path.parent
         parts = [*sorted(folder.glob("*.mcap")), *beside_folders(folder)]

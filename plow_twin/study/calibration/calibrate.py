@@ -101,8 +101,8 @@ def calibrate(
             on_progress((number + share) / starts, min([best, *(start.objective for start in done)]))
 
         before = objective.runs
-        known = first if number == 0 else None
-        points, values = _evolve(space, objective, rng, search, known, report)
+        given_start = first if number == 0 else None
+        points, values = _evolve(space, objective, rng, search, given_start, report)
         point, best = _polish(space, objective, points[np.argmin(values)], search)
         populations.append((points, values))
         # the objective at the end of least squares may be larger than at the beginning

@@ -83,14 +83,16 @@ def target_rows(objective: TargetObjective, values: Mapping[str, Value]) -> list
     for target, residual in zip(objective.targets.targets, objective.unweighted(values), strict=True):
         columns = [paths.index(path) for path in target.statistics]
         got = tuple(float(numbers[settings.index(setting), columns].min()) for setting in target.settings)
-        asked = {
+        requirement = {
             "value": f"{target.number:g} within {target.tolerance:.0%}",
             "above": f"above {', '.join(target.others)}",
             "trend": f"{target.shape.replace('_', ' ')}",
         }.get(target.kind, f"{target.kind.replace('_', ' ')} {target.number:g}")
         met = target.met(float(residual))
         kind, first = target.kind, target.statistics[0]
-        rows.append(TargetRow(target.name, kind, first, asked, got, float(residual), met, target.mark, target.source))
+        rows.append(
+            TargetRow(target.name, kind, first, requirement, got, float(residual), met, target.mark, target.source)
+        )
     return rows
 
 

@@ -60,8 +60,8 @@ class TargetObjective:
         self._fill(table, candidates, everyone, [0], paths)
         if len(settings) > 1:
             first = np.nansum(self._rows(table, paths, missing=np.nan) ** 2, axis=1)
-            left = np.flatnonzero(np.where(np.isfinite(table[:, 0].sum(axis=1)), first <= cut, False))
-            self._fill(table, candidates, left, list(range(1, len(settings))), paths)
+            candidates_left = np.flatnonzero(np.where(np.isfinite(table[:, 0].sum(axis=1)), first <= cut, False))
+            self._fill(table, candidates, candidates_left, list(range(1, len(settings))), paths)
         return self._rows(table, paths, missing=FAILED_RESIDUAL)
 
     def unweighted(self, candidate: Values) -> Array:

@@ -79,8 +79,8 @@ def _got_and_asked(target: TargetRow) -> str:
     unit = unit_of(target.statistic)
     factor, shown = (1e-3, " kN") if unit == "N" else (1.0, "" if unit == "1" else f" {unit}")
     got = ", ".join(signed(factor * value, ".4g") for value in target.got)
-    asked = target.asked
+    requirement = target.asked
     if target.kind == "value" and unit == "N":
-        number, _, rest = asked.partition(" ")
-        asked = f"{signed(factor * float(number), 'g')}{shown} {rest}"
-    return f"got {got}{shown}; asked {asked}"
+        number, _, rest = requirement.partition(" ")
+        requirement = f"{signed(factor * float(number), 'g')}{shown} {rest}"
+    return f"got {got}{shown}; asked {requirement}"

@@ -135,12 +135,12 @@ class TargetSet:
         for pattern in patterns:
             if not any(fnmatchcase(name, pattern) for name in names):
                 raise StudyError(f"without: got {pattern!r}, expected a pattern of {', '.join(map(repr, names))}")
-        left = tuple(
+        remaining = tuple(
             target for target in self.targets if not any(fnmatchcase(target.name, pattern) for pattern in patterns)
         )
-        if not left:
+        if not remaining:
             raise StudyError(f"without: got {', '.join(map(repr, patterns))}, expected patterns that leave a target")
-        return TargetSet(left, self.t_end_s, self.tol, self.source, self.unknowns)
+        return TargetSet(remaining, self.t_end_s, self.tol, self.source, self.unknowns)
 
 
 _ABOVE_0: Final[Schema] = {"type": "number", "exclusiveMinimum": 0.0, "description": "a number > 0"}
@@ -223,5 +223,5 @@ def _target(item: Mapping[str, Any], scene: Scene) -> Target:
     )  # fmt: skip
 
 
-def _texts(given: str | list[str]) -> tuple[str, ...]:
-    return (given,) if isinstance(given, str) else tuple(given)
+def _texts(texts: str | list[str]) -> tuple[str, ...]:
+    return (texts,) if isinstance(texts, str) else tuple(texts)

@@ -130,18 +130,18 @@ def changes(before: Drawn, after: Drawn) -> list[Change | None]:
     """
     result: list[Change | None] = [None] * before.mean.shape[1]
     fewest = min(before.size, after.size)
-    known = np.flatnonzero(before.mean[0] > 0.0)
+    positive = np.flatnonzero(before.mean[0] > 0.0)
     if fewest < FEWEST:
         return result
-    mean = before.mean[:, known]
-    effect = _tested(after.mean[:, known] - mean, mean, fewest)
+    mean = before.mean[:, positive]
+    effect = _tested(after.mean[:, positive] - mean, mean, fewest)
     at_equal_load = None
     if not _apart(before, after):
-        rest = _at_equal_load(before, after)[:, known]
-        left = np.isfinite(rest[:, 0]) if len(known) else np.zeros(len(rest), bool)
-        if left[0] and left[1:].mean() >= 0.9:
-            at_equal_load = _tested(rest[left], mean[left], fewest)
-    for place, cell in enumerate(known.tolist()):
+        rest = _at_equal_load(before, after)[:, positive]
+        determined = np.isfinite(rest[:, 0]) if len(positive) else np.zeros(len(rest), bool)
+        if determined[0] and determined[1:].mean() >= 0.9:
+            at_equal_load = _tested(rest[determined], mean[determined], fewest)
+    for place, cell in enumerate(positive.tolist()):
         machine = (None,) * 4 if at_equal_load is None else (part[place].item() for part in at_equal_load)
         result[cell] = Change(*(part[place].item() for part in effect), *machine)
     return result

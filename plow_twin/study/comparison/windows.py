@@ -128,7 +128,7 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
     numbers = sorted(number for number, row in sums.messages.rows.items() if row[0] >= full and number not in silent)
     if not numbers:
         raise RecordingError(
-            f"{recording.path}: got a silence in each window, expected some complete windows; "
+            f"{recording.path}: got a silence in each window, expected at least one complete window; "
             "a silence is an interval between samples that is longer than excitation_timeout"
         )
     return sums.windows(numbers, len(silent))
@@ -193,11 +193,11 @@ class _RunSums:
 
     def silent(self) -> set[int]:
         """Return the windows that overlap a time without samples, with the window of the first message after it."""
-        known, silent = np.array(sorted(self.messages.rows)), set[int]()
+        windows, silent = np.array(sorted(self.messages.rows)), set[int]()
         for begin, end in self._silent_ns:
-            first = np.searchsorted(known, begin // self._window_ns)
-            last = np.searchsorted(known, end // self._window_ns, side="right")
-            silent.update(known[first:last].tolist())
+            first = np.searchsorted(windows, begin // self._window_ns)
+            last = np.searchsorted(windows, end // self._window_ns, side="right")
+            silent.update(windows[first:last].tolist())
         return silent
 
     def windows(self, numbers: list[int], silent: int) -> Windows:
@@ -224,9 +224,9 @@ class _RunSums:
 
 def _between(sums: _Sums, count: _Sums, numbers: list[int]) -> Array:
     """Return the means of windows, interpolated for a window without a message."""
-    known = sorted(sums.rows)
-    means = sums.of(known) / count.of(known)
-    return np.column_stack([np.interp(numbers, known, column) for column in means.T])
+    windows = sorted(sums.rows)
+    means = sums.of(windows) / count.of(windows)
+    return np.column_stack([np.interp(numbers, windows, column) for column in means.T])
 
 
 def _risen(part: Batched, window: Indexes) -> tuple[Batched, Indexes]:

@@ -44,7 +44,9 @@ class Drops:
 
     def usable(self) -> list[int]:
         """Return the indices of the drops that have at least two bounces and a flight long enough for a fit."""
-        return [i for i, given in enumerate(self.flight_rows) if given > LEAST_ROWS and len(self.bounces[i]) > 1]
+        return [
+            i for i, flight_rows in enumerate(self.flight_rows) if flight_rows > LEAST_ROWS and len(self.bounces[i]) > 1
+        ]
 
     def until(self, index: int, bounce: int) -> int:
         """Return the row of a bounce, counted from 0, or the row of the last bounce if the drop has fewer bounces."""

@@ -180,17 +180,19 @@ def simulated_impact(before: ArrayLike) -> Array:
 
 def _numbers(contact: EllipseContact, speed: Array, along: Array, normal_arm: Array) -> tuple[Array, NDArray[np.void]]:
     """Return the damping factors lambda [s/m], shape (n,), and all other parameters, which the impacts share."""
-    law, wanted = LAWS[contact.law], contact.restitution
-    e = np.clip(wanted * (speed / USUAL_SPEED) ** -contact.fall - contact.fall_along * np.abs(along), _LEAST, _LARGEST)
+    law, restitution = LAWS[contact.law], contact.restitution
+    e = np.clip(
+        restitution * (speed / USUAL_SPEED) ** -contact.fall - contact.fall_along * np.abs(along), _LEAST, _LARGEST
+    )
     viscous, damping = 0.0, np.zeros_like(speed)
     if law.additive:
         mobility = 1.0 + float(np.mean(normal_arm**2)) / GYRATION**2
-        viscous = 2.0 * wanted * (_STIFFNESS / mobility) ** 0.5
+        viscous = 2.0 * restitution * (_STIFFNESS / mobility) ** 0.5
     elif law.number_of is not None:
         grid = np.linspace(_LEAST, _LARGEST, 500)
         damping = np.interp(e, grid, [law.damping_number(one) for one in grid]) / speed
     else:
-        damping[:] = wanted / USUAL_SPEED
+        damping[:] = restitution / USUAL_SPEED
     spring = contact.stick_stiffness * _STIFFNESS
     ramp = 0.1 * USUAL_SPEED / _STIFFNESS**0.5 if law.ramped else 0.0
     numbers = (

@@ -252,15 +252,15 @@ def ensemble(
     The rows are counted from the first row of `first_flight`. See `fit_flight` for the remaining arguments.
     """
     flight = fit_flight(first_flight, block, scatter)
-    given = len(flight.times)
-    ahead = max(n_rows - given + 1, 1)
+    measured_rows = len(flight.times)
+    ahead = max(n_rows - measured_rows + 1, 1)
     states, blocks, touches = draw(flight, members, seed, block, scatter)
     tossed = marker.measured(toss(marker.state_of_block(states), ahead, blocks, touches)[:, :, :3])
-    paths = np.empty((members, max(n_rows, given), 3))
-    paths[:, given - 1 : given - 1 + ahead] = tossed
+    paths = np.empty((members, max(n_rows, measured_rows), 3))
+    paths[:, measured_rows - 1 : measured_rows - 1 + ahead] = tossed
     for j in range(3):
         way, fall = _free_flight(block, j, flight.times[:-1])
-        paths[:, : given - 1, j] = states[:, j, None] + states[:, 3 + j, None] * way + fall
+        paths[:, : measured_rows - 1, j] = states[:, j, None] + states[:, 3 + j, None] * way + fall
     noise = np.random.default_rng([seed, 1]).standard_normal(paths.shape)
     paths += noise * [scatter.place, scatter.place, scatter.angle]
     return paths[:, :n_rows]

@@ -85,7 +85,7 @@ class Sweep:
         scene = self.scene()
         paths = [axis.path for axis in self.axes]
         if not 1 <= len(paths) <= 2 or len(set(paths)) < len(paths):
-            raise StudyError(f"axes: got {paths}, expected one parameter or two different ones")
+            raise StudyError(f"axes: got {paths}, expected one parameter, or two different parameters")
         if self.size > _MOST_MEMBERS:
             raise StudyError(f"axes: got {self.size} members, expected at most {_MOST_MEMBERS}")
         if not self.statistics or len(set(self.statistics)) < len(self.statistics):

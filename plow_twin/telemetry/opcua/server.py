@@ -49,8 +49,8 @@ class OneUser(UserManager):
         self, iserver: Any, username: str | None = None, password: str | None = None, certificate: Any = None
     ) -> User | None:
         """Return a user with read access, or None if the credentials are wrong."""
-        given = zip((self._user, self._password), (username or "", password or ""), strict=True)
-        right = all([hmac.compare_digest(own.encode(), value.encode("utf-8", "replace")) for own, value in given])
+        pairs = zip((self._user, self._password), (username or "", password or ""), strict=True)
+        right = all([hmac.compare_digest(own.encode(), value.encode("utf-8", "replace")) for own, value in pairs])
         return User(UserRole.User, username) if right or not self._user else None
 
 

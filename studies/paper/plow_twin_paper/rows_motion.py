@@ -82,15 +82,15 @@ def _largest(table: dict[tuple[Sense, str], dict[str, float]]) -> Iterator[Row]:
     for force in FORCES:
         values = {letter: table[force.sense, letter][force.statistic] for letter in CORNERS}
         first = max(values, key=lambda letter: values[letter])
-        what = f"{SENSE_NAMES[force.sense]}: {_STATISTICS[force.statistic]}"
+        title = f"{SENSE_NAMES[force.sense]}: {_STATISTICS[force.statistic]}"
         listed = ", ".join(f"{letter} {value / 1e3:.2f}" for letter, value in values.items())
         yield Row(
-            _FORCES, FORCES_SOURCE, f"{what} is at {force.corner}", f"at {force.corner}", f"at {first} ({listed} kN)",
+            _FORCES, FORCES_SOURCE, f"{title} is at {force.corner}", f"at {force.corner}", f"at {first} ({listed} kN)",
             Verdict.of(first == force.corner), "the same point", FITTED,
         )  # fmt: skip
         value = values[force.corner]
         yield Row(
-            _FORCES, FORCES_SOURCE, f"{what}, at {force.corner}", f"{force.value_n / 1e3:.0f}", f"{value / 1e3:.2f}",
+            _FORCES, FORCES_SOURCE, f"{title}, at {force.corner}", f"{force.value_n / 1e3:.0f}", f"{value / 1e3:.2f}",
             Verdict.of(abs(value - force.value_n) <= FORCE_TOLERANCE * force.value_n),
             f"within {FORCE_TOLERANCE:.0%}{_MEAN_OVER if force.statistic == 'mean_in_contact' else ''}",
             FITTED, "kN", force.value_n / 1e3, value / 1e3,

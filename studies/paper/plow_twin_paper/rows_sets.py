@@ -55,9 +55,9 @@ def _sizes(sense: Sense, timeline: Sequence[Hold]) -> Iterator[Row]:
     shares = paper_sets.share_by_size(timeline)
     text = ", ".join(f"{size}: {share:.1%}" for size, share in enumerate(shares, start=1))
     name = SENSE_NAMES[sense]
-    said = "" if sense == "ccw" else " (said of counter-clockwise alone, taken for both)"
+    remark = "" if sense == "ccw" else " (said of counter-clockwise alone, taken for both)"
     yield Row(
-        _SETS, _FIGURES["ccw"], f"{name}: two-point contact is the most frequent{said}", "two points most often",
+        _SETS, _FIGURES["ccw"], f"{name}: two-point contact is the most frequent{remark}", "two points most often",
         f"share of the contact time by number of points {text}", Verdict.of(max(shares) == shares[1] > 0.0),
         "largest share of the contact time", FITTED,
     )  # fmt: skip
@@ -82,9 +82,9 @@ def _quoted(moment: Moment, timeline: Sequence[Hold]) -> Row:
     near = paper_sets.nearest(timeline, time, moment.corners)
     load = math.sin(OMEGA_RAD_S * moment.time_s)
     at_time = "" if time == moment.time_s else f" at {time:.2f} s, the same phase"
-    what = f"{SENSE_NAMES[moment.sense]} contact at {moment.time_s:g} s (load at sin = {load:+.2f})"
+    title = f"{SENSE_NAMES[moment.sense]} contact at {moment.time_s:g} s (load at sin = {load:+.2f})"
     return Row(
-        _TIMES, f"section 3, {moment.figure}", what, braces(moment.corners),
+        _TIMES, f"section 3, {moment.figure}", title, braces(moment.corners),
         f"{braces(paper_sets.at(timeline, time))}{at_time}; the quoted set at this phase in {same} of {len(cycles)} "
         f"periods; {_near(near, moment)}", Verdict.of(paper_sets.at(timeline, time) == moment.corners),
         "the same set at that time, or at that phase in a shorter run", CHECK,

@@ -64,8 +64,8 @@ def rows(runs: PaperRuns) -> list[Row]:
 def _corners(sweep: Sweep, group: str, source: str, falls: bool) -> Iterator[Row]:
     at = ", ".join(f"{1e3 * value:g}" for value in GRID_M)
     for column, corner in enumerate(CORNERS):
-        what = f"point {corner}: largest force against {group.partition(' (')[0].lower()}"
-        yield _trend(group, source, what, sweep.on_grid()[:, column], at, falls, FITTED if corner in "ab" else CHECK)
+        title = f"point {corner}: largest force against {group.partition(' (')[0].lower()}"
+        yield _trend(group, source, title, sweep.on_grid()[:, column], at, falls, FITTED if corner in "ab" else CHECK)
     forces, along = sweep.on_grid(), group.partition(" (")[0].lower()
     first = [CORNERS[int(row.argmax())] if np.isfinite(row).all() else "?" for row in forces]
     yield Row(
@@ -76,11 +76,11 @@ def _corners(sweep: Sweep, group: str, source: str, falls: bool) -> Iterator[Row
     )  # fmt: skip
 
 
-def _trend(group: str, source: str, what: str, values: Array, at: str, falls: bool, inputs: str) -> Row:
+def _trend(group: str, source: str, title: str, values: Array, at: str, falls: bool, inputs: str) -> Row:
     computed = np.isfinite(values).all()
     agrees = bool(computed) and (rises_then_falls(values) if falls else rises(values))
     return Row(
-        group, source, what, "rises, then falls" if falls else "rises",
+        group, source, title, "rises, then falls" if falls else "rises",
         f"{', '.join(f'{value / 1e3:.1f}' for value in values)} kN at {at} mm",
         Verdict.of(agrees) if computed else Verdict.NOT_COMPUTED, _RISES_THEN_FALLS if falls else _RISES, inputs,
     )  # fmt: skip

@@ -161,8 +161,8 @@ class OpcUa(Bridge):
             counts["unfilled_s"] += time.monotonic() - self._broken_s
         values |= {key: f"{value:g}" for key, value in counts.items()}
         values["no_history"] = self._no_history
-        said = self.trouble or complaint
-        return int(bool(said)), said, values
+        message = self.trouble or complaint
+        return int(bool(message)), message, values
 
     def _run(self) -> None:
         with suppress(asyncio.CancelledError):
@@ -319,16 +319,16 @@ class OpcUa(Bridge):
         assert self._link is not None
         values = await self._link.history(begin_ns, end_ns)
         new = [item for item in values if self._stamp_ns(*item) > self._newest_ns(item[0])]
-        asked = [item for item in new if self._stamp_ns(*item) <= end_ns + _OVERLAP_NS]
-        self._counts.history_strays += len(new) - len(asked)
-        self._counts.values_filled += len(asked)
+        within_interval = [item for item in new if self._stamp_ns(*item) <= end_ns + _OVERLAP_NS]
+        self._counts.history_strays += len(new) - len(within_interval)
+        self._counts.values_filled += len(within_interval)
         now_s = time.monotonic()
-        for number, value in asked:
+        for number, value in within_interval:
             self._add(number, value, now_s)
         self._pass_on(float("-inf"))
         while len(self._queue) > _QUEUE // 2:
             await asyncio.sleep(0.01)
-        return len(asked)
+        return len(within_interval)
 
     def _pass_on(self, now_s: float) -> None:
         log_ns = time.time_ns()
@@ -360,14 +360,14 @@ def _node_id(text: str) -> ua.NodeId:
 
 
 def _check_encryption(access: Access, host: str) -> None:
-    given = (access.certificate, access.key, access.ca)
-    if any(given) and not all(given):
+    files = (access.certificate, access.key, access.ca)
+    if any(files) and not all(files):
         raise BridgeError("certificates: expected --tls-cert, --tls-key and --tls-ca (of the server) together")
     if bool(access.user_certificate) != bool(access.user_key):
         raise BridgeError("user: expected --user-cert and --user-key together")
-    if access.user_certificate and (access.user or not all(given)):
+    if access.user_certificate and (access.user or not all(files)):
         raise BridgeError("user: --user-cert replaces --user, and needs --tls-cert, --tls-key and --tls-ca")
-    if not any(given) and not access.plain and not is_loopback(host):
+    if not any(files) and not access.plain and not is_loopback(host):
         raise BridgeError(
             f"{access.url}: got another machine without certificates, expected --tls-cert or this machine"
         )

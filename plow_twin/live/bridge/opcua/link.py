@@ -159,12 +159,14 @@ class Link:
         )
         values_read: list[tuple[int, Any]] = []
         reached = [details.StartTime] * len(self._nodes)
-        wanted = [(number, ua.HistoryReadValueId(NodeId=node)) for number, node in enumerate(self._nodes)]
-        while wanted:
-            asked = ua.HistoryReadParameters(details, ua.TimestampsToReturn.Both, False, [read for _, read in wanted])
-            results = await self._client.uaclient.history_read(asked)
+        requested = [(number, ua.HistoryReadValueId(NodeId=node)) for number, node in enumerate(self._nodes)]
+        while requested:
+            request = ua.HistoryReadParameters(
+                details, ua.TimestampsToReturn.Both, False, [read for _, read in requested]
+            )
+            results = await self._client.uaclient.history_read(request)
             more = []
-            for (number, read), result in zip(wanted, results, strict=True):
+            for (number, read), result in zip(requested, results, strict=True):
                 result.StatusCode.check()
                 values = getattr(result.HistoryData, "DataValues", None) or []
                 values_read += [(number, value) for value in values]
@@ -176,11 +178,11 @@ class Link:
                     more.append(
                         (number, ua.HistoryReadValueId(read.NodeId, ContinuationPoint=result.ContinuationPoint))
                     )
-            wanted = more
+            requested = more
         return values_read
 
     async def _subscribe(self) -> Revised:
-        asked = ua.CreateSubscriptionParameters(
+        request = ua.CreateSubscriptionParameters(
             RequestedPublishingInterval=PUBLISHING_MS,
             RequestedLifetimeCount=round(_LIFETIME_S * 1e3 / PUBLISHING_MS),
             RequestedMaxKeepAliveCount=round(_KEEPALIVE_S * 1e3 / PUBLISHING_MS),
@@ -189,7 +191,7 @@ class Link:
             Priority=0,
         )
         self._heard_s = time.monotonic()
-        granted = await self._client.uaclient.create_subscription(asked, self._on_publish)
+        granted = await self._client.uaclient.create_subscription(request, self._on_publish)
         self._subscription = granted.SubscriptionId
         self._keepalive_s = granted.RevisedPublishingInterval * granted.RevisedMaxKeepAliveCount * 1e-3
         # each stamp is a sample, so a node with a new stamp must be sent even if its value has not changed
@@ -228,8 +230,8 @@ class Link:
             )
             for number in numbers
         ]
-        asked = ua.CreateMonitoredItemsParameters(self._subscription, ua.TimestampsToReturn.Both, items)
-        return dict(zip(numbers, await self._client.uaclient.create_monitored_items(asked), strict=True))
+        request = ua.CreateMonitoredItemsParameters(self._subscription, ua.TimestampsToReturn.Both, items)
+        return dict(zip(numbers, await self._client.uaclient.create_monitored_items(request), strict=True))
 
     async def _on_publish(self, result: ua.PublishResult) -> None:
         self._heard_s = time.monotonic()
