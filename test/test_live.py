@@ -961,7 +961,7 @@ def test_every_view_reports_a_silence_in_a_file_and_no_loss(tmp_path: Path, caps
     assert f"{named}; in these intervals the load is interpolated linearly" in capsys.readouterr().out.replace("\n", "")
 
 
-@pytest.mark.parametrize(("setting", "said"), [("follow=full", True), ("follow=parameters", False)])
+@pytest.mark.parametrize(("setting", "reported"), [("follow=full", True), ("follow=parameters", False)])
 def test_a_file_is_read_at_the_speed_of_the_following_twins_and_a_message_says_so(
     setting: str, reported: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
