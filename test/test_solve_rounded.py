@@ -164,11 +164,11 @@ def test_rounded_corners_stick_in_a_live_twin_that_is_restored() -> None:
 def test_rounded_corners_move_the_same_in_a_live_twin_and_a_batch(carries: str, friction: Friction) -> None:
     scene = in_guide(carries, friction=friction)
     run = simulate(scene, t_end=0.1, output_dt=0.01, energy_balance=True)
-    # between samples 10 us apart, the loads differ from straight lines by 2e-6 of their size
-    times = np.arange(1, 10_001) * 1e-5
+    # with a sample at t = 0, the interpolated load is the constant load of the scene
+    times = np.arange(101) * 1e-3
     wrench = compile_loads(scene.loads).at(times)
     twin = Twin(scene, excitation="sampled").advance_samples(times, wrench)
-    np.testing.assert_allclose(twin.q[999::1000], run.q[1:], atol=1e-7)
+    np.testing.assert_allclose(twin.q[::10], run.q, atol=1e-7)
     batch = TwinBatch([scene, scene]).advance_samples(times, wrench)
     np.testing.assert_array_equal(batch.q, [twin.q] * 2)
 

@@ -40,8 +40,8 @@ from plow_twin.solve.state import (
 #: Rounding errors of the first value of a guard function, relative to its terms at the start of the step and to its
 #: largest term over the step.
 _ROUNDING, _ROUNDING_OVER_STEP = 1e-10, 1e-13
-#: Rounding error of a corner's position along its wall, divided by `Params.leverage`, and of its slip rate, divided by
-#: `Params.threshold[0]`.
+#: Rounding error of a corner's penetration and of its position along its wall, divided by `Params.leverage`, and of its
+#: slip rate, divided by `Params.threshold[0]`.
 _FINEST = 4e-15
 
 
@@ -83,6 +83,14 @@ def _anchor(p, state, pair, force, place, rate) -> None:
 def _normal_force(p, state, pair, depth):
     """Return the normal force of a pair that pushes, even if rounding makes the penetration `depth` negative."""
     return max(law_force(p, state, pair, depth, rate_of(p, pair, state.y)), 0.0)
+
+
+@kernel()
+def _normal_rounding(p, state, pair):
+    """Return the rounding error in N of a corner's normal force, which follows from that of its penetration."""
+    depth, rate = max(penetration_of(p, state, pair, state.y), 0.0), rate_of(p, pair, state.y)
+    more = law_force(p, state, pair, depth + _FINEST * p.leverage, rate)
+    return abs(more - law_force(p, state, pair, depth, rate))
 
 
 @kernel()
@@ -170,8 +178,9 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         # a pair with mode ON can be slightly outside its wall, because of the error of its touch time
         g[0] = p.static_friction * max(force[0, pair], 0.0) - sign * drag[0, pair]
         size, noise = p.static_friction * abs(force[0, pair]) + abs(drag[0, pair]), 0.0
-        # an allowance for the rounding error of T, so that a corner does not slip as soon as it sticks
+        # an allowance for the rounding errors of T and N, so that a corner does not slip as soon as it sticks
         late = _FINEST * (p.stick_stiffness * p.leverage + p.stick_damping * p.threshold[0])
+        late += p.static_friction * _normal_rounding(p, state, pair)
     else:
         for k in range(order - 1):
             spring = state.alpha * rate[k, pair]
