@@ -364,12 +364,14 @@ def furthest_off(scene: Scene, tolerances: tuple[float, ...]) -> float:
         ("hertz", 8),
         pytest.param("hertz", 47, marks=pytest.mark.stress),
         ("hertz", 81),
+        ("hertz", 178),
+        pytest.param("kelvin_voigt", 57, marks=pytest.mark.stress),
         pytest.param("exact_restitution", 237, marks=pytest.mark.stress),
     ],
 )
 def test_even_a_tiny_force_decides_whether_a_corner_sticks(law: str, seed: int) -> None:
     """Steps that are accurate only for the motion would release sticking corners and move their anchors."""
-    assert furthest_off(held_scene(law, seed), (1e-3, 1e-4, 1e-6, 1e-7, 1e-8)) < 10.0
+    assert furthest_off(held_scene(law, seed), (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)) < 10.0
 
 
 @pytest.mark.parametrize("seed", [6, 17])

@@ -185,7 +185,7 @@ def _next_mode(p, mode, viscous, fraction, ramp):
 
 @kernel()
 def _stays(column, order, h) -> bool:
-    """Return whether a guard function stays positive on [0, h] by the lower bound of `_unsafe_pairs`."""
+    """Return whether a guard function that begins positive stays positive on [0, h], by the bound of `_unsafe_pairs`."""
     reach = 0.0
     for k in range(order, 1, -1):
         reach = (reach + max(-column[k], 0.0)) * h
@@ -196,7 +196,7 @@ def _stays(column, order, h) -> bool:
 def _sooner(state, w, order, best) -> float:
     """Return the sigma at which the guard function in `w.column[0]` first becomes negative, at most `best`."""
     column = w.column[0]
-    if _stays(column, order, best):
+    if column[0] >= 0.0 and _stays(column, order, best):
         return best
     state.guard_roots += 1
     return min(best, first_root(column, order, best, w))
