@@ -32,12 +32,12 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record import ring
 from plow_twin.record.bag import BagWriter, Topic
 from plow_twin.record.entries import EntryRecord, OutputRecord
-from plow_twin.record.header import LOSS_RECORD, RunHeader
+from plow_twin.record.header import JOURNAL, LOSS_RECORD, RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.mcap_file import UnbufferedFile
 from plow_twin.record.messages import JointState
 from plow_twin.record.reader import FileStatus, RunReader
-from plow_twin.record.recorder import JOURNAL, Recorder
+from plow_twin.record.recorder import Recorder
 from plow_twin.record.replay import replay
 from plow_twin.record.ring import RingWriter
 from plow_twin.record.writer import RunWriter, in_free_folder
@@ -230,9 +230,7 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> Non
     reader = RunReader(tmp_path / "run")
     entries = [record for record in records_of(reader) if isinstance(record, EntryRecord)]
     assert reader.status is FileStatus.TRUNCATED and len(entries) > 100
-    # every item is in the file or counted as lost; the item that was being written when the disk became full may be
-    # both
-    assert len(entries) + report["lost"][JOURNAL] >= 3000
+    assert len(entries) + report["lost"][JOURNAL] == 3000
 
 
 def test_little_free_space_ends_a_recording_that_can_be_read(tmp_path: Path) -> None:
@@ -307,6 +305,48 @@ def test_a_recording_continues_when_the_disk_has_space_again(
     report = replay(tmp_path / "run")
     assert (report.exit_code, report.status, report.divergences) == (3, FileStatus.COMPLETE, 0)
     assert report.lost[JOURNAL] == loss.lost[JOURNAL] and report.compared["contact_peaks"] > 500
+
+
+def test_losses_on_a_full_disk_are_counted_exactly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write, calls, full = UnbufferedFile.write, itertools.count(), True
+
+    def fail_sometimes(file: UnbufferedFile, data: bytes) -> None:
+        if full and next(calls) % 31 > 28:
+            write(file, data[:10])
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(file, data)
+
+    monkeypatch.setattr(UnbufferedFile, "write", fail_sometimes)
+    recorder = Recorder(
+        tmp_path / "run", HEADER, flush_period_s=0.2, chunk_size=8192, part_bytes=10_000, min_free_bytes=1
+    )
+    sent, message = itertools.count(1), JointState(BASE_NS, "slide_frame", PAIR_NAMES, *np.zeros((3, 8)))
+
+    def step() -> bool:
+        for _ in range(50):
+            recorder.journal(Sample(BASE_NS, (1.0, 2.0, 3.0)))
+            recorder.output(TOPIC, BASE_NS, message)
+        if recorder.snapshot_wanted:
+            recorder.journal(Snapshot(BASE_NS, b"0"))
+        return 50 * next(sent) >= 20_000
+
+    until(step, pause_s=0.002)
+    full = False
+    until(lambda: recorder.counters.error is None, "space on the disk")
+    while recorder.snapshot_wanted:
+        recorder.journal(Snapshot(BASE_NS, b"0"))
+    loss = recorder.close()
+    assert loss.closed and min(loss.lost[JOURNAL], loss.lost[TOPIC]) > 100
+    reader = RunReader(tmp_path / "run")
+    records = list(records_of(reader))
+    numbers = [record.sequence for record in records if isinstance(record, EntryRecord)]
+    assert len(reader.parts) > 1 and len(numbers) + loss.lost[JOURNAL] == max(numbers) + 1
+    assert sum(isinstance(record, OutputRecord) for record in records) + loss.lost[TOPIC] == 50 * (next(sent) - 1)
+    noted = Counter[str]()
+    for record in records:
+        if isinstance(record, EntryRecord) and isinstance(record.entry, Loss | Dropped):
+            noted[record.entry.topic if isinstance(record.entry, Dropped) else JOURNAL] += record.entry.count
+    assert noted == loss.lost
 
 
 def test_an_incomplete_ring_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

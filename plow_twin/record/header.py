@@ -19,6 +19,8 @@ HEADER_RECORD: Final = "plow_twin"
 LOSS_RECORD: Final = "plow_twin_loss"
 #: Key in the loss record under which the reason of an early end is written. Every key except this key is a topic.
 STOPPED_EARLY_KEY: Final = "stopped_early"
+#: Key in the loss record of the number of lost journal entries.
+JOURNAL: Final = "journal"
 #: Version of the file layout, which `docs/recording.md` describes.
 LAYOUT_VERSION: Final = 4
 

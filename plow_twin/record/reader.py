@@ -23,7 +23,7 @@ from plow_twin.record.cdr import decode
 from plow_twin.record.chunks import ChunkReader, Messages, is_mcap, metadata_records
 from plow_twin.record.entries import NO_ENTRIES, Batch, Entries, Outputs, parted_at, unwrap
 from plow_twin.record.follow import Tail
-from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
+from plow_twin.record.header import HEADER_RECORD, JOURNAL, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
 from plow_twin.record.journal_codec import Dropped, from_message, read_digests
 from plow_twin.record.messages import MESSAGE_TYPES, Message, WrenchStamped
 from plow_twin.record.metadata_yaml import missing_files
@@ -156,7 +156,7 @@ class RunReader:
         """
         noted: Counter[str] = Counter()
         for entry in self._noted.values():
-            noted[entry.topic if isinstance(entry, Dropped) else "journal"] += entry.count
+            noted[entry.topic if isinstance(entry, Dropped) else JOURNAL] += entry.count
         return dict(self._counted | noted)
 
     @property

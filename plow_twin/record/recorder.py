@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError, TakenError
-from plow_twin.record.header import RunHeader
+from plow_twin.record.header import JOURNAL, RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
 from plow_twin.stream.journal import Entry, Loss, Sample, Snapshot
@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from plow_twin.record.ring import RingWriter
     from plow_twin.record.writer import RunWriter
 
-#: Key of the number of lost journal entries in the loss counters.
-JOURNAL: Final = "journal"
 #: Interval at which the thread empties the queue [s].
 _POLL_S: Final = 0.05
 #: Error numbers of a full disk. These errors only pause the recording, because space may become free.
@@ -172,7 +170,10 @@ class Recorder:
         self._snapshot_due = False
         self._output_gaps: Counter[str] = Counter()
         self._lost: Counter[str] = Counter()
+        #: numbers of messages that the writer has received since the last flush, and of messages in the files then
         self._unflushed: Counter[str] = Counter()
+        self._flushed: Counter[str] = Counter()
+        self._sync = sync
         self._written = 0
         self._error: str | None = None
         self._paused: str | None = None
@@ -385,7 +386,7 @@ class Recorder:
             self._writer.close(lost, reason or self._paused)
             self._closed = True
         except Exception as error:  # the twin continues without a recorder after any error
-            self._give_up(str(error), self._unflushed)
+            self._give_up(str(error), self._unsafe())
             self._writer.abandon()
 
     def _drain(self) -> None:
@@ -483,6 +484,7 @@ class Recorder:
     def _flush(self) -> str | None:
         self._writer.flush()
         self._unflushed.clear()
+        self._flushed = self._writer.counts
         reason = self._writer.reason_to_stop()
         if reason is not None:  # the folder may not exist any more, so `shortage` could fail
             return reason
@@ -503,16 +505,24 @@ class Recorder:
             self._paused = reason
             self._error = f"{self.path}: recording stopped: {reason}"
             unwritten, self._queue, self._more = self._queue, deque(), 0
-            lost = Counter(self._unflushed)
-            _add_keys(lost, unwritten)
-            self._lost.update(lost)
-            self._journal_gap += lost.pop(JOURNAL, 0)
-            self._output_gaps.update(lost)
+            self._lost.update(self._unsafe())
+            _add_keys(self._lost, unwritten)
+            # a note of an earlier loss may be lost too, so that its number must be noted again
+            self._output_gaps = self._lost - self._writer.noted
+            self._journal_gap = self._output_gaps.pop(JOURNAL, 0)
             self._snapshot_due = True
             error = self._error
         self._unflushed.clear()
+        self._flushed = self._writer.counts
         if first and self._on_error is not None:
             self._on_error(error)
+
+    def _unsafe(self) -> Counter[str]:
+        """Return the numbers of messages that the writer has received since the last flush and that may be lost.
+
+        With `sync`, a chunk is safe only after a flush. Otherwise a chunk that is in the file is safe.
+        """
+        return self._unflushed if self._sync else self._unflushed - (self._writer.counts - self._flushed)
 
     def _give_up(self, reason: str, unsafe: Mapping[str, int] = MappingProxyType({})) -> None:
         """Refuse all further items and report `reason`; queued items and the unflushed items `unsafe` are lost."""

@@ -6,6 +6,7 @@ All functions must be called from one thread.
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from plow_twin.errors import RecordingError, TakenError
 from plow_twin.record.cdr import encode, schema_text, type_hash, warm_up
 from plow_twin.record.chunks import MESSAGE_HEAD
 from plow_twin.record.durable import sync_path
-from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
+from plow_twin.record.header import HEADER_RECORD, JOURNAL, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
 from plow_twin.record.journal_codec import Dropped, to_message
 from plow_twin.record.mcap_file import ByteFile, ChunkBuilder, McapFile, UnbufferedFile
 from plow_twin.record.messages import Message, WrenchStamped
@@ -28,7 +29,7 @@ from plow_twin.record.outputs import REPLAYED, publication_templates
 from plow_twin.record.reader import sample_template
 from plow_twin.record.template import Indexes
 from plow_twin.solve.state import WITH_INTERVALS
-from plow_twin.stream.journal import Digest, Entry, Sample
+from plow_twin.stream.journal import Digest, Entry, Loss, Sample
 from plow_twin.stream.outputs import Published
 from plow_twin.stream.topics import TOPICS, Cadence, topics_of
 
@@ -80,6 +81,10 @@ class RunWriter:
         self._base_names = {header.topic(topic.name): topic.name for topic in TOPICS}
         self._done: list[PartFacts] = []
         self._bytes_before = 0
+        self._counts_before: Counter[str] = Counter()
+        self._notes: list[Loss | Dropped] = []
+        #: losses that are noted in the files, by topic, or `JOURNAL` for journal entries
+        self.noted: Counter[str] = Counter()
         warm_up()
         self._prepare(folder)
         self._number = 0
@@ -111,6 +116,15 @@ class RunWriter:
         return self._bytes_before + self._part.file.size
 
     @property
+    def counts(self) -> Counter[str]:
+        """Number of messages in the files by topic, with the key `JOURNAL` for all three topics of the journal."""
+        header, counts = self.header, Counter(self._counts_before)
+        journal = (header.samples_topic, header.digests_topic, header.entries_topic)
+        for topic, (number, _, _) in self._part.channels.items():
+            counts[JOURNAL if topic in journal else topic] += self._part.file.counts[number]
+        return counts
+
+    @property
     def part_bytes(self) -> int:
         """Size of the part that is being written [B]."""
         return self._part.file.size
@@ -120,6 +134,8 @@ class RunWriter:
         topic = self.header.entries_topic
         if isinstance(entry, Sample | Digest):
             topic = self.header.samples_topic if isinstance(entry, Sample) else self.header.digests_topic
+        elif isinstance(entry, Loss | Dropped):
+            self._notes.append(entry)
         stamp_ns = getattr(entry, "stamp_ns", log_time_ns)
         self._write(self._journal, topic, sequence, log_time_ns, stamp_ns, to_message(entry, self.header.frame_id))
 
@@ -248,8 +264,11 @@ class RunWriter:
             self._close_chunks()
 
     def _close_chunks(self) -> None:
+        notes, self._notes = self._notes, []
         try:
             self._part.file.chunk(self._journal)
+            for note in notes:
+                self.noted[note.topic if isinstance(note, Dropped) else JOURNAL] += note.count
             self._part.file.chunk(self._outputs)
         except OSError:
             self._outputs.clear()  # a replay cannot compare outputs if the preceding journal entries are missing
@@ -282,6 +301,7 @@ class RunWriter:
         except OSError:
             new.file.out.remove()
             raise
+        self._counts_before = self.counts
         self._part, self._number = new, self._number + 1
         if keep_bytes:
             self._remove_oldest(keep_bytes)
