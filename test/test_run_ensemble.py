@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -100,13 +101,18 @@ def test_equal_parts_of_successive_scenes_are_converted_once(monkeypatch: pytest
 
 
 def test_parts_independent_of_clearance_and_contact_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows, computed = geometry.arm_rows, list[Scene]()
+    unchanged, rows, computed, corners = compiled_scene._unchanged, geometry.arm_rows, list[Scene](), list[Scene]()
 
-    def counted(scene: Scene) -> object:
+    def counted(params: np.dtype[np.void], scene: Scene, sampled: bool, shared: Any) -> object:
         computed.append(scene)
+        return unchanged(params, scene, sampled, shared)
+
+    def counted_rows(scene: Scene) -> object:
+        corners.append(scene)
         return rows(scene)
 
-    monkeypatch.setattr(geometry, "arm_rows", counted)
+    monkeypatch.setattr(compiled_scene, "_unchanged", counted)
+    monkeypatch.setattr(geometry, "arm_rows", counted_rows)
     centred = preset("bench_kv")
     # off centre, the head may touch walls at the start
     beside = dataclasses.replace(centred, initial=Initial(q=(1e-3, 2e-3, 0.01)))
@@ -116,6 +122,7 @@ def test_parts_independent_of_clearance_and_contact_are_computed_once(monkeypatc
     scenes += variants([centred] * 2, {"contact": {"stiffness": np.array([2e8, 3e6]), "damping": np.array([1e3, 1e9])}})
     params, _ = compiled_scene.compile_scenes(scenes, 1e-6)
     assert len(computed) == 1 + len(gaps)
+    assert len(corners) == 1
     alone = [compiled_scene.compile_scenes([scene], 1e-6)[0] for scene in scenes]
     assert [one.tobytes() for one in alone] == [params[i : i + 1].tobytes() for i in range(len(scenes))]
     for damping in (-1.0, np.nan, np.inf):

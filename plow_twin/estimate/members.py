@@ -27,7 +27,7 @@ from plow_twin.estimate.forces import FEWEST, amplitudes_of, draw_biases, draw_s
 from plow_twin.estimate.learned import Learner, biases_of, numbers_of, with_numbers
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.unknowns import QUANTITIES
-from plow_twin.model.geometry import penetration_rows, penetrations_at_centre, states_of
+from plow_twin.model.geometry import penetration_rows, penetrations_at_centre, states_of, wall_distances
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import DOF_NAMES, Friction, Gravity, Scene, Wear, fastest_travel, variants
 from plow_twin.run.batch import TwinBatch
@@ -116,7 +116,7 @@ class Ensemble:
         # load error of each member in N, N, N m, and its time in s
         self._load_off, self._drifted = np.zeros((members, 3)), start
         self._walls = np.repeat(penetration_rows(scene)[None], members, axis=0)
-        self._walls[:, 4] = penetrations_at_centre(scenes)
+        self._walls[:, 4] = penetrations_at_centre(scene, wall_distances(scenes))
         self._clearance = _clearance_of(scenes)
         self._fastest = np.array([fastest_travel(one.wear, one.contact) for one in scenes])
         self._stiffness, self._exponent = np.array([one.contact.stiffness for one in scenes]), scene.contact.exponent
@@ -427,7 +427,8 @@ class Ensemble:
             return
         changed = list(compress(changed, accepted))
         self._numbers[which], self._gain[which] = numbers[accepted], gain[accepted]
-        self._clearance[which], self._walls[which, 4] = _clearance_of(changed), penetrations_at_centre(changed)
+        self._clearance[which] = _clearance_of(changed)
+        self._walls[which, 4] = penetrations_at_centre(changed[0], wall_distances(changed))
         self._fastest[which] = [fastest_travel(one.wear, one.contact) for one in changed]
         self._stiffness[which] = [one.contact.stiffness for one in changed]
         if which[0] == 0:

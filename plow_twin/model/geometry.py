@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 
 #: Number of components of the state: X, Y, VX, VY, omega, c, s, theta.
 STATE_SIZE = 8
-#: 1 for the pairs with a wall normal along x (and y), 0 for all other pairs, shape (8,) each.
-_ALONG_X, _ALONG_Y = np.abs(NORMAL_X), np.abs(NORMAL_Y)
+#: Axis of each pair's wall normal, 0 for x and 1 for y, shape (8,).
+_AXIS = np.abs(NORMAL_Y).astype(int)
 
 
 def corner_positions(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -81,10 +81,11 @@ def roll(scene: Scene) -> float:
 
 def wall_distances(scenes: Sequence[Scene]) -> NDArray[np.float64]:
     """Return the distance of each pair's unworn wall from the centre of the cavity in m, shape (m, 8)."""
-    cavities = ((one.frame, one.clearance) for one in scenes)
-    sides = [(frame.width_m + gap.horizontal_m, frame.height_m + gap.vertical_m) for frame, gap in cavities]
-    half = 0.5 * np.array(sides)
-    return _ALONG_X * half[:, :1] + _ALONG_Y * half[:, 1:]
+    sides = [
+        (one.frame.width_m + one.clearance.horizontal_m, one.frame.height_m + one.clearance.vertical_m)
+        for one in scenes
+    ]
+    return 0.5 * np.array(sides).take(_AXIS, axis=1)
 
 
 def _along_normal(scene: Scene) -> NDArray[np.float64]:
@@ -105,16 +106,21 @@ def _along_tangent(scene: Scene) -> NDArray[np.float64]:
 
 def penetration_rows(scene: Scene) -> NDArray[np.float64]:
     """Return the coefficients of each penetration n . p - H before wear, shape (5, 8): rows for c, s, X, Y and 1."""
-    return _of_places(scene, np.vstack([_along_normal(scene), penetrations_at_centre([scene])]))
+    return np.vstack([position_rows(scene), penetrations_at_centre(scene, wall_distances([scene]))])
 
 
-def penetrations_at_centre(scenes: Sequence[Scene]) -> NDArray[np.float64]:
-    """Return the last row of `penetration_rows`, shape (m, 8), the only row that depends on the clearance.
+def position_rows(scene: Scene) -> NDArray[np.float64]:
+    """Return the first four rows of `penetration_rows`, which depend only on the frame and on what the head carries."""
+    return _of_places(scene, _along_normal(scene))
 
-    The scenes must have the same head and frame.
+
+def penetrations_at_centre(scene: Scene, distances: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the last row of `penetration_rows`, the only row that depends on the clearance, shape (m, 8).
+
+    `distances` are the `wall_distances` of scenes that have the head and the frame of `scene`.
     """
-    offset_x, offset_y = scenes[0].head.com_offset_m
-    return NORMAL_X * offset_x + NORMAL_Y * offset_y - (wall_distances(scenes) - corner_radius(scenes[0]))
+    offset_x, offset_y = scene.head.com_offset_m
+    return NORMAL_X * offset_x + NORMAL_Y * offset_y - (distances - corner_radius(scene))
 
 
 def _of_places(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:

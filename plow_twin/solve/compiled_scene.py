@@ -208,17 +208,20 @@ _LATELY: Final = _Shared(64)
 
 
 class _Unchanged(NamedTuple):
-    """Results that scenes of the same `_kind` share. `values` are fields of `PARAMS`."""
+    """Results that scenes of the same `_kind` share. The fields of `record` that `_varied` returns are not final."""
 
     loads: LoadSet
     acceleration: float  #: largest acceleration in m/s^2
     start_speed: float  #: upper bound of the head's speed at the start in m/s
+    mobility: float  #: largest acceleration of a corner per force in 1/kg
+    frame_overdamped: bool  #: the dampers of the support alone make the motion overdamped
     harmonics: Harmonics | None
     terms: Terms
-    values: dict[str, Any]
+    rows: Array  #: `Params.penetration_rows`
+    record: NDArray[np.void]  #: bytes of one record of `PARAMS`, which numpy copies faster than fields
 
 
-def _unchanged(scene: Scene, sampled: bool, shared: _Shared) -> _Unchanged:
+def _unchanged(params: np.dtype[np.void], scene: Scene, sampled: bool, shared: _Shared) -> _Unchanged:
     loads = shared.of(compile_loads, () if sampled else scene.loads)
     mass, inertia = scene.head.mass_kg, scene.head.inertia_kg_m2
     gravity = scene.gravity.acceleration_m_s2
@@ -227,10 +230,12 @@ def _unchanged(scene: Scene, sampled: bool, shared: _Shared) -> _Unchanged:
     constant[2] -= mass * gravity * scene.gravity.arm_m / inertia
     direction, harmonics = shared.of(_harmonics, scene.head, loads)
     terms, _ = law_terms(scene.contact)
-    rows = geometry.penetration_rows(scene)
+    frame, carries = scene.frame, scene.head.carries
+    rows = np.zeros((5, PAIR_COUNT))
+    rows[:4] = shared.of(geometry.position_rows, frame, carries, given=(scene,))
     values: dict[str, Any] = dict(
         penetration_rows=rows,
-        arm_rows=geometry.arm_rows(scene),
+        arm_rows=shared.of(geometry.arm_rows, frame, carries, given=(scene,)),
         enabled=[name in scene.pairs for name in PAIR_NAMES],
         inverse_mass=1.0 / mass,
         inverse_inertia=1.0 / inertia,
@@ -242,12 +247,29 @@ def _unchanged(scene: Scene, sampled: bool, shared: _Shared) -> _Unchanged:
         offset=scene.head.com_offset_m,
         free=scene.free,
         fastest=float(loads.omega.max(initial=0.0)),
-        leverage=float(np.hypot(rows[0], rows[1]).max()),
+        leverage=shared.of(_leverage, frame, carries, given=(rows,)),
         max_events=MAX_EVENTS_AT_ONCE,
+        slip_speed=1.0,
     )
+    values |= _of_frame(scene) | _rubbing(scene) | _support(scene)
+    if scene.friction is not None:
+        values |= {"slip_rows": geometry.slip_rows(scene), "slip_arm_rows": geometry.slip_arm_rows(scene)}
+    record = new_records(params, 1)
+    for name, value in values.items():
+        record[name] = value
     terms = _scene_terms(scene, terms, loads, harmonics, sampled or loads.pieces is not None, shared)
     acceleration = _largest_acceleration(scene, shared.of(_largest_wrench, loads))
-    return _Unchanged(loads, acceleration, _start_speed(scene), harmonics, terms, values)
+    radius, overdamped = values["radius"], False
+    mobility = 1.0 / mass + radius**2 / inertia
+    if scene.support is not None:
+        mobility += float(values["frame_mobility"][0] + radius**2 * values["frame_mobility"][2])
+        overdamped = bool((values["frame_damping"] > OVERDAMPED_RATIO * np.sqrt(values["frame_stiffness"])).any())
+    return _Unchanged(loads, acceleration, _start_speed(scene), mobility, overdamped, harmonics, terms, rows,
+                      record.view(f"V{params.itemsize}"))  # fmt: skip
+
+
+def _leverage(rows: Array) -> float:
+    return float(np.hypot(rows[0], rows[1]).max())
 
 
 def _sources(scene: Scene, sampled: bool) -> tuple[object, ...]:
@@ -278,12 +300,13 @@ def _compile_alike(
 
     `rows` are an array of records and the indices of the scenes in it. Without `rows`, the array is new.
     """
-    first = scenes[0]
-    params, which = rows or (new_records(params_type(options(first)), len(scenes)), list(range(len(scenes))))
-    common = shared.of(_unchanged, *_sources(first, sampled), given=(first, sampled, shared))
+    first, kind = scenes[0], params_type(options(scenes[0]))
+    params, which = rows or (new_records(kind, len(scenes)), list(range(len(scenes))))
+    common = shared.of(_unchanged, kind, *_sources(first, sampled), given=(kind, first, sampled, shared))
     values, overdamped = _varied(scenes, tol, common)
     # numpy writes to a slice faster than to a list of indices
     there = slice(which[0], which[-1] + 1) if which[-1] - which[0] < len(which) else which
+    params.view(common.record.dtype)[there] = common.record
     for name, value in values.items():
         params[name][there] = value
     segments = None
@@ -301,35 +324,43 @@ def _compile_alike(
 
 
 def _varied(scenes: Sequence[Scene], tol: float, common: _Unchanged) -> tuple[dict[str, Any], list[bool]]:
-    """Return the fields of `PARAMS`, shape (m, ...) or that of one record, and whether each scene is overdamped."""
-    first, terms, contacts = scenes[0], common.terms, [scene.contact for scene in scenes]
-    length, radius = np.array([geometry.length_scale(scene) for scene in scenes]), common.values["radius"]
+    """Return fields of `PARAMS`, shape (m, ...) or that of one record, and whether each scene is overdamped."""
+    first, terms = scenes[0], common.terms
+    length, walls = np.array([geometry.length_scale(scene) for scene in scenes]), geometry.wall_distances(scenes)
     # speed after half the length scale under the largest load
     speed = np.maximum(np.maximum(np.sqrt(length * common.acceleration), common.start_speed), 1e-3 * length)
+    numbers = [
+        (one.stiffness, one.damping or 0.0, law_terms(one)[1], one.impact_speed_floor_m_s, one.ramp_m or 0.0)
+        for one in (scene.contact for scene in scenes)
+    ]
+    stiffness, damping, number, floor, ramp = np.array(numbers, dtype=float).T
     admissible = min(tol * (STEP_SHARE if terms.fraction is None else STEP_SHARE_FRACTION), LARGEST_STEP_ERROR)
     order = order_for(admissible)
-    rows = np.repeat(common.values["penetration_rows"][None], len(scenes), axis=0)
-    rows[:, 4] = geometry.penetrations_at_centre(scenes)
+    rows = common.rows[None].repeat(len(scenes), axis=0)
+    rows[:, 4] = geometry.penetrations_at_centre(first, walls)
     release = 0.0 if terms.fraction is None else list(map(_release, scenes, [tol] * len(scenes), length, speed))
-    values: dict[str, Any] = common.values | dict(
+    values: dict[str, Any] = dict(
         penetration_rows=rows,
-        stiffness=np.array([float(contact.stiffness) for contact in contacts]),
+        stiffness=stiffness,
         exponent=float(first.contact.exponent),
-        viscous=np.array([float(contact.damping or 0.0) if terms.viscous else 0.0 for contact in contacts]),
-        damping_number=np.array([law_terms(contact)[1] for contact in contacts]),
-        speed_floor=np.array([float(contact.impact_speed_floor_m_s) for contact in contacts]),
-        ramp=[float(contact.ramp_m or 0.0) if terms.ramp else 0.0 for contact in contacts],
+        viscous=damping if terms.viscous else 0.0,
+        damping_number=number,
+        speed_floor=floor,
+        ramp=ramp if terms.ramp else 0.0,
         lacuna=_lacuna(first.contact.exponent),
         order=order,
         threshold=speed[:, None] * _thresholds(admissible, order),
         velocity_tolerance=tol * speed,
         position_tolerance=tol * length,
-        weight=radius * speed / length,
+        weight=geometry.half_diagonal(first) * speed / length,
         release=release,
-        half_cavity=0.5 * geometry.wall_distances(scenes).min(axis=1),
+        half_cavity=0.5 * walls.min(axis=1),
     )
-    values |= _of_options(scenes) | _rubbing(first) | _slip(scenes) | _frame(first)
-    return values, _overdamped(scenes, terms, values, length).tolist()
+    if first.friction is not None:
+        values |= _slip([scene.friction for scene in scenes if scene.friction is not None])
+    if options(first).falling:
+        values |= _falling([scene.contact for scene in scenes])
+    return values, _overdamped(first, common, values, damping, length).tolist()
 
 
 def options(scene: Scene) -> Options:
@@ -338,23 +369,24 @@ def options(scene: Scene) -> Options:
     return Options(scene.head.carries == "corners", scene.frame.corner_radius_m is not None, falls)
 
 
-def _of_options(scenes: Sequence[Scene]) -> dict[str, Any]:
-    first, options_of_scene = scenes[0], dict[str, Any]()
-    there, contacts = options(first), [scene.contact for scene in scenes]
+def _of_frame(scene: Scene) -> dict[str, Any]:
+    there, constants = options(scene), dict[str, Any]()
     if there.corners:
-        options_of_scene["tumbles"] = float(geometry.tumbles(first))
+        constants["tumbles"] = float(geometry.tumbles(scene))
     if there.rounded:
-        options_of_scene["roll"] = geometry.roll(first)
-    if there.falling:
-        options_of_scene |= dict(
-            damping_numbers=damping_numbers(first.contact.law),
-            restitution=[contact.restitution for contact in contacts],
-            fall=[contact.restitution_fall or 0.0 for contact in contacts],
-            fall_speed=[contact.restitution_speed_m_s or 1.0 for contact in contacts],
-            fall_mass=[contact.restitution_mass_power or 0.0 for contact in contacts],
-            fall_along=[contact.restitution_fall_along_s_m or 0.0 for contact in contacts],
-        )
-    return options_of_scene
+        constants["roll"] = geometry.roll(scene)
+    return constants
+
+
+def _falling(contacts: Sequence[Contact]) -> dict[str, Any]:
+    return dict(
+        damping_numbers=damping_numbers(contacts[0].law),
+        restitution=[contact.restitution for contact in contacts],
+        fall=[contact.restitution_fall or 0.0 for contact in contacts],
+        fall_speed=[contact.restitution_speed_m_s or 1.0 for contact in contacts],
+        fall_mass=[contact.restitution_mass_power or 0.0 for contact in contacts],
+        fall_along=[contact.restitution_fall_along_s_m or 0.0 for contact in contacts],
+    )
 
 
 @cache
@@ -507,15 +539,16 @@ def _harmonics(head: Head, loads: LoadSet) -> tuple[Array, Harmonics | None]:
         return np.eye(2), None
     # sine and cosine amplitudes of the accelerations Fx/m, Fy/m, M/I, shape (h, 2, 3)
     inertias = np.array([head.mass_kg, head.mass_kg, head.inertia_kg_m2])
-    amplitudes = np.stack([loads.sine / inertias, loads.cosine / inertias], axis=1)
+    amplitudes = np.array([loads.sine, loads.cosine]).swapaxes(0, 1) / inertias
     acting = amplitudes.any(axis=(1, 2))
     if not acting.any():
         return np.eye(2), None
     amplitudes = amplitudes[acting]
     forces = amplitudes[:, :, :2].reshape(-1, 2)
-    largest = forces[np.argmax(np.hypot(forces[:, 0], forces[:, 1]))]
-    size = float(np.hypot(*largest))
-    unit = largest / size if size > 0.0 else np.array([1.0, 0.0])
+    sizes = np.hypot(forces[:, 0], forces[:, 1])
+    largest = sizes.argmax()
+    size = float(sizes[largest])
+    unit = forces[largest] / size if size > 0.0 else np.array([1.0, 0.0])
     across = np.abs(forces @ np.array([-unit[1], unit[0]]))
     directions = np.array([unit, [0.0, 0.0]]) if across.max() <= 1e-15 * size else np.eye(2)
     harmonics = np.zeros(len(amplitudes), HARMONIC)
@@ -579,12 +612,11 @@ def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
     return release
 
 
-def _overdamped(scenes: Sequence[Scene], terms: Terms, values: dict[str, Any], length: Array) -> NDArray[np.bool_]:
+def _overdamped(
+    first: Scene, common: _Unchanged, values: dict[str, Any], factor: Array, length: Array
+) -> NDArray[np.bool_]:
     """Return whether the motion of each scene is overdamped, so that it needs implicit steps."""
-    first, exponent, stiffness = scenes[0], values["exponent"], values["stiffness"]
-    mobility = 1.0 / first.head.mass_kg + values["radius"] ** 2 / first.head.inertia_kg_m2
-    if first.support is not None:
-        mobility += float(values["frame_mobility"][0] + values["radius"] ** 2 * values["frame_mobility"][2])
+    terms, exponent, stiffness = common.terms, values["exponent"], values["stiffness"]
     largest_force = first.head.mass_kg * values["threshold"][:, 0] ** 2 / length
     depth = np.maximum(
         (largest_force / stiffness) ** (1.0 / exponent), _initial_depth(first, values["penetration_rows"])
@@ -595,16 +627,12 @@ def _overdamped(scenes: Sequence[Scene], terms: Terms, values: dict[str, Any], l
     if terms.viscous is not None:
         damping = damping + values["viscous"]
     elif terms.hysteretic is not None:
-        factor = np.array([scene.contact.damping or 0.0 for scene in scenes])
         slow = values["damping_number"] / values["speed_floor"]
         damping = damping + largest_force * np.where(factor > 0.0, factor, slow)
     if terms.slip is not None:
         damping = damping + np.array(values["friction"]) * largest_force / np.array(values["slip_speed"])
-    overdamped: NDArray[np.bool_] = damping * mobility > OVERDAMPED_RATIO * np.sqrt(spring * mobility)
-    # the dampers of a support can make the motion overdamped
-    if first.support is not None:
-        overdamped |= bool((values["frame_damping"] > OVERDAMPED_RATIO * np.sqrt(values["frame_stiffness"])).any())
-    return overdamped
+    overdamped: NDArray[np.bool_] = damping * common.mobility > OVERDAMPED_RATIO * np.sqrt(spring * common.mobility)
+    return overdamped | common.frame_overdamped
 
 
 def _rubbing(scene: Scene) -> dict[str, Any]:
@@ -620,24 +648,18 @@ def _rubbing(scene: Scene) -> dict[str, Any]:
     return options_of_scene
 
 
-def _slip(scenes: Sequence[Scene]) -> dict[str, Any]:
-    """Return the constants of friction; without friction, only a slip speed as a divisor."""
-    there = [scene.friction for scene in scenes if scene.friction is not None]
-    if not there:
-        return {"slip_speed": 1.0}
-    static = [one.coefficient if one.static_coefficient is None else one.static_coefficient for one in there]
+def _slip(frictions: Sequence[Friction]) -> dict[str, Any]:
+    static = [one.coefficient if one.static_coefficient is None else one.static_coefficient for one in frictions]
     return dict(
-        slip_rows=geometry.slip_rows(scenes[0]),
-        slip_arm_rows=geometry.slip_arm_rows(scenes[0]),
-        friction=[one.coefficient for one in there],
-        slip_speed=[one.regularisation_speed_m_s for one in there],
+        friction=[one.coefficient for one in frictions],
+        slip_speed=[one.regularisation_speed_m_s for one in frictions],
         static_friction=static,
-        stick_stiffness=[one.stick_stiffness_n_m or 0.0 for one in there],
-        stick_damping=[one.stick_damping_n_s_m or 0.0 for one in there],
+        stick_stiffness=[one.stick_stiffness_n_m or 0.0 for one in frictions],
+        stick_damping=[one.stick_damping_n_s_m or 0.0 for one in frictions],
     )
 
 
-def _frame(scene: Scene) -> dict[str, Any]:
+def _support(scene: Scene) -> dict[str, Any]:
     support = scene.support
     if support is None:
         return {}
