@@ -185,7 +185,7 @@ def _next_mode(p, mode, viscous, fraction, ramp):
 
 @kernel()
 def _stays(column, order, h) -> bool:
-    """Return whether a guard function that begins positive stays positive on [0, h], by the bound of `_unsafe_pairs`."""
+    """Return whether a guard that begins positive stays positive on [0, h], by the bound of `_unsafe_pairs`."""
     reach = 0.0
     for k in range(order, 1, -1):
         reach = (reach + max(-column[k], 0.0)) * h
