@@ -40,21 +40,24 @@ from plow_twin.estimate.priors import ROUNDING, UNSTATED, deviation_of
 from plow_twin.estimate.result import NORMAL_P95
 from plow_twin.estimate.unknowns import GX, GY, MOVING, SIZE, SOFTNESS
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.model.scene import Friction, Scene, largest_exponent
+from plow_twin.model.scene import LEAST_EXPONENT, Friction, Scene, largest_exponent
 
 Array = NDArray[np.float64]
 
+#: Paths of the exponent, of the friction coefficient and of the speed below which friction is viscous.
+EXPONENT, FRICTION, CREEP = "contact.exponent", "friction.coefficient", "friction.regularisation_speed_m_s"
 #: Step of the difference quotient for each quantity of a scene: a fifth to a half of the prior deviation.
 STATED: Final = {
     "head.mass_kg": 0.02,
     "head.inertia_kg_m2": 0.02,
     "frame.width_m": 5e-4,
     "frame.height_m": 5e-4,
-    "contact.exponent": 0.02,
-    "friction.coefficient": 0.01,
+    EXPONENT: 0.02,
+    FRICTION: 0.01,
+    CREEP: 0.1,
 }
-#: Path of the friction coefficient.
-FRICTION: Final = "friction.coefficient"
+#: Lower bound on the relative change of the speed below which friction is viscous.
+_LEAST_CREEP = -0.9
 #: Steps of the difference quotients with respect to the relative stiffness and damping of a wall, and to a constant
 #: load in units of half the load's range.
 _WALL_STEP, _PUSH_STEP = 0.02, 5e-3
@@ -91,7 +94,7 @@ class Graded:
     inflation : ndarray, shape (3,)
         Variance of the measured x, y and theta, divided by the variance of the noise in the fit.
     surprise : float
-        Mean square of the differences in units of their prior deviations, at least 1.
+        Mean square of the linearised steps of the differences in units of their prior deviations, at least 1.
     harmonics : Harmonics, optional
         The harmonics that were added to the load.
     """
@@ -134,8 +137,8 @@ def graded(problem: Problem, fitted: Fit, doubtful: bool = False, seed: int = 0)
     linear.eliminate()
     mean, covariance, often, halves = linear.averaged(np.random.default_rng(seed), tuning.DIFFERS[int(doubtful)])
     surprise, named = linear.surprise(mean, often), linear.named(mean, often)
-    share, exponent, _ = named.get("contact.exponent", (0.0, 0.0, 0.0))
-    bent = tuning.BENT_BY_EXPONENT * share * exponent**2
+    share, exponent, _ = named.get(EXPONENT, (0.0, 0.0, 0.0))
+    bent = tuning.BENT_BY_EXPONENT * share * (exponent - problem.unknowns.changes.get(EXPONENT, 0.0)) ** 2
     unexplained = tuning.UNEXPLAINED * math.sqrt(float(linear.inflation.mean()) - 1.0)
     ratio = max(1.0, linear.scatter()) * surprise
 
@@ -182,18 +185,18 @@ def _columns(problem: Problem, fitted: Fit) -> tuple[dict[str, _Column], Array]:
     point = fitted.point
 
     def by(step: float, **changed: Any) -> Array | None:
-        moved = problem.evaluate(point.shared, point.states, **changed)
-        return None if moved is None else np.nan_to_num((moved.predicted - point.predicted) / step)
+        other = problem.evaluate(point.shared, point.states, **changed)
+        return None if other is None else np.nan_to_num((other.predicted - point.predicted) / step)
 
     scene, depth = problem.unknowns.scene, problem.unknowns.penetration_of(float(fitted.shared[SOFTNESS]))
     out: dict[str, _Column] = {}
     for path, coarse in STATED.items():
-        deviation, step = deviation_of(scene, path) if _can_move(scene, path) else 0.0, problem.steps * coarse
-        change = partial(_moved, path=path, step=step, depth=depth)
+        deviation, step = deviation_of(scene, path) if can_move(scene, path) else 0.0, problem.steps * coarse
+        change = partial(moved_scene, path=path, step=step, depth=depth)
         column = by(step, change=change) if deviation > 0.0 else None
         if column is not None:
-            least = -(scene.friction.coefficient if scene.friction else 0.0) if path == FRICTION else -math.inf
-            out[path] = _Column(deviation, column, least=least)
+            least = least_change(problem.unknowns.nominal_scene or scene, path)
+            out[path] = _Column(deviation, column, problem.unknowns.changes.get(path), least)
     sides = [out[path].derivative for path in ("frame.width_m", "frame.height_m") if path in out]
     if len(sides) == 2 and scene.frame.corner_radius_m is None:
         # at small angles, a radius has the effect of sides that are shorter by twice the radius
@@ -245,31 +248,45 @@ def _of_sensor(problem: Problem, point: Point) -> Iterator[tuple[str, Array]]:
 
 def variants(scene: Scene) -> tuple[Scene, ...]:
     """Return the scenes with a different exponent and with friction, which need kernels of their own."""
-    paths = (path for path in ("contact.exponent", FRICTION) if _can_move(scene, path))
-    return tuple(_moved(scene, path, STATED[path], 1.0) for path in paths)
+    paths = (path for path in (EXPONENT, FRICTION) if can_move(scene, path))
+    return tuple(moved_scene(scene, path, STATED[path], 1.0) for path in paths)
 
 
-def _can_move(scene: Scene, path: str) -> bool:
-    if path != "contact.exponent":
-        return True
-    return scene.contact.exponent + STATED[path] <= largest_exponent(scene.contact)
+def can_move(scene: Scene, path: str) -> bool:
+    """Return whether the number at `path` can differ from the scene."""
+    if path == CREEP:
+        rubbing = scene.friction
+        return rubbing is not None and rubbing.coefficient > 0.0 and rubbing.stick_stiffness_n_m is None
+    return path != EXPONENT or scene.contact.exponent + STATED[path] <= largest_exponent(scene.contact)
 
 
-def _moved(scene: Scene, path: str, step: float, depth: float) -> Scene:
-    """Return the scene with the number at `path` changed by `step`, which is relative for mass and inertia.
+def least_change(scene: Scene, path: str) -> float:
+    """Return the smallest possible change of the number at `path`."""
+    if path == FRICTION:
+        return -scene.friction.coefficient if scene.friction else 0.0
+    if path == CREEP:
+        return _LEAST_CREEP
+    return LEAST_EXPONENT - scene.contact.exponent if path == EXPONENT else -math.inf
+
+
+def moved_scene(scene: Scene, path: str, step: float, depth: float) -> Scene:
+    """Return the scene with the number at `path` changed by `step`, which is relative for mass, inertia and speed.
 
     A change of the exponent does not change the force at the penetration `depth` in m.
     """
     part, name = path.split(".")
     if part == "friction":
         rubbing = scene.friction or Friction(0.0)
+        if path == CREEP:
+            speed = rubbing.regularisation_speed_m_s * (1.0 + step)
+            return replace(scene, friction=replace(rubbing, regularisation_speed_m_s=speed))
         static = rubbing.static_coefficient
-        moved = replace(
+        other = replace(
             rubbing,
             coefficient=rubbing.coefficient + step,
             static_coefficient=None if static is None else static + step,
         )
-        return replace(scene, friction=moved)
+        return replace(scene, friction=other)
     if part == "head":
         return replace(scene, head=replace(scene.head, **{name: getattr(scene.head, name) * (1.0 + step)}))
     if part == "frame":
@@ -387,7 +404,8 @@ class _Linearised:
         evidence = 0.5 * float(self._score[use] @ mean[use]) - float(np.log(np.diag(lower)).sum())
         evidence += 0.5 * float(np.log(self._precision[use]).sum())
         for index in np.flatnonzero(differs & np.isfinite(self._least)).tolist():
-            evidence += _truncate(mean, covariance, SIZE + index, self._least[index] - self._value[index])
+            inside = _truncate(mean, covariance, SIZE + index, self._least[index] - self._value[index])
+            evidence += inside - float(log_ndtr(-self._least[index] * math.sqrt(self._precision[SIZE + index])))
         return evidence, mean, covariance
 
     def averaged(self, rng: np.random.Generator, prior: float) -> tuple[Array, Array, Array, Array]:
@@ -440,7 +458,7 @@ class _Linearised:
     def surprise(self, mean: Array, often: Array) -> float:
         """Return `Graded.surprise`. The linearisation is inaccurate if the result exceeds 1."""
         own = len(self.names)
-        z, often = ((self._value + mean[SIZE:]) * np.sqrt(self._precision[SIZE:]))[:own], often[:own]
+        z, often = (mean[SIZE:] * np.sqrt(self._precision[SIZE:]))[:own], often[:own]
         return max(1.0, float((z**2 / np.maximum(often, 0.1)).sum() / max(often.sum(), 1.0)))
 
     def named(self, mean: Array, often: Array) -> dict[str, tuple[float, float, float]]:
@@ -472,7 +490,7 @@ def _truncate(mean: Array, covariance: Array, index: int, least: float) -> float
     """Change the mean and covariance of normal unknowns, in place, to those given that unknown `index` is at least
     `least`.
 
-    Return the logarithm of the probability of this condition, divided by its prior probability of a half.
+    Return the logarithm of the probability of this condition.
     Reference: Minka, Expectation propagation (2001), section 3.2 (moment matching).
     """
     spread = math.sqrt(covariance[index, index])
@@ -482,7 +500,7 @@ def _truncate(mean: Array, covariance: Array, index: int, least: float) -> float
     column = covariance[:, index] / spread
     mean += ratio * column
     covariance -= ratio * (ratio + z) * np.outer(column, column)
-    return log_inside + math.log(2.0)
+    return log_inside
 
 
 def _lasting(residual: Array, swing: NDArray[np.int64], square: float) -> float:

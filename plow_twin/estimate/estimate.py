@@ -20,6 +20,7 @@ from plow_twin.estimate.gaps import Gaps, GapsFit, fit_gaps
 from plow_twin.estimate.lacking import with_harmonics
 from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses, filled
 from plow_twin.estimate.pads import shown, with_differences
+from plow_twin.estimate.relinearised import with_other_law_numbers
 from plow_twin.estimate.result import Estimate, ForcesUsed, Interval, State
 from plow_twin.estimate.screening import is_dead, is_idle, rests, shortages, thinned, well_measured
 from plow_twin.estimate.search import LOW_PASS, behind_low_pass, candidate, refine
@@ -311,13 +312,16 @@ def _searched(
         if again and again[1].loss < found[1].loss:
             found, verdict = again, judge(*again, period)
     found, verdict = _with_differences(found, verdict, period)
+    if bounced is None and fails(found[1], verdict) and (verdict.by_scale or not verdict.sensor):
+        # friction can resemble wrong scales of the sensor
+        found, verdict = with_other_law_numbers(*found, period) or (found, verdict)
     if bounced is None and fails(found[1], verdict) and not verdict.sensor:
         # a low pass of the sensor or a change of the machine can resemble harmonics
         found, verdict = with_harmonics(*plain, forward.load, period) or (found, verdict)
     result = summarise(*found, verdict, lost, forces if bounced is None else None)
     if bounced is None and fails(found[1], verdict) and not verdict.broken:
         result = under_uncertain_load(result, unknowns, forward.load, poses, period, found)
-    following = () if verdict.model or verdict.sensor or verdict.lacking else _next_guess(*found)
+    following = () if verdict.model or verdict.sensor or verdict.added else _next_guess(*found)
     return result if bounced is None else with_bounced(result, bounced, spent), following
 
 

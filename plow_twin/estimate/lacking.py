@@ -51,7 +51,7 @@ def with_harmonics(
         verdict = judge(problem, fitted, period)
         if verdict.model or verdict.sensor:
             return None
-    verdict.lacking = _named(harmonics)
+    verdict.added = _named(harmonics)
     return ((problem, fitted), verdict) if fitted.finished else None
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
-from plow_twin.estimate.discrepancy import FRICTION
+from plow_twin.estimate.discrepancy import CREEP, FRICTION
 from plow_twin.estimate.forces import FEWEST, amplitudes_of, draw_biases, draw_scenes, loads_of, quantiles
 from plow_twin.estimate.learned import Learner, biases_of, numbers_of, with_numbers
 from plow_twin.estimate.result import Estimate, Interval, State
@@ -581,9 +581,15 @@ def compile_friction(scene: Scene, tol: float) -> None:
 def _with_friction(scenes: Sequence[Scene], estimate: Estimate, rng: np.random.Generator) -> list[Scene]:
     """Return scenes with friction coefficients drawn about those of the scenes."""
     _, by, deviation = estimate.differs[FRICTION]
+    share, faster, _ = estimate.differs.get(CREEP, (0.0, 0.0, 0.0))
     assert scenes[0].friction is not None
+    speed = scenes[0].friction.regularisation_speed_m_s * (1.0 + share * faster)
     drawn = scenes[0].friction.coefficient + by + deviation * np.append(0.0, rng.standard_normal(len(scenes) - 1))
-    return variants(scenes, {"friction": {"coefficient": np.maximum(drawn, _LEAST_FRICTION)}})
+    rubbing = {
+        "coefficient": np.maximum(drawn, _LEAST_FRICTION),
+        "regularisation_speed_m_s": np.full(len(drawn), speed),
+    }
+    return variants(scenes, {"friction": rubbing})
 
 
 def middle_of(scene: Scene, estimate: Estimate) -> tuple[Scene, Array]:

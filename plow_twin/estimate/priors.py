@@ -14,9 +14,10 @@ from plow_twin.model.scene import Mark, Scene
 #: - mass, inertia: a drawing gives the values to some percent
 #: - frame: a drawing gives the sides up to a tolerance, and it does not show the rounding of the corners
 #: - exponent, friction: the contact law is idealised, and friction is seldom documented
+#: - creep (the speed below which friction is viscous): a number of the model that no machine has
 #:
-#: The deviations of clearance and frame are in m, the deviations of mass and inertia are relative. For stiffness and
-#: damping they apply to the logarithm, for a restitution to the logit.
+#: The deviations of clearance and frame are in m, the deviations of mass, inertia and creep are relative. For stiffness
+#: and damping they apply to the logarithm, for a restitution to the logit.
 DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
     "clearance": {Mark.GIVEN: 8e-3, Mark.MEASURED: 2e-3, Mark.RECONSTRUCTED: 8e-3, Mark.ASSUMED: 8e-3},
     "stiffness": {Mark.GIVEN: 2.5, Mark.MEASURED: 0.5, Mark.RECONSTRUCTED: 2.5, Mark.ASSUMED: 2.5},
@@ -26,6 +27,7 @@ DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
     "frame": {Mark.GIVEN: 1e-3, Mark.MEASURED: 5e-4, Mark.RECONSTRUCTED: 2e-3, Mark.ASSUMED: 5e-3},
     "exponent": {Mark.GIVEN: 0.07, Mark.MEASURED: 0.03, Mark.RECONSTRUCTED: 0.07, Mark.ASSUMED: 0.07},
     "friction": {Mark.GIVEN: 0.05, Mark.MEASURED: 0.02, Mark.RECONSTRUCTED: 0.05, Mark.ASSUMED: 0.05},
+    "creep": {Mark.GIVEN: 0.5, Mark.MEASURED: 0.2, Mark.RECONSTRUCTED: 0.5, Mark.ASSUMED: 0.5},
 }
 #: Scale in m of the half-normal prior of the corner radius if the scene states no radius.
 ROUNDING: Final = 3e-3
@@ -67,6 +69,7 @@ KINDS: Final = {
     "frame.height_m": "frame",
     "contact.exponent": "exponent",
     "friction.coefficient": "friction",
+    "friction.regularisation_speed_m_s": "creep",
 }
 
 
@@ -89,7 +92,7 @@ def deviation_of(scene: Scene, path: str) -> float:
     value = float(getattr(owner, name)) if owner is not None else 0.0
     if name == "restitution":
         return provenance.deviation / max(value * (1.0 - value), 1e-6)
-    if kind in ("stiffness", "damping", "mass", "inertia"):
+    if kind in ("stiffness", "damping", "mass", "inertia", "creep"):
         share = provenance.deviation / max(abs(value), 1e-300)
         # a log-normal number with the relative deviation s has a logarithm with the variance ln(1 + s^2)
         return math.sqrt(2.0 * math.log(math.hypot(1.0, share))) if kind in ("stiffness", "damping") else share

@@ -61,7 +61,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
         shared = unknowns.within(beside.shared)
         covariance = beside.covariance
         covariance[[GX, GY], [GX, GY]] += _between_optima(problem, shared) ** 2
-    rough = beside is not None and (suspect or not finished or bool(verdict.lacking))
+    rough = beside is not None and (suspect or not finished or bool(verdict.added))
     deviation = np.sqrt(np.diag(covariance))
     published, spread = shared[[GX, GY]], np.tile(deviation[[GX, GY]], (2, 1))
     if beside is not None:
@@ -71,7 +71,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     moved = verdict.changed / math.sqrt(3.0)
     deviation[[GX, GY]] = np.hypot(deviation[[GX, GY]], moved)
     spread = np.hypot(np.hypot(spread, moved), _unseen(fit))
-    reasons = verdict.model + verdict.sensor + ([verdict.lacking] if verdict.lacking else [])
+    reasons = verdict.model + verdict.sensor + ([verdict.added] if verdict.added else [])
     if not finished and not suspect:
         gain = f"the cost would still fall by {fit.gain_left:.0f}, expected at most {tuning.OUTLYING**2:g}"
         reasons = [f"the fit has not reached an optimum: {gain}"]
@@ -110,7 +110,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
         vertical_state=states[1],
         **_numbers(unknowns, normal),
         noise=(float(fit.noise[0]), float(fit.noise[1]), float(fit.noise[2])),
-        model="suspect" if verdict.model or verdict.lacking else "ok",
+        model="suspect" if verdict.model or verdict.added else "ok",
         sensor="suspect" if verdict.sensor else "ok",
         reasons=tuple(reasons),
         lost=lost,
@@ -422,6 +422,8 @@ def summarise_bounced(
 
 
 def _numbers(unknowns: Unknowns, normal: list[Interval]) -> dict[str, Any]:
+    # the unit of the stiffness depends on the exponent
+    unknowns = replace(unknowns, scene=unknowns.nominal_scene or unknowns.scene)
     values = {quantity.name: value for quantity, value in zip(QUANTITIES, normal, strict=True)}
     del values["horizontal"], values["vertical"]
     contact = {

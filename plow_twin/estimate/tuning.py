@@ -385,6 +385,14 @@ DIFFERS: Annotated[
         "the clearances of frames with errors of 2 mm (seeds 30100 to 30107)",
     ),
 ] = (0.1, 0.5)
+CERTAIN: Annotated[
+    float,
+    Tuned(
+        "1",
+        "probability of a difference of friction or exponent above which a fit with this difference follows",
+        "`friction_02`, `friction_05`, `friction_10`, `exponent_110`, seeds 98300, 98301",
+    ),
+] = 0.9
 BENT: Annotated[float, Tuned("1", "error of a linearised step, relative to the step")] = 0.3
 BENT_BY_EXPONENT: Annotated[
     float,

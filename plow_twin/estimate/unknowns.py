@@ -131,12 +131,18 @@ class Unknowns:
         Lower limit of the sensor's noise in x, y [m] and theta [rad].
     force : float
         Reference force F0 of the softness in N.
+    nominal_scene : Scene, optional
+        The scene that was given if `scene` differs from it.
+    changes : dict of str to float
+        Differences of `scene` from `nominal_scene`, by the paths of the numbers.
     """
 
     scene: Scene
     deviation: Array = field(default_factory=_prior)
     noise: tuple[float, ...] = (0.0, 0.0, 0.0)
     force: float = 1e5
+    nominal_scene: Scene | None = None
+    changes: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
     def stated(scene: Scene, load: Load, poses: Poses) -> Unknowns:

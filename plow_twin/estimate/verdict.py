@@ -39,7 +39,7 @@ class Verdict:
     figures : statistics of the tests
     by_scale : whether wrong scale factors are the only fault of the sensor
     broken : whether the sensor has failed or the measurements contradict each other, so no estimate is possible
-    lacking : description of the most significant harmonic that the fit has added to the measured load
+    added : description of the terms that the fit has added to the scene or to the measured load
     changed : (2,) change in m, within the window, of the two clearances or of the biases of x and y
     """
 
@@ -48,7 +48,7 @@ class Verdict:
     figures: dict[str, float] = field(default_factory=dict)
     by_scale: bool = False
     broken: bool = False
-    lacking: str = ""
+    added: str = ""
     changed: Array = field(default_factory=lambda: np.zeros(2))
 
 

@@ -23,6 +23,7 @@ from plow_twin.model.pairs import CORNER_NAMES, PAIR_NAMES
 SCENE_VERSION: Final = 1
 DOF_NAMES: Final = ("x", "y", "theta")
 
+LEAST_EXPONENT: Final = 1.0
 _LARGEST_EXPONENT: Final = 4.0
 
 _Part = TypeVar("_Part")
@@ -163,7 +164,7 @@ class Contact:
     law: str = _choice("contact law", LAWS, "exact_restitution")
     # the dataclass needs a default; NaN is not admissible, so every scene has to give the stiffness
     stiffness: float = _quantity("N/m^exponent", "K in F = K d^n (...)", math.nan, gt=0.0)
-    exponent: float = _quantity("1", "n in F = K d^n (...)", 1.0, ge=1.0, le=_LARGEST_EXPONENT)
+    exponent: float = _quantity("1", "n in F = K d^n (...)", 1.0, ge=LEAST_EXPONENT, le=_LARGEST_EXPONENT)
     damping: float | None = _quantity(
         "N s/m or s/m",
         "kelvin_voigt, ramped_damping: C in N s/m; others: constant factor lambda of (1 + lambda d') in s/m",
