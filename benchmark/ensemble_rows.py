@@ -95,12 +95,12 @@ def lanes_rows(columns: int, rows: int, repeats: int, notify: Notify) -> Iterato
         notify(f"{name}, tol={tol:g}")
         lanes.append(timed(lambda: simulate_many(scenes, T_END, SPARSE, tol, 1))[0])
         last = [run() for run in alone]
-        loop.append(sum(one.wall_s for one in last))
+        loop.append(sum(result.wall_s for result in last))
     one_by_one = Row(LANES_SECTION, f"{name}, one by one", OURS_BARE, f"tol={tol:g}, threads=1", SPARSE, T_END)
-    poses = [one.q for one in last if one.q is not None]
+    poses = [result.q for result in last if result.q is not None]
     one_by_one.error = float(_member_errors(scenes, np.array(poses), exact).max())
-    one_by_one.steps = sum(one.steps or 0 for one in last)
-    one_by_one.events = sum(one.events or 0 for one in last)
+    one_by_one.steps = sum(result.steps or 0 for result in last)
+    one_by_one.events = sum(result.events or 0 for result in last)
     in_lanes.section, in_lanes.scene = LANES_SECTION, f"{name}, in lanes"
     for row, walls in ((in_lanes, lanes), (one_by_one, loop)):
         row.time(walls)

@@ -101,18 +101,18 @@ def as_markdown(groups: Sequence[dict[str, Any]]) -> str:
         "range of motion [mm] | CPU [s] |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for one in groups:
+    for row in groups:
         lines.append(
-            f"| {GROUPS[one['group']].title} | {one['truths']} | {one['h_rmse_mm']:.3f}, {one['v_rmse_mm']:.3f} | "
-            f"{one['h_coverage']:.2f}, {one['v_coverage']:.2f} | {one['h_width_mm']:.2f}, {one['v_width_mm']:.2f} | "
-            f"{100 * one['as_expected']:.0f} % | {one['h_range_rmse_mm']:.1f}, {one['v_range_rmse_mm']:.1f} | "
-            f"{one['cpu_s']:.1f} (most {one['cpu_s_most']:.1f}) |"
+            f"| {GROUPS[row['group']].title} | {row['truths']} | {row['h_rmse_mm']:.3f}, {row['v_rmse_mm']:.3f} | "
+            f"{row['h_coverage']:.2f}, {row['v_coverage']:.2f} | {row['h_width_mm']:.2f}, {row['v_width_mm']:.2f} | "
+            f"{100 * row['as_expected']:.0f} % | {row['h_range_rmse_mm']:.1f}, {row['v_range_rmse_mm']:.1f} | "
+            f"{row['cpu_s']:.1f} (most {row['cpu_s_most']:.1f}) |"
         )
     lines += ["", "| group | stiffness: RMSE | coverage | median width |", "|---|---|---|---|"]
-    for one in groups:
-        title, widths = GROUPS[one["group"]].title, (one["k_rmse"], one["k_width"])
+    for group in groups:
+        title, widths = GROUPS[group["group"]].title, (group["k_rmse"], group["k_width"])
         rmse, width = (f"{100 * value:.3f} %" for value in widths)
-        lines.append(f"| {title} | {rmse} | {one['k_coverage']:.2f} | {width} |")
+        lines.append(f"| {title} | {rmse} | {group['k_coverage']:.2f} | {width} |")
     return "\n".join(lines).replace("nan, nan", "-")
 
 

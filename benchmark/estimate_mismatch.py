@@ -209,7 +209,7 @@ def draw(kind: Kind, seed: int) -> Mismatch:
     attempts = (
         _draw(kind, np.random.default_rng([20261123, seed, *again])) for again in ((), *((i,) for i in range(1, 20)))
     )
-    return next(one for one in attempts if np.nanmax(np.abs(one.poses.q)) < _LARGEST_TURN)
+    return next(attempt for attempt in attempts if np.nanmax(np.abs(attempt.poses.q)) < _LARGEST_TURN)
 
 
 def _draw(kind: Kind, rng: np.random.Generator) -> Mismatch:
@@ -395,20 +395,20 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
     both = [
         {key: row[f"{axis}_{key}"] for key in ("error_m", "sd_m", "inside", "state")} for row in rows for axis in "hv"
     ]
-    published = [one for one in both if one["state"] in PUBLISHED]
-    errors, all_errors = (np.array([one["error_m"] for one in some]) for some in (published, both))
-    deviations = np.array([one["sd_m"] for one in published])
-    useful = sum(2.0 * NORMAL_P95 * one["sd_m"] < USEFUL_M for one in published)
+    published = [entry for entry in both if entry["state"] in PUBLISHED]
+    errors, all_errors = (np.array([entry["error_m"] for entry in some]) for some in (published, both))
+    deviations = np.array([entry["sd_m"] for entry in published])
+    useful = sum(2.0 * NORMAL_P95 * entry["sd_m"] < USEFUL_M for entry in published)
     return {
         "clearances": len(both),
         "published": len(published) / len(both),
         "useful": useful / len(both),
         "rmse_mm": 1e3 * float(np.sqrt(np.mean(errors**2))) if published else np.nan,
-        "coverage": float(np.mean([one["inside"] for one in published])) if published else np.nan,
+        "coverage": float(np.mean([entry["inside"] for entry in published])) if published else np.nan,
         "width_mm": 1e3 * 2.0 * NORMAL_P95 * float(np.median(deviations)) if published else np.nan,
         "far_off": float(np.mean(np.abs(errors) > 3.0 * deviations)) if published else 0.0,
         "all_rmse_mm": 1e3 * float(np.sqrt(np.mean(all_errors**2))),
-        "withdrawn": float(np.mean([one["state"] == State.WITHDRAWN.value for one in both])),
+        "withdrawn": float(np.mean([entry["state"] == State.WITHDRAWN.value for entry in both])),
         "cpu_s": float(np.mean([row["cpu_s"] for row in rows])),
     }
 
@@ -419,10 +419,10 @@ def as_markdown(groups: dict[str, dict[str, float]]) -> str:
         "beyond 3 deviations | CPU [s] |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
-    for title, one in groups.items():
+    for title, row in groups.items():
         lines.append(
-            f"| {title} | {one['clearances']} | {one['published']:.2f} | {one['useful']:.2f} | {one['rmse_mm']:.3f} | "
-            f"{one['coverage']:.2f} | {one['width_mm']:.2f} | {one['far_off']:.2f} | {one['cpu_s']:.1f} |"
+            f"| {title} | {row['clearances']} | {row['published']:.2f} | {row['useful']:.2f} | {row['rmse_mm']:.3f} | "
+            f"{row['coverage']:.2f} | {row['width_mm']:.2f} | {row['far_off']:.2f} | {row['cpu_s']:.1f} |"
         )
     return "\n".join(lines).replace("nan", "-")
 

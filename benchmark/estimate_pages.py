@@ -66,18 +66,18 @@ def right_models() -> str:
         if (GROUPS[group].model, GROUPS[group].sensor) != ("ok", "ok"):
             continue
         rows = truths(group, seeds)
-        one, target = summary(group, rows), ASKED.get(group)
+        figures, target = summary(group, rows), ASKED.get(group)
         flagged, total = flagged + sum(map(_flagged, rows)), total + len(rows)
         estimated = [[row for row in rows if row[f"{axis}_state"] == State.ESTIMATED.value] for axis in "hv"]
         held = [
             coverage([bool(row[f"{axis}_inside"]) for row in own]) for axis, own in zip("hv", estimated, strict=True)
         ]
         lines.append(
-            f"| {GROUPS[group].title} | {len(rows)} | {one['h_rmse_mm']:.3f}, {one['v_rmse_mm']:.3f} | "
+            f"| {GROUPS[group].title} | {len(rows)} | {figures['h_rmse_mm']:.3f}, {figures['v_rmse_mm']:.3f} | "
             f"{'' if target is None else target} | {len(estimated[0])}, {len(estimated[1])} | {held[0]} | {held[1]} | "
-            f"{one['h_width_mm']:.2f}, {one['v_width_mm']:.2f} | {sum(map(_flagged, rows))} | "
-            f"{one['h_range_rmse_mm']:.1f}, {one['v_range_rmse_mm']:.1f} | "
-            f"{one['cpu_s']:.1f}, {one['cpu_s_most']:.1f} |"
+            f"{figures['h_width_mm']:.2f}, {figures['v_width_mm']:.2f} | {sum(map(_flagged, rows))} | "
+            f"{figures['h_range_rmse_mm']:.1f}, {figures['v_range_rmse_mm']:.1f} | "
+            f"{figures['cpu_s']:.1f}, {figures['cpu_s_most']:.1f} |"
         )
     share = f"{flagged / total:.1%}"
     lines += ["", f"Of {total} truths with the correct model, {flagged} are flagged as suspect ({share})."]
@@ -162,11 +162,11 @@ def mismatch() -> str:
         rows = [row for row in now if name in (None, row["kind"])]
         if not rows:
             continue
-        one, title = of_kind(rows), "all" if name is None else KINDS[name].title
-        numbers = f"{one['rmse_mm']:.2f} | {one['coverage']:.2f} | {one['width_mm']:.2f} | {one['far_off']:.2f}"
+        row, title = of_kind(rows), "all" if name is None else KINDS[name].title
+        numbers = f"{row['rmse_mm']:.2f} | {row['coverage']:.2f} | {row['width_mm']:.2f} | {row['far_off']:.2f}"
         lines.append(
-            f"| {title} | {one['clearances']} | {one['published']:.2f} | "
-            f"{one['useful']:.2f} | {numbers.replace('nan', '-') if one['published'] else '- | - | - | -'} |"
+            f"| {title} | {row['clearances']} | {row['published']:.2f} | "
+            f"{row['useful']:.2f} | {numbers.replace('nan', '-') if row['published'] else '- | - | - | -'} |"
         )
     return "\n".join(lines)
 

@@ -62,14 +62,14 @@ def located() -> str:
 
 def work() -> str:
     rows = solver_rows()
-    (one,) = [row for row in rows if row.section == "sampled_load" and "256" not in row.scene]
+    (row_of_load,) = [row for row in rows if row.section == "sampled_load" and "256" not in row.scene]
     many = [row for row in rows if row.section == "sampled_load" and "256" in row.scene]
     pairs = core_row(rows)
     hours = {row.scene: row for row in rows if row.section == "machine_time" and row.simulated_s == 3600.0}
     starts = [row.wall_ms for row in rows if row.section == "start"]
     assert pairs is not None and pairs.wall_ms is not None and None not in starts
     lines = [
-        ["one live twin with load samples at 1 kHz", f"{one.value:.0f} times as fast as real time"],
+        ["one live twin with load samples at 1 kHz", f"{row_of_load.value:.0f} times as fast as real time"],
         *([_many_twins(row.scene), f"{row.value:.2f} of a core"] for row in many),
         [
             "20 s of motion for 1,000 pairs of clearances, each pose within 1e-4 of the clearance",

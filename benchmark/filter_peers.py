@@ -180,24 +180,24 @@ class Enkf(EnsembleKalmanFilter):  # type: ignore[misc]
 def run_one(name: str, method: str, seed: int) -> dict[str, Any]:
     truth = draw(GROUPS[name], seed)
     begin = time.process_time()
-    one: Any = Ukf(truth) if method == "ukf" else Enkf(truth, seed)
+    filter_: Any = Ukf(truth) if method == "ukf" else Enkf(truth, seed)
     noise = truth.group.noise_m * np.array([1.0, 1.0, 4.0])
-    unknown_noise = _UNKNOWN_NOISE * one.members.unknowns.deviations()
-    one.Q = np.diag(np.concatenate([_STATE_NOISE, unknown_noise]) ** 2)
-    one.R = np.diag(noise**2)
+    unknown_noise = _UNKNOWN_NOISE * filter_.members.unknowns.deviations()
+    filter_.Q = np.diag(np.concatenate([_STATE_NOISE, unknown_noise]) ** 2)
+    filter_.R = np.diag(noise**2)
     row: dict[str, Any] = {"group": name, "method": method, "seed": seed}
     try:
         for t, q in zip(truth.poses.t[1:], truth.poses.q[1:], strict=True):
-            one.predict(float(t) - one.now)
+            filter_.predict(float(t) - filter_.now)
             # a component that was not measured gets so much noise that it has practically no effect
             there = np.isfinite(q)
-            one.update(np.where(there, q, 0.0), np.diag(np.where(there, noise, 1e3) ** 2))
+            filter_.update(np.where(there, q, 0.0), np.diag(np.where(there, noise, 1e3) ** 2))
     except np.linalg.LinAlgError as error:
         return row | {"failed": str(error)}
-    deviation = np.sqrt(np.maximum(np.diag(one.P)[_FIRST:], 0.0))
+    deviation = np.sqrt(np.maximum(np.diag(filter_.P)[_FIRST:], 0.0))
     row["cpu_s"] = time.process_time() - begin
     for axis, index in (("h", GX), ("v", GY)):
-        off = float(one.x[_FIRST + index] - truth.clearance[index])
+        off = float(filter_.x[_FIRST + index] - truth.clearance[index])
         inside = int(abs(off) <= NORMAL_P95 * deviation[index])
         row |= {f"{axis}_error_m": off, f"{axis}_sd_m": float(deviation[index]), f"{axis}_inside": inside}
     return row

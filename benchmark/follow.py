@@ -116,7 +116,7 @@ def _spans(stretch: Stretch, true: Motion, nominal: Motion) -> dict[str, float]:
 
 def _clearance(stretch: Stretch, truth: Truth) -> dict[str, float]:
     rows, out = stretch.rows, {}
-    first = next((one.t for one in stretch.taken_over if one.taken), float(rows.t[-1]))
+    first = next((takeover.t for takeover in stretch.taken_over if takeover.taken), float(rows.t[-1]))
     for axis, name in enumerate(("horizontal", "vertical")):
         value, low, high = rows.clearance[:, axis].T
         before = rows.t < first

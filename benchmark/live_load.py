@@ -338,7 +338,7 @@ def beside(seconds: float) -> None:
                 process.wait(20.0)
             probe.close()
     for name, ages in heard.items():
-        ratios = [one / echo_s for one, echo_s in zip(shares[name], shares["echo"], strict=True)]
+        ratios = [share / echo_s for share, echo_s in zip(shares[name], shares["echo"], strict=True)]
         print(json.dumps({
             "case": name, "messages": len(ages),
             "core": round(median(shares[name]), 3), "x_echo": round(median(ratios), 3),

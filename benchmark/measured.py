@@ -450,21 +450,21 @@ class Square:
         half = np.random.default_rng(1).permutation(len(self.usable)) % 2
         far: list[list[np.ndarray]] = [[], [], []]
         fitted = []
-        for one in (0, 1):
-            block, marker = self.fit(np.flatnonzero(half != one), start, names)
+        for half_left_out in (0, 1):
+            block, marker = self.fit(np.flatnonzero(half != half_left_out), start, names)
             for bounces in (1, 2, 3):
-                far[bounces - 1].append(self.errors(block, marker, np.flatnonzero(half == one), bounces))
+                far[bounces - 1].append(self.errors(block, marker, np.flatnonzero(half == half_left_out), bounces))
             numbers = {name: round(float(block[name]), 6) for name in names}
             fitted.append({**numbers, "turn": round(marker.turn, 4), "lever": np.round(marker.lever, 6).tolist()})
-        return {**medians([np.concatenate(one) for one in far]), "fitted": fitted}
+        return {**medians([np.concatenate(part) for part in far]), "fitted": fitted}
 
 
 def medians(far: list[np.ndarray]) -> dict[str, Any]:
     """Return the medians of distances [m] and angles [rad], shape (n, 2) each, over one, two and three bounces."""
     return {
-        "drops": [len(one) for one in far],
-        "distance_mm": [round(1e3 * float(np.median(one[:, 0])), 1) for one in far],
-        "angle_rad": [round(float(np.median(one[:, 1])), 2) for one in far],
+        "drops": [len(distances) for distances in far],
+        "distance_mm": [round(1e3 * float(np.median(distances[:, 0])), 1) for distances in far],
+        "angle_rad": [round(float(np.median(distances[:, 1])), 2) for distances in far],
     }
 
 
@@ -493,7 +493,7 @@ def of_drops(drops: Drops) -> dict[str, Any]:
                 inside[bounce].append(holds[first:last].mean(axis=0))
         results[name] = {
             **medians([square.errors(block, marker, every, bounces) for bounces in (1, 2, 3)]),
-            "coverage": [np.round(np.mean(one, axis=0), 3).tolist() for one in inside if one],
+            "coverage": [np.round(np.mean(rows, axis=0), 3).tolist() for rows in inside if rows],
             "crps_mm_mm_rad": np.round(np.mean(scores, axis=0) * [1e3, 1e3, 1.0], 2).tolist(),
             "crps_median": np.round(np.median(scores, axis=0) * [1e3, 1e3, 1.0], 2).tolist(),
         }
@@ -539,7 +539,9 @@ def of_heights(drops: Drops) -> dict[str, Any]:
         end = motion[-12:]
         impacts_found, _ = impacts(square, nothing, Poses(t, motion), noise_level(motion))
         below = [
-            one.deeper - one.distance for one in impacts_found if one.wall == "bottom" and one.gained < tuning.GAINED
+            impact.deeper - impact.distance
+            for impact in impacts_found
+            if impact.wall == "bottom" and impact.gained < tuning.GAINED
         ]
         if len(below) and np.ptp(end[:, 1]) < 1e-3 and np.ptp(end[:, 2]) < 5e-3 and end[:, 1].mean() < -0.967:
             places.append(end[:, 0].mean())
@@ -590,12 +592,12 @@ def plot(results: dict[str, Any], drops: Drops) -> None:
     axes[2].set_xlabel("time [s]")
     figure.savefig(IMAGES / "measured_drop.png", dpi=110, bbox_inches="tight")
     figure, axis = plt.subplots(figsize=(6, 3.4))
-    for name, one in results["square"].items():
+    for name, figures_of_law in results["square"].items():
         rounded = name.startswith("rounded")
         block = "rounded corners, e falls" if rounded else "sharp corners, e constant"
         for j, (component, style) in enumerate((("x", "-"), ("z", "--"), ("angle", ":"))):
             color = "tab:blue" if rounded else "tab:orange"
-            cover = [100.0 * row[j] for row in one["coverage"]]
+            cover = [100.0 * row[j] for row in figures_of_law["coverage"]]
             axis.plot(range(1, len(cover) + 1), cover, style, marker="o", color=color, label=f"{component}, {block}")
     axis.axhspan(85.0, 95.0, color="0.9", label="aim")
     axis.set_xticks([1, 2])

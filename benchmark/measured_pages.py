@@ -26,25 +26,30 @@ def measured_laws() -> str:
         return f"{results[name]['rms']:.3f} / {results[name]['median']:.3f}" if name in results else ""
 
     laws = [name.removesuffix(", regularised") for name in results if name.endswith(", regularised")]
-    rows = [[f"`{law}`" if " " not in law else law, *(figures(f"{law}, {one}") for one in _FRICTIONS)] for law in laws]
+    rows = [
+        [f"`{law}`" if " " not in law else law, *(figures(f"{law}, {friction}") for friction in _FRICTIONS)]
+        for law in laws
+    ]
     single = [name for name in results if not name.endswith(_FRICTIONS)]
     return table(["RMS / median [m/s]", *_FRICTIONS], rows + [[name, figures(name), "", ""] for name in single])
 
 
 def measured_drops() -> str:
     rows = []
-    for name, one in _part("square").items():
-        coverage = ["x {:.2f}, z {:.2f}, theta {:.2f}".format(*each) for each in one["coverage"]]
-        score = "{:.1f} mm, {:.1f} mm, {:.2f} rad".format(*one["crps_median"])
-        distance = [f"{mm:.1f} mm, {rad:.2f} rad" for mm, rad in zip(one["distance_mm"], one["angle_rad"], strict=True)]
+    for name, numbers in _part("square").items():
+        coverage = ["x {:.2f}, z {:.2f}, theta {:.2f}".format(*each) for each in numbers["coverage"]]
+        score = "{:.1f} mm, {:.1f} mm, {:.2f} rad".format(*numbers["crps_median"])
+        distance = [
+            f"{mm:.1f} mm, {rad:.2f} rad" for mm, rad in zip(numbers["distance_mm"], numbers["angle_rad"], strict=True)
+        ]
         rows.append([name, *distance, *coverage, score])
     others = {
         "the first, fitted to the other half of the drops": "square_held_out",
         "preset `measured_square`, by the solver": "square_preset",
     }
     for place, (name, part) in enumerate(others.items(), 1):
-        one = _part(part)
-        pairs = zip(one["distance_mm"], one["angle_rad"], strict=True)
+        numbers = _part(part)
+        pairs = zip(numbers["distance_mm"], numbers["angle_rad"], strict=True)
         rows.insert(place, [name, *(f"{mm:.1f} mm, {rad:.2f} rad" for mm, rad in pairs), "", "", ""])
     counts = next(iter(_part("square").values()))["drops"]
     head = ["block", *(f"error over {n} ({count} drops)" for n, count in zip((1, 2, 3), counts, strict=True))]

@@ -65,47 +65,51 @@ def machine(rng: np.random.Generator) -> Machine:
     return Machine(nominal, scene, true_coefficient, 1.0 + 0.05 * rng.standard_normal(3), bias, 0.05 * rng.uniform())
 
 
-def load_of(one: Machine, rng: np.random.Generator, span: float) -> tuple[Array, Array]:
+def load_of(true_machine: Machine, rng: np.random.Generator, span: float) -> tuple[Array, Array]:
     """Return the times and samples of the load that the estimate gets."""
     t = np.arange(0.0, span + _FINE, _FINE)
-    return t, compile_loads(one.believed.loads).at(t) + cutting(rng, t) * _BROAD
+    return t, compile_loads(true_machine.believed.loads).at(t) + cutting(rng, t) * _BROAD
 
 
-def visit(one: Machine, worn: Scene, rng: np.random.Generator) -> tuple[Load, Poses]:
+def visit(true_machine: Machine, worn: Scene, rng: np.random.Generator) -> tuple[Load, Poses]:
     """Return the measurements of a worn machine: the load for the estimate, and the poses of the sensor."""
-    t, wrench = load_of(one, rng, _SPAN)
-    motion = simulate(replace(worn, loads=(Table("cutting", t, wrench * one.gain),)), _SPAN, _FINE, 1e-6)
+    t, wrench = load_of(true_machine, rng, _SPAN)
+    motion = simulate(replace(worn, loads=(Table("cutting", t, wrench * true_machine.gain),)), _SPAN, _FINE, 1e-6)
     at = np.arange(0.0, _SPAN, _POSE_STEP)
-    q = np.stack([np.interp(np.maximum(at - one.delay_s, 0.0), motion.t, column) for column in motion.q.T], axis=1)
+    q = np.stack(
+        [np.interp(np.maximum(at - true_machine.delay_s, 0.0), motion.t, column) for column in motion.q.T], axis=1
+    )
     knots = np.arange(0.0, _SPAN + _LOAD_STEP, _LOAD_STEP)
     load, _ = Load.of(knots, np.stack([np.interp(knots, t, column) for column in wrench.T], axis=1))
-    poses, _ = Poses.of(at, q + one.bias + _NOISE * rng.standard_normal(q.shape))
+    poses, _ = Poses.of(at, q + true_machine.bias + _NOISE * rng.standard_normal(q.shape))
     return load, poses
 
 
 def one_month(seed: int, day_m: float) -> dict[str, Any]:
     """Estimate the clearances on each of the `DAYS`, and the wear coefficient, for a travel `day_m` [m] per day."""
     rng = np.random.default_rng([20261123, seed])
-    one = machine(rng)
-    path = true_path(one, rng, day_m)
-    rows, under = [], one.believed
+    true_machine = machine(rng)
+    path = true_path(true_machine, rng, day_m)
+    rows, under = [], true_machine.believed
     for day in DAYS:
-        exposure = one.coefficient_m2_n * day * day_m / PAD_AREA_M2
+        exposure = true_machine.coefficient_m2_n * day * day_m / PAD_AREA_M2
         depth = np.array([np.interp(exposure, path.exposure, pad) for pad in path.depth.T])
-        worn = replace(one.scene, wear=Wear(0.0, PAD_AREA_M2, SPEED_M_S, initial_depth_m=tuple(depth.tolist())))
-        load, poses = visit(one, worn, rng)
-        result = estimate(one.believed, load, poses)
+        worn = replace(
+            true_machine.scene, wear=Wear(0.0, PAD_AREA_M2, SPEED_M_S, initial_depth_m=tuple(depth.tolist()))
+        )
+        load, poses = visit(true_machine, worn, rng)
+        result = estimate(true_machine.believed, load, poses)
         if State.ESTIMATED is result.horizontal_state is result.vertical_state:
             estimates = [[value.mean, value.deviation] for value in result.in_scene_frame()]
             rows.append((float(day), estimates, clearances(worn, depth)[:2]))
-            under = under_load(with_estimate(one.believed, result.as_dict())[0], result, load)
+            under = under_load(with_estimate(true_machine.believed, result.as_dict())[0], result, load)
     days, values, true = (np.array([row[i] for row in rows]) for i in range(3))
     history = History((days - days[0]) * day_m, values[:, :, 0], values[:, :, 1])
     estimated = coefficient(under, history)
-    quantiles = [estimated.quantile(share) / one.coefficient_m2_n for share in (0.05, 0.5, 0.9, 0.95)]
+    quantiles = [estimated.quantile(share) / true_machine.coefficient_m2_n for share in (0.05, 0.5, 0.9, 0.95)]
     error = (values[:, :, 0] - true) / values[:, :, 1]
     return {
-        "seed": seed, "day_m": day_m, "coefficient_m2_n": one.coefficient_m2_n,
+        "seed": seed, "day_m": day_m, "coefficient_m2_n": true_machine.coefficient_m2_n,
         "grown_m": (true[-1] - true[0]).tolist(), "visits": len(rows),
         "rmse_m": float(np.sqrt(np.mean((values[:, :, 0] - true) ** 2))),
         "inside": float(np.mean(np.abs(error) <= 1.645)),
@@ -113,13 +117,17 @@ def one_month(seed: int, day_m: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def true_path(one: Machine, rng: np.random.Generator, day_m: float) -> life.Path:
+def true_path(true_machine: Machine, rng: np.random.Generator, day_m: float) -> life.Path:
     jump, periods = tuning.JUMP, tuning.MEAN_PERIODS
     tuning.JUMP, tuning.MEAN_PERIODS = (jump[0] / 4.0, jump[1]), (periods[0], 4 * periods[1])
     try:
-        t, wrench = load_of(one, rng, (sum(tuning.MEAN_PERIODS) + 1) * PERIOD)
-        scene = replace(one.scene, loads=(Table("cutting", t, wrench * one.gain),), wear=one.believed.wear)
-        most = one.coefficient_m2_n * float(DAYS[-1]) * day_m / PAD_AREA_M2
+        t, wrench = load_of(true_machine, rng, (sum(tuning.MEAN_PERIODS) + 1) * PERIOD)
+        scene = replace(
+            true_machine.scene,
+            loads=(Table("cutting", t, wrench * true_machine.gain),),
+            wear=true_machine.believed.wear,
+        )
+        most = true_machine.coefficient_m2_n * float(DAYS[-1]) * day_m / PAD_AREA_M2
         return life.wear_path(scene, (np.inf, np.inf), most)
     finally:
         tuning.JUMP, tuning.MEAN_PERIODS = jump, periods

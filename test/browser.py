@@ -88,7 +88,7 @@ def page(folder: Path, url: str) -> Iterator[Page]:
         until(lambda: process.poll() is not None or (place.exists() and "\n" in place.read_text()), "an answer")
         port = place.read_text().split()[0]
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=10) as answer:
-            target = next(one for one in json.load(answer) if one["type"] == "page")
+            target = next(entry for entry in json.load(answer) if entry["type"] == "page")
         with connect(target["webSocketDebuggerUrl"], max_size=None) as socket:
             opened = Page(socket)
             opened.open(url)

@@ -85,7 +85,11 @@ def lend(python: Path, *names: str) -> None:
         linked.add(name)
         package = distribution(name)
         needed = (Requirement(text) for text in package.requires or ())
-        waiting += [one.name for one in needed if one.marker is None or one.marker.evaluate({"extra": ""})]
+        waiting += [
+            requirement.name
+            for requirement in needed
+            if requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+        ]
         for part in {file.parts[0] for file in package.files or ()} - {"..", "__pycache__"}:
             if not (site / part).exists():
                 (site / part).symlink_to(package.locate_file(part))

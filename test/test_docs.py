@@ -63,7 +63,9 @@ def test_every_command_on_a_page_has_an_existing_verb_and_valid_options() -> Non
         words = words[2:] if words[0] == "--laws" else words  # all verbs accept the option `--laws`
         while isinstance(command, click.Group) and words and words[0] in command.commands:
             command = command.commands[words.pop(0)]
-        valid = {option for one in command.params for option in (*one.opts, *one.secondary_opts)} | {"--help"}
+        valid = {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)} | {
+            "--help"
+        }
         options_given = {word for word in words if word.startswith("--") and not word.startswith("---")}
         required = [{*one.opts} for one in command.params if isinstance(one, click.Option) and one.required]
         incomplete = options_given != {"--help"} and not all(options & options_given for options in required)

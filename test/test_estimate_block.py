@@ -48,7 +48,7 @@ def of_drop(drops: Drops, index: int, off: float = 0.0, scene: Scene | None = No
 def test_height_of_the_table_follows_from_measured_drops(drops) -> None:
     rng = np.random.default_rng(4)
     result = [of_drop(drops, index, 0.005 * rng.standard_normal()) for index in range(0, 250, 4)]
-    estimated = [one for one in result if one.vertical_state.known]
+    estimated = [drop for drop in result if drop.vertical_state.known]
     assert len(estimated) > 0.9 * len(result)
     true = SQUARE.clearance.vertical_m
     # an error of the clearance causes half the error in the height of the table
@@ -59,9 +59,9 @@ def test_height_of_the_table_follows_from_measured_drops(drops) -> None:
     # heights that the data do not determine to half a millimetre are marked as rough
     rough = np.array([one.vertical_state is State.ROUGH for one in estimated])
     assert (rough | (np.abs(off) < 5e-4)).mean() > 0.85
-    for one, flagged in zip(estimated, rough, strict=True):
-        assert (one.vertical.deviation > 1e-3) == flagged
-        assert any(reason.startswith("vertical: rough") for reason in one.reasons) == flagged
+    for estimate_of_drop, flagged in zip(estimated, rough, strict=True):
+        assert (estimate_of_drop.vertical.deviation > 1e-3) == flagged
+        assert any(reason.startswith("vertical: rough") for reason in estimate_of_drop.reasons) == flagged
 
 
 def test_walls_without_impacts_are_not_observable(drops) -> None:

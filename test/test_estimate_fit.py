@@ -45,7 +45,7 @@ def test_the_normal_equations_of_linked_swings_agree_with_dense_ones(swings: int
     rng = np.random.default_rng(swings)
     arrow, size = Arrow.empty(3, swings), 3 + 6 * swings
     dense = np.zeros((size, size))
-    for swing, count in [(one, 6) for one in range(swings)] + [(one, 12) for one in range(swings - 1)]:
+    for swing, count in [(index, 6) for index in range(swings)] + [(one, 12) for one in range(swings - 1)]:
         rows = rng.standard_normal((30, 3 + count))
         arrow.add(swing, rows.T @ rows)
         places = np.concatenate([np.arange(3), 3 + 6 * swing + np.arange(count)])
@@ -90,8 +90,8 @@ def test_a_clearance_at_its_bound_is_not_observable() -> None:
     shared = fit_found.shared.copy()
     shared[GX] = LEAST_CLEARANCE
     bound = replace(fit_found, point=replace(fit_found.point, shared=shared))
-    for one, state in ((fit_found, State.ESTIMATED), (bound, State.NOT_OBSERVABLE)):
-        result = summarise(problem, one, Verdict(broken=True), 0)
+    for fitted, state in ((fit_found, State.ESTIMATED), (bound, State.NOT_OBSERVABLE)):
+        result = summarise(problem, fitted, Verdict(broken=True), 0)
         assert result.horizontal_state is state and result.vertical_state is State.ESTIMATED
     assert result.horizontal.p95 - result.horizontal.p05 > 5e-3
 
@@ -153,7 +153,7 @@ def test_motions_in_lanes_agree_with_motions_alone() -> None:
         scene = replace(scene, contact=replace(scene.contact, stiffness=stiffness))
         starts.append(Start(scene, np.array([1.0, 0.9, 1.1]), np.array([1e-3, 0.0, 0.0, 0.1, 0.0, 0.0])))
     together, edges = forward.run_many(starts, 0.0, times), np.array([0, len(times)])
-    alone = [forward.run(one.scene, one.gain, np.zeros(1), one.state[None], edges, times) for one in starts]
+    alone = [forward.run(start.scene, start.gain, np.zeros(1), start.state[None], edges, times) for start in starts]
     assert together[1] is None and alone[1] is None
     assert together[2] == pytest.approx(alone[2].q, abs=1e-5)
     early = times < 0.3  # a hard contact forgets its start

@@ -208,7 +208,7 @@ def test_twins_have_the_friction_that_an_estimate_finds(truth: Truth) -> None:
     members = Ensemble(truth.nominal, estimate, FEWEST, np.random.default_rng(0), 0.0, TOLERANCE, np.zeros(PAIR_COUNT))
     assert members.first.scene.friction == Friction(0.1)
     assert members.others is not None
-    drawn = [one.friction.coefficient for one in members.others.scenes if one.friction is not None]
+    drawn = [scene.friction.coefficient for scene in members.others.scenes if scene.friction is not None]
     assert len(drawn) == FEWEST - 1 and 0.01 < np.std(drawn) < 0.03
     follower = Follower(truth.nominal, FEWEST)
     without = follower.signature

@@ -112,7 +112,7 @@ def test_poses_form_windows_while_the_load_is_silent() -> None:
         formed.append(windows.add_pose(stamp, (0.001 * index, 0.0, 0.0)))
         if 400 <= index < 800:
             formed.append(windows.add_load(stamp, (1.0, 2.0, 3.0)))
-    found = [one for one in formed if one is not None]
+    found = [window for window in formed if window is not None]
     assert sorted(one.end_ns for one in found) == [one.end_ns for one in found]
     silent = [one for one in found if not one.samples]
     assert silent[0].end_ns < stamps[400] < stamps[800] < silent[-1].end_ns
@@ -126,7 +126,7 @@ def test_a_pose_with_a_stamp_far_ahead_does_not_stop_the_windows() -> None:
     for index, stamp in enumerate(stamps):
         formed.append(windows.add_pose(stamp + 3_600_000_000_000 * (index == 500), (0.0, 0.0, 0.0)))
         formed.append(windows.add_load(stamp, (1.0, 2.0, 3.0)))
-    found = [one for one in formed if one is not None]
+    found = [window for window in formed if window is not None]
     assert len(found) == 8 and all(one.samples for one in found)
 
 

@@ -144,7 +144,7 @@ class Live:
         return self.twin._ensemble.pose.copy()
 
     def column(self, name: str) -> Array:
-        return np.concatenate([one.rows[name] for one in self.published])
+        return np.concatenate([publication.rows[name] for publication in self.published])
 
     def clearance(self) -> Array:
         """Return the newest published clearances, each with the ends of its interval, shape (2, 3)."""

@@ -152,13 +152,13 @@ def test_a_request_during_a_cleanup_is_answered_and_the_node_continues(tmp_path:
         node, at = running.probe.node, f"{running.namespace}/plow_twin"
         change = node.create_client(ChangeState, f"{at}/change_state")
         clients = [node.create_client(Trigger, f"{at}/{name}") for name in ("acknowledge_alarms", "mark", "reset")]
-        running.probe.until(lambda: all(one.service_is_ready() for one in (change, *clients)), "services")
+        running.probe.until(lambda: all(client.service_is_ready() for client in (change, *clients)), "services")
         running.probe.pause(0.5)
 
         def beside(transition: int) -> None:
             """Send requests before and after the request for a transition, faster than they are answered."""
             request = ChangeState.Request(transition=Transition(id=transition))
-            before = [one.call_async(Trigger.Request()) for one in clients]
+            before = [client.call_async(Trigger.Request()) for client in clients]
             changed = change.call_async(request)
             after = [one.call_async(Trigger.Request()) for one in clients]
             running.probe.until(lambda: all(one.done() for one in (changed, *before, *after)), "answers")

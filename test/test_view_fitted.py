@@ -23,7 +23,7 @@ from plow_twin.view.fitted import FittedPicture, FittedValue, write_fit_picture
 @pytest.fixture(scope="module")
 def picture() -> FittedPicture:
     truth, result = known()[0]
-    labels = {one.name: one.label for one in QUANTITIES}
+    labels = {quantity.name: quantity.label for quantity in QUANTITIES}
     prior = priors(truth.nominal, truth.load, truth.poses)
     return estimate_picture(result, prior, truth.poses, labels, "Estimate of a truth")
 

@@ -266,7 +266,7 @@ def _repeated(source: Path) -> _Task | None:
 
     reader = RunReader(source)
     estimates = list(live_estimates(reader))
-    whole = [(one.entry, one.window) for one in estimates if one.window is not None]
+    whole = [(estimate.entry, estimate.window) for estimate in estimates if estimate.window is not None]
     if not whole:
         return None
     entry, window = whole[-1]
@@ -306,7 +306,7 @@ def _labels(scene: Scene) -> dict[str, str]:
     from plow_twin.cli.scene_facts import damping_unit
     from plow_twin.estimate.unknowns import QUANTITIES
 
-    labels = {one.name: one.label for one in QUANTITIES}
+    labels = {quantity.name: quantity.label for quantity in QUANTITIES}
     labels["damping"] = "restitution [1]" if scene.contact.damping is None else f"damping [{damping_unit(scene)}]"
     power = scene.contact.exponent
     labels["stiffness"] = labels["stiffness"].replace("m^n", "m" if power == 1.0 else f"m^{power:g}")
@@ -349,9 +349,9 @@ def show_estimate(result: Estimate, scene: Scene) -> None:
     labels = _labels(scene)
     values = result.values()
     rows = [
-        (labels[one.name], values[one.name], one.factor, one.digits, states.get(one.name, ""))
-        for one in QUANTITIES
-        if one.name in values
+        (labels[quantity.name], values[quantity.name], quantity.factor, quantity.digits, states.get(quantity.name, ""))
+        for quantity in QUANTITIES
+        if quantity.name in values
     ]
     rows += [
         (f"{name.replace('_', ', ')} [mm]", value, 1e3, ".3f", state.value)

@@ -233,7 +233,7 @@ def _show(fit: Fit, space: Space, out: Path) -> None:
     console.print(f"singular values of the Jacobian over the ranges: {singular}", highlight=False, soft_wrap=True)
     objectives = ", ".join(f"{start.objective:.4g}" for start in calibration.starts)
     console.print(f"objective of each start: {objectives}", highlight=False, soft_wrap=True)
-    sizes = ", ".join(f"{one.objective:.4g} ({one.members})" for one in fit.clusters[:8])
+    sizes = ", ".join(f"{cluster.objective:.4g} ({cluster.members})" for cluster in fit.clusters[:8])
     console.print(
         f"clusters of near-optimal points: {len(fit.clusters)}, objective (points): {sizes}\n"
         f"{calibration.runs} runs; {out / 'fit.yaml'}, {out / 'calibration.json'}",

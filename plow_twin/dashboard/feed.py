@@ -257,4 +257,4 @@ class Feed:
 
 
 def _joined(rows: list[NDArray[np.void]], name: str) -> NDArray[Any]:
-    return np.concatenate([one[name] for one in rows])
+    return np.concatenate([part[name] for part in rows])

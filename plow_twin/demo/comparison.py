@@ -54,8 +54,8 @@ def compare_forces(run: Path, wider_m: float) -> Comparison | None:
     )
     times = (stamps - stamps[0]) * 1e-9
     motions = {
-        name: Twin(one, tol=1e-6, excitation="sampled").advance_samples(times, wrench)
-        for name, one in (("nominal", scene), ("true", replace(scene, clearance=clearance)))
+        name: Twin(model, tol=1e-6, excitation="sampled").advance_samples(times, wrench)
+        for name, model in (("nominal", scene), ("true", replace(scene, clearance=clearance)))
     }
     late = times >= times[-1] - COMPARED_S
     here = np.flatnonzero(late & np.isin(stamps, published_ns))

@@ -115,14 +115,16 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, prior_estimate: Estim
     reason = _unfit(impacts_found, contacts)
     if reason:
         return replace(prior_estimate, horizontal_state=unseen, vertical_state=unseen, reasons=(reason,))
-    met, reasons = _on_walls(scene, [one for one in impacts_found if one.gained < tuning.GAINED], prior_estimate)
+    met, reasons = _on_walls(
+        scene, [impact for impact in impacts_found if impact.gained < tuning.GAINED], prior_estimate
+    )
     value, deviation = _solve(scene, met, prior_estimate, level)
     clearances, states = [], []
     bias: list[Interval | None] = [Interval.normal(*pair) for pair in zip(value[_BIAS], deviation[_BIAS], strict=True)]
     for axis, (name, before) in enumerate(
         (("horizontal", prior_estimate.horizontal), ("vertical", prior_estimate.vertical))
     ):
-        count = {wall: sum(one.wall == wall for one in met) for wall, (its, _) in WALLS.items() if its == axis}
+        count = {wall: sum(impact.wall == wall for impact in met) for wall, (its, _) in WALLS.items() if its == axis}
         share = float(deviation[axis]) / max(before.deviation, 1e-300)
         observed = share < tuning.OBSERVED_SHARE
         clearances.append(Interval.normal(value[axis], deviation[axis]).above(0.0) if observed else before)
@@ -156,7 +158,7 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, prior_estimate: Estim
 
 
 def _unfit(impacts: list[Impact], contacts: int) -> str:
-    gained = sum(one.gained >= tuning.GAINED for one in impacts)
+    gained = sum(impact.gained >= tuning.GAINED for impact in impacts)
     if gained > tuning.IMPACT_SHARE * len(impacts):
         return f"{gained} of {len(impacts)} impacts add energy: the poses are too far apart in time"
     if len(impacts) < tuning.IMPACT_SHARE * contacts:
@@ -174,8 +176,8 @@ def _on_walls(scene: Scene, every: list[Impact], prior_estimate: Estimate) -> tu
         clearance = (prior_estimate.horizontal, prior_estimate.vertical)[axis]
         expected = 0.5 * ((scene.frame.width_m, scene.frame.height_m)[axis] + clearance.mean)
         most = 0.5 * tuning.OUTLYING * clearance.deviation
-        own = [one for one in every if one.wall == wall]
-        near = [one for one in own if abs(one.distance - one.deeper - expected) < most]
+        own = [impact for impact in every if impact.wall == wall]
+        near = [impact for impact in own if abs(impact.distance - impact.deeper - expected) < most]
         if len(near) < len(own):
             far = max((one.distance for one in own), key=lambda distance: abs(distance - expected))
             reasons.append(
@@ -198,19 +200,19 @@ def _solve(scene: Scene, met: list[Impact], prior_estimate: Estimate, level: Arr
     spread = deviation_of(scene, "contact.stiffness") / (scene.contact.exponent + 1.0)
     prior[_DEPTH] = math.expm1(NORMAL_P95 * spread) / NORMAL_P95
     for axis in (GX, GY):
-        if len({one.wall for one in met if WALLS[one.wall][0] == axis}) < 2:
+        if len({impact.wall for impact in met if WALLS[impact.wall][0] == axis}) < 2:
             prior[_BIAS][axis] = 0.0
     if not met:
         return mean, prior
     design, off = np.zeros((len(met), _SIZE)), np.zeros(len(met))
     sides = np.array([scene.frame.width_m, scene.frame.height_m])
-    for row, one in enumerate(met):
-        axis, normal = WALLS[one.wall]
-        off[row] = one.distance - one.deeper - 0.5 * (sides[axis] + mean[axis])
-        design[row, _DEPTH] = one.deeper
+    for row, impact in enumerate(met):
+        axis, normal = WALLS[impact.wall]
+        off[row] = impact.distance - impact.deeper - 0.5 * (sides[axis] + mean[axis])
+        design[row, _DEPTH] = impact.deeper
         design[row, axis] = 0.5
-        design[row, _BIAS] = *normal, one.arm
-        design[row, _LEVER] = one.turned
+        design[row, _BIAS] = *normal, impact.arm
+        design[row, _LEVER] = impact.turned
     free = prior > 0.0
     # the error of an impact's position is at least the uncertainty of the frame's sides
     least = max(float(level[:2].max()), *(deviation_of(scene, f"frame.{side}") for side in ("width_m", "height_m")))

@@ -708,9 +708,9 @@ class MotionFeatures:
 
         `clearance` and `numbers` are those of `start`.
         """
-        one = self.start(unknowns, clearance, numbers, rng)
+        motion_start = self.start(unknowns, clearance, numbers, rng)
         edges, t = np.array([0, len(self._t)]), self._t - delay
-        run = forward.run(one.scene, one.gain, t[:1] - _BEFORE, one.state[None], edges, t)
+        run = forward.run(motion_start.scene, motion_start.gain, t[:1] - _BEFORE, motion_start.state[None], edges, t)
         return None if run is None else self.with_noise(run.q, rng)
 
     def run(self, forward: Forward, starts: Sequence[Start], delay: float) -> list[Array | None]:
@@ -830,7 +830,9 @@ class MotionFeatures:
         reach, phase = reaches(self._unknowns.scene, q), self._reach_phase
         count = np.bincount(phase, minlength=tuning.PATH_PHASES + 1)
         occupied = count > 0
-        means = np.stack([np.bincount(phase, one, len(count))[occupied] / count[occupied] for one in reach.T], axis=1)
+        means = np.stack(
+            [np.bincount(phase, column, len(count))[occupied] / count[occupied] for column in reach.T], axis=1
+        )
         means.sort(axis=0)
         parts = [means[-max(int(share * len(means)), 1) :].mean(axis=0) for share in tuning.FARTHEST_PARTS]
         return np.stack(parts)

@@ -312,12 +312,12 @@ class _Linearised:
         self.names = list(columns)[: len(columns) - waves]
         self.waves = slice(SIZE + len(self.names), SIZE + len(columns))
         self._fit, self._swing = fitted, fitted.point.swing
-        further = np.stack([one.derivative for one in every], axis=2)
-        self._precision = np.concatenate([problem.deviation, [one.deviation for one in every]]) ** -2.0
+        further = np.stack([quantity.derivative for quantity in every], axis=2)
+        self._precision = np.concatenate([problem.deviation, [quantity.deviation for quantity in every]]) ** -2.0
         # values of the further quantities, and whether the fit includes them, shape (k,) each
-        self._value = np.array([one.value or 0.0 for one in every])
-        self._in_fit = np.array([one.value is not None for one in every])
-        self._least = np.array([one.least for one in every])
+        self._value = np.array([quantity.value or 0.0 for quantity in every])
+        self._in_fit = np.array([quantity.value is not None for quantity in every])
+        self._least = np.array([quantity.least for quantity in every])
         self._pull = np.concatenate([problem.mean - fitted.shared, -self._value]) * self._precision
         rows = [np.flatnonzero(self._swing == index) for index in range(problem.window.swings)]
         self._rows = [some for some in rows if len(some) >= FEWEST_OF_SWING]

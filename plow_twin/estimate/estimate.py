@@ -423,9 +423,9 @@ def warm_up(scene: Scene) -> None:
         return
     load = Load.unmeasured(1.0)
     other = with_other_law(Unknowns(scene))
-    for one in (scene, *variants(scene), *(() if other is None else (other.scene,))):
-        Forward(one, load).run(
-            replace(one, loads=(), wear=None),
+    for variant in (scene, *variants(scene), *(() if other is None else (other.scene,))):
+        Forward(variant, load).run(
+            replace(variant, loads=(), wear=None),
             np.ones(3),
             np.zeros(1),
             np.zeros((1, 6)),

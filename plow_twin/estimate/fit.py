@@ -441,8 +441,8 @@ class Problem:
             load, size = harmonics.moved(-harmonics.amplitude).added(self.forward.load), harmonics.amplitude.size
             out = np.zeros((*point.residual.shape, size))
             here, step = self.evaluate(point.shared, point.states, load=load), self.steps * _HARMONIC_STEP
-            for index, one in enumerate(np.eye(size).reshape(size, *harmonics.amplitude.shape)):
-                wave = replace(harmonics, amplitude=step * one).at(load.t)
+            for index, unit in enumerate(np.eye(size).reshape(size, *harmonics.amplitude.shape)):
+                wave = replace(harmonics, amplitude=step * unit).at(load.t)
                 moved = replace(load, wrench=load.wrench + wave)
                 other = self.evaluate(point.shared, point.states, load=moved)
                 if here is not None and other is not None:

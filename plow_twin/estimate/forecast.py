@@ -94,7 +94,7 @@ class Plan:
                 raise LifeError(f"{name}: got {value}, expected a finite number >= 0")
         if self.stop_h is not None and self.stop_h > self.horizon_h:
             raise LifeError(f"stop_h: got {self.stop_h:g} h, expected at most the horizon of {self.horizon_h:g} h")
-        names = [one.name for one in self.scenarios]
+        names = [scenario.name for scenario in self.scenarios]
         if len(set(names)) < len(names):
             raise LifeError(f"scenarios: got the names {', '.join(names)}, expected each once")
 
@@ -149,8 +149,12 @@ class Forecast:
             "path_steps": len(self.path.exposure),
             "path_error_m": self.path.error,
             "scenarios": {
-                one.name: {"load": one.load, "coefficient": one.coefficient, **self.scenarios[one.name]._times()}
-                for one in plan.scenarios
+                scenario.name: {
+                    "load": scenario.load,
+                    "coefficient": scenario.coefficient,
+                    **self.scenarios[scenario.name]._times(),
+                }
+                for scenario in plan.scenarios
             },
         }
 
@@ -199,8 +203,8 @@ def forecast(
         If the scene has no wear, no travel or no period, or if its wear coefficient lies outside the prior.
     """
     others = {
-        one.name: _forecast(with_load(scene, one.load), plan, deviation_m, known, one.coefficient)
-        for one in plan.scenarios
+        scenario.name: _forecast(with_load(scene, scenario.load), plan, deviation_m, known, scenario.coefficient)
+        for scenario in plan.scenarios
     }
     return replace(_forecast(scene, plan, deviation_m, known), scenarios=others)
 

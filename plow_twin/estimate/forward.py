@@ -170,11 +170,11 @@ class Forward:
         """
         motions: list[Array | None] = [None] * len(starts)
         edges, begin, fitting = np.array([0, len(times)]), np.array([start]), []
-        for place, one in enumerate(starts):
-            if fits_lanes(compile_scene(one.scene, tuning.TOLERANCE, sampled=True), sampled=True):
+        for place, motion_start in enumerate(starts):
+            if fits_lanes(compile_scene(motion_start.scene, tuning.TOLERANCE, sampled=True), sampled=True):
                 fitting.append(place)
                 continue
-            run = self.run(one.scene, one.gain, begin, one.state[None], edges, times)
+            run = self.run(motion_start.scene, motion_start.gain, begin, motion_start.state[None], edges, times)
             motions[place] = None if run is None else run.q
         # a vector ends with its slowest motion, and harder contacts take more steps
         fitting.sort(key=lambda place: starts[place].scene.contact.stiffness)
@@ -188,8 +188,13 @@ class Forward:
         knots = self._knots
         t = np.union1d(knots[(knots > start) & (knots < times[-1])], times)
         at_times, out = np.isin(t, times), []
-        states, gains = np.array([one.state for one in starts]), np.array([one.gain for one in starts])[:, None]
-        batch = TwinBatch([one.scene for one in starts], tol=tuning.TOLERANCE, start=start, max_steps=_STEPS)
+        states, gains = (
+            np.array([motion_start.state for motion_start in starts]),
+            np.array([motion_start.gain for motion_start in starts])[:, None],
+        )
+        batch = TwinBatch(
+            [motion_start.scene for motion_start in starts], tol=tuning.TOLERANCE, start=start, max_steps=_STEPS
+        )
         batch.move(range(len(starts)), states[:, :3], states[:, 3:])
         batch.set_wrench((self.load.at(np.array([start])) * gains)[:, 0])
         good = np.ones(len(starts), np.bool_)

@@ -188,7 +188,7 @@ def _displacement(unknown: Array, scene: Scene) -> tuple[Array, Array]:
 
 def _between(rows: Array, t: Array, gap: Array, pairs: NDArray[np.int64], pair: tuple[int, int], theta: Array) -> Array:
     """Return the clearance in m between the two facing pads of `pair` from each message, shape (n,)."""
-    first, second = (gap[:, int(np.flatnonzero(pairs == one)[0])] for one in pair)
+    first, second = (gap[:, int(np.flatnonzero(pairs == index)[0])] for index in pair)
     both = rows[:, list(pair)].sum(axis=1)
     clearance: Array = first + second + np.cos(theta) * both[0] + np.sin(theta) * both[1] + both[4]
     return clearance

@@ -36,12 +36,14 @@ def numbers_of(scenes: Sequence[Scene], gain: Array, bias: Array) -> Array:
     The parameters are the logarithms of K^-1/2 and of the damping or restitution, two clearances, three load gains, and
     three biases of the sensor.
     """
-    damping = [one.contact.damping if one.contact.restitution is None else one.contact.restitution for one in scenes]
+    damping = [
+        scene.contact.damping if scene.contact.restitution is None else scene.contact.restitution for scene in scenes
+    ]
     raw = np.column_stack([
-        [-0.5 * np.log(one.contact.stiffness) for one in scenes],
+        [-0.5 * np.log(scene.contact.stiffness) for scene in scenes],
         [np.log(number) if number else 0.0 for number in damping],
-        [one.clearance.horizontal_m for one in scenes],
-        [one.clearance.vertical_m for one in scenes],
+        [scene.clearance.horizontal_m for scene in scenes],
+        [scene.clearance.vertical_m for scene in scenes],
         gain,
         bias,
     ])  # fmt: skip
@@ -184,4 +186,4 @@ class Learner:
         ends = np.cumsum([count, count * count, count * count, count])
         mean, covariance, precision, score, (time,) = np.split(state, ends)
         self.mean, self._score, self.time = mean.copy(), score.copy(), float(time)
-        self.covariance, self._precision = (one.reshape(count, count).copy() for one in (covariance, precision))
+        self.covariance, self._precision = (matrix.reshape(count, count).copy() for matrix in (covariance, precision))

@@ -126,8 +126,8 @@ class Poses:
 
         A value that is repeated for a long time shows a stopped sensor and is kept.
         """
-        one, next_one = self.q[:-1], self.q[1:]
-        again = ((one == next_one) | (np.isnan(one) & np.isnan(next_one))).all(axis=1)
+        previous, next_one = self.q[:-1], self.q[1:]
+        again = ((previous == next_one) | (np.isnan(previous) & np.isnan(next_one))).all(axis=1)
         if again.mean() < tuning.REPEATING[0] if len(again) else True:
             return self
         first = np.flatnonzero(np.append(True, ~again))
@@ -399,7 +399,7 @@ def filled(poses: Poses) -> Array:
 
 def own_deviations(brought: Iterable[tuple[float, ...]]) -> Array:
     """Return the standard deviations in n messages of poses, shape (n, 3); NaN for a message without deviations."""
-    return np.array([one or (math.nan,) * 3 for one in brought], dtype=np.float64).reshape(-1, 3)
+    return np.array([deviations or (math.nan,) * 3 for deviations in brought], dtype=np.float64).reshape(-1, 3)
 
 
 def useless_deviation() -> Deviation:

@@ -118,8 +118,11 @@ class Ensemble:
         self._walls = np.repeat(penetration_rows(scene)[None], members, axis=0)
         self._walls[:, 4] = penetrations_at_centre(scene, wall_distances(scenes))
         self._clearance = _clearance_of(scenes)
-        self._fastest = np.array([fastest_travel(one.wear, one.contact) for one in scenes])
-        self._stiffness, self._exponent = np.array([one.contact.stiffness for one in scenes]), scene.contact.exponent
+        self._fastest = np.array([fastest_travel(member.wear, member.contact) for member in scenes])
+        self._stiffness, self._exponent = (
+            np.array([member.contact.stiffness for member in scenes]),
+            scene.contact.exponent,
+        )
         self._pressed = tuning.PRESSED * scene.head.mass_kg * Gravity().acceleration_m_s2
         self.good = np.ones(members, dtype=bool)
         #: force, and peak and impulse of the span, of each pair of each member
@@ -429,8 +432,8 @@ class Ensemble:
         self._numbers[which], self._gain[which] = numbers[accepted], gain[accepted]
         self._clearance[which] = _clearance_of(changed)
         self._walls[which, 4] = penetrations_at_centre(changed[0], wall_distances(changed))
-        self._fastest[which] = [fastest_travel(one.wear, one.contact) for one in changed]
-        self._stiffness[which] = [one.contact.stiffness for one in changed]
+        self._fastest[which] = [fastest_travel(scene.wear, scene.contact) for scene in changed]
+        self._stiffness[which] = [scene.contact.stiffness for scene in changed]
         if which[0] == 0:
             load = (self.first.wrench - self._load_off[0]) / before * self._gain[0] + self._load_off[0]
             time = self.first.time
@@ -504,7 +507,7 @@ class Ensemble:
         wide = (self._peak, self._impulse, self._v, self.worn, self._depth, self._load_off)
         learned = self.learned()
         arrays = (self.good, self.square, *wide, np.array([self._drifted]), *learned, times, path)
-        return [*self.twins(), *(one.tobytes() for one in arrays)], self._rng.bit_generator.state
+        return [*self.twins(), *(array.tobytes() for array in arrays)], self._rng.bit_generator.state
 
     def set_state(self, blobs: list[bytes], random: Any) -> None:
         """Restore a state that `state` has returned."""
@@ -517,7 +520,7 @@ class Ensemble:
         numbers = numbers.reshape(count, -1)
         which = np.flatnonzero((numbers != self._numbers).any(axis=1))
         self._set_numbers(which, numbers[which])
-        own = [one.reshape(count, -1) for one in wide]
+        own = [array.reshape(count, -1) for array in wide]
         self._peak[:], self._impulse[:], self._v, self.worn, self._depth, self._load_off = own
         self._drifted = float(drifted[0])
         self._newest = None
@@ -541,7 +544,7 @@ def _off(q: Array, then: Array, there: NDArray[np.int64]) -> Array:
 
 
 def _clearance_of(scenes: Sequence[Scene]) -> Array:
-    return np.array([[one.clearance.horizontal_m, one.clearance.vertical_m] for one in scenes]).reshape(-1, 2)
+    return np.array([[scene.clearance.horizontal_m, scene.clearance.vertical_m] for scene in scenes]).reshape(-1, 2)
 
 
 def _worn(scenes: Sequence[Scene], wear: Wear, moved: Array) -> list[Scene]:
@@ -600,7 +603,7 @@ def middle_of(scene: Scene, estimate: Estimate) -> tuple[Scene, Array]:
     def point(value: Interval | None) -> Interval | None:
         return None if value is None else Interval(value.mean, value.mean, value.mean)
 
-    points: dict[str, Any] = {one.name: point(getattr(estimate, one.name)) for one in QUANTITIES}
+    points: dict[str, Any] = {quantity.name: point(getattr(estimate, quantity.name)) for quantity in QUANTITIES}
     middle = replace(estimate, apparent=None, **points)
     scenes, gain = draw_scenes(scene, middle, 1, np.random.default_rng(0))
     return scenes[0], gain[0]

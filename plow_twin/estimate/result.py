@@ -252,8 +252,8 @@ class Estimate:
         """Return the estimate from `data`, a result of `as_dict`, but without groups, figures and motion."""
 
         def clearance(name: str) -> tuple[Interval, State]:
-            one = data[name]
-            return Interval(one["mean_m"], one["p05_m"], one["p95_m"]), State(one["state"])
+            facts = data[name]
+            return Interval(facts["mean_m"], facts["p05_m"], facts["p95_m"]), State(facts["state"])
 
         (horizontal, horizontal_state), (vertical, vertical_state) = clearance("horizontal"), clearance("vertical")
         others: dict[str, Any] = {
@@ -263,7 +263,8 @@ class Estimate:
         }
         correlation, apparent, harmonics = data["correlation"], data.get("apparent"), data.get("load_harmonics")
         others["differs"] = {
-            name: (one["probability"], one["by"], one["deviation"]) for name, one in data["differs"].items()
+            name: (difference["probability"], difference["by"], difference["deviation"])
+            for name, difference in data["differs"].items()
         }
         if apparent is not None:
             others["apparent"] = tuple(Interval(**apparent[name]) for name in ("horizontal", "vertical"))

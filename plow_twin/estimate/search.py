@@ -68,7 +68,7 @@ def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float)
                 del fits[1:]
                 break
         fits = fits[: stage.keep]
-        points = [(one.shared, one.point.states, one.noise) for one in fits]
+        points = [(fitted_motion.shared, fitted_motion.point.states, fitted_motion.noise) for fitted_motion in fits]
     return (problem, fits[0]) if fits else None
 
 
@@ -148,7 +148,7 @@ def refine(
     for start in starts:
         states = better_states(near, start, states_at(window, start))
         fits.append(fit(near, start, states, noise, 10, *(() if hard else (tuning.ENOUGH,))))
-    best = min((one for one in fits if one is not None), key=lambda one: one.loss, default=None)
+    best = min((fit_result for fit_result in fits if fit_result is not None), key=lambda one: one.loss, default=None)
     if best is None:
         return None
     whole = Problem(forward, unknowns, window, horizon=horizon, differences=differences, drift=None if hard else drift)

@@ -29,7 +29,7 @@ from plow_twin.model import geometry
 Array = NDArray[np.float64]
 
 #: Steps of the difference quotients with respect to all unknowns. The steps for biases and delay are 1e-3 in SI units.
-_STEPS: Final = np.array([one.step or 1e-3 for one in QUANTITIES])
+_STEPS: Final = np.array([quantity.step or 1e-3 for quantity in QUANTITIES])
 #: Upper bound on the number of times that a step is shortened.
 _SHORTER: Final = 5
 

@@ -78,7 +78,7 @@ def _copy_part(typingctx: Any, target: Any, source: Any, first: Any, last: Any) 
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         begin, end = (context.cast(builder, arguments[i], signature.args[i], types.intp) for i in (2, 3))
-        there, here = (builder.gep(builder.bitcast(one, cgutils.voidptr_t), [begin]) for one in arguments[:2])
+        there, here = (builder.gep(builder.bitcast(argument, cgutils.voidptr_t), [begin]) for argument in arguments[:2])
         cgutils.raw_memcpy(builder, there, here, builder.sub(end, begin), 1)  # type: ignore[no-untyped-call]
         return context.get_dummy_value()
 

@@ -132,7 +132,7 @@ class _Compiler(CompilerBase):
 
     def define_pipelines(self) -> list[Any]:
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        passes.passes = [(self.lowering if one is NativeLowering else one, text) for one, text in passes.passes]
+        passes.passes = [(self.lowering if pass_ is NativeLowering else pass_, text) for pass_, text in passes.passes]
         passes.finalize()
         return [passes]
 

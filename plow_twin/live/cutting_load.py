@@ -118,9 +118,9 @@ class CuttingLoad:
         """
         position, speed, number = self.face.travel(t)
         force = np.zeros((len(t), 2))
-        for one in np.unique(number):
-            own = number == one
-            cutting, lateral = self._fields(int(one), position[own])
+        for pass_number in np.unique(number):
+            own = number == pass_number
+            cutting, lateral = self._fields(int(pass_number), position[own])
             force[own] = np.column_stack([self.force_n * cutting, self.lateral_n * lateral])
         force *= (np.abs(speed) / self.face.speed_m_s)[:, None]
         x, y = self.at_m

@@ -312,20 +312,20 @@ class Health:
             "head_pose_residual": "" if residual is None else "{:.6g} {:.6g} {:.6g}".format(*residual),
             "refused_publishers": str(inputs.refused_publishers),
         }
-        for topic, one in inputs.optional.items():
+        for topic, source in inputs.optional.items():
             intake: Intake = getattr(inputs, topic)
             values |= {
                 f"{topic}_used": str(intake.used),
                 f"{topic}_dropped": str(intake.arrived - intake.used),
                 f"{topic}_implausible": str(intake.counts[Verdict.IMPLAUSIBLE]),
-                f"{topic}_not_followed": str(one.ignored),
+                f"{topic}_not_followed": str(source.ignored),
             }
         more = {
             "samples_lost": inputs.senders.lost,
             "samples_not_followed": inputs.senders.ignored,
             "messages_lost": inputs.lost,
             **{f"{topic}_dropped": _refused(getattr(inputs, topic)) for topic in OPTIONAL},
-            **{f"{topic}_not_followed": one.ignored for topic, one in inputs.optional.items()},
+            **{f"{topic}_not_followed": optional.ignored for topic, optional in inputs.optional.items()},
         }
         increased = self._grown({**counted, **more}, _TROUBLE)
         if peak > inputs.depth // 2:

@@ -82,8 +82,8 @@ def roll(scene: Scene) -> float:
 def wall_distances(scenes: Sequence[Scene]) -> NDArray[np.float64]:
     """Return the distance of each pair's unworn wall from the centre of the cavity in m, shape (m, 8)."""
     sides = [
-        (one.frame.width_m + one.clearance.horizontal_m, one.frame.height_m + one.clearance.vertical_m)
-        for one in scenes
+        (scene.frame.width_m + scene.clearance.horizontal_m, scene.frame.height_m + scene.clearance.vertical_m)
+        for scene in scenes
     ]
     return 0.5 * np.array(sides).take(_AXIS, axis=1)
 

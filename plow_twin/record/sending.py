@@ -76,11 +76,11 @@ class _Group(NamedTuple):
     def of(cls, topics: tuple[Topic, ...], frame_id: str, child_frame_id: str) -> Self:
         templates = [template(topic, frame_id, child_frame_id) for topic in topics]
         ends = np.cumsum([0, *map(len, templates)])
-        buffer = np.concatenate([one.data for one in templates])
+        buffer = np.concatenate([template.data for template in templates])
         parts = [
             (topic.name, buffer.data[begin:end]) for topic, begin, end in zip(topics, ends, ends[1:], strict=False)
         ]
-        places = np.concatenate([begin + one.places for begin, one in zip(ends, templates, strict=False)])
+        places = np.concatenate([begin + template.places for begin, template in zip(ends, templates, strict=False)])
         sources = np.concatenate([_sources(topic) for topic in topics])
         integers = np.concatenate([_integers(topic) for topic in topics])
         return cls(tuple(parts), buffer, ends[:-1].copy(), places, sources, integers)

@@ -394,9 +394,9 @@ def warm_up_writer(header: RunHeader) -> None:
     """Compile the functions that write messages to chunks, so that the first sample is not delayed."""
     templates: dict[str, Any] = {"sample": sample_template(header.frame_id)}
     templates |= publication_templates(header.frame_id, header.child_frame_id)
-    one = np.zeros(1, np.int64)
+    zero = np.zeros(1, np.int64)
     for template in templates.values():
         builder = ChunkBuilder("zstd")
         builder.reserve(MESSAGE_HEAD + len(template))
-        builder.add_many(1, template, one, one, one, one, np.zeros((1, template.count)))
-        builder.add_bytes(one, one, one, one, one, b"0")
+        builder.add_many(1, template, zero, zero, zero, zero, np.zeros((1, template.count)))
+        builder.add_bytes(zero, zero, zero, zero, zero, b"0")

@@ -68,7 +68,11 @@ class WithoutEvents(Node):
 
 def _set_parameters(callback: Callable[..., Any], request: Any, response: Any) -> Any:
     """Answer a request to set parameters, or refuse it if rclpy cannot read it."""
-    wrong = [f"{one.name}: got type {one.value.type}" for one in request.parameters if one.value.type not in _TYPES]
+    wrong = [
+        f"{parameter.name}: got type {parameter.value.type}"
+        for parameter in request.parameters
+        if parameter.value.type not in _TYPES
+    ]
     reason = f"{'; '.join(wrong)}; expected one of {min(_TYPES)} to {max(_TYPES)}"
     if not wrong:
         try:

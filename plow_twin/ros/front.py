@@ -63,7 +63,11 @@ class RosFront:
         self.runtime = runtime = Runtime(self, settings, prepared, kept_wear)
         made.callback(lambda: self._lost.extend(runtime.close()))
         enabled = (settings.estimate, settings.estimate_forces, any(settings.forecast_limits))
-        without = [topic for topic, one in zip(ESTIMATES, enabled, strict=True) if not (settings.estimate and one)]
+        without = [
+            topic
+            for topic, is_enabled in zip(ESTIMATES, enabled, strict=True)
+            if not (settings.estimate and is_enabled)
+        ]
         # the node publishes on the topic `status`, because the topic exists before configure
         if settings.follows != "full":
             without += FOLLOWED_TOPICS

@@ -121,7 +121,7 @@ class TwinBatch:
         count = max(1, min(workers, os.cpu_count() or 1, len(scenes)))
         self._workers = [_Worker.of(terms, self._compiled, max_wall_s) for _ in range(count)]
         self._edges = [len(scenes) * index // len(self._workers) for index in range(len(self._workers) + 1)]
-        if all(fits_lanes(one, sampled=True) for _, one in _kinds(self._compiled)):
+        if all(fits_lanes(compiled_scene, sampled=True) for _, compiled_scene in _kinds(self._compiled)):
             spans = [range(*span) for span in pairwise(self._edges)]
             self._workers = [one.with_lanes(self, terms, span) for one, span in zip(self._workers, spans, strict=True)]
         self._pool = ThreadPoolExecutor(len(self._workers)) if len(self._workers) > 1 else None
@@ -304,13 +304,13 @@ class TwinBatch:
             return changed
         places, own = np.asarray(which), list(self.scenes)
         params, compiled = compile_scenes(scenes, self.tol, sampled=True, kind=options(own[0]))
-        for index, (place, scene, one) in enumerate(zip(places.tolist(), scenes, compiled, strict=True)):
+        for index, (place, scene, compiled_scene) in enumerate(zip(places.tolist(), scenes, compiled, strict=True)):
             before = self._compiled[place]
-            changed[index] = _signature(one.parts, scene) == _signature(before.parts, before.scene)
+            changed[index] = _signature(compiled_scene.parts, scene) == _signature(before.parts, before.scene)
             if not changed[index]:
                 continue
-            self._compiled[place], own[place] = one, scene
-            if scene.contact.damping is not None and one.parts.terms.hysteretic is not None:
+            self._compiled[place], own[place] = compiled_scene, scene
+            if scene.contact.damping is not None and compiled_scene.parts.terms.hysteretic is not None:
                 self._states["damping_factor"][place] = scene.contact.damping
         params["wear_per_impulse"] = self._params["wear_per_impulse"][places]
         self._params[places[changed]] = params[changed]
@@ -382,9 +382,9 @@ class TwinBatch:
                 return
 
             def alone(member: int, i: int) -> None:
-                one, row = slice(member, member + 1), np.zeros((1, 1), ROW)
-                line = self._ends(samples[:, : i + 1], one)[:, i:]
-                records = self._params[one], self._states[one]
+                member_slice, row = slice(member, member + 1), np.zeros((1, 1), ROW)
+                line = self._ends(samples[:, : i + 1], member_slice)[:, i:]
+                records = self._params[member_slice], self._states[member_slice]
                 worker.advance(*records, 0, 1, times[i : i + 1], np.ascontiguousarray(line), self._max_steps, row)
                 rows[member, i] = row.view(np.uint8)[0, : ADVANCE.itemsize].view(ADVANCE)[0]
 
@@ -403,8 +403,8 @@ class TwinBatch:
                 run(0)
             else:
                 begun = [self._pool.submit(run, index) for index in range(len(self._workers))]
-                for one in begun:
-                    one.result()
+                for twins_begun in begun:
+                    twins_begun.result()
         except (OutOfTimeError, KeyboardInterrupt) as stop:
             self._stop(begun)
             self._states, self._before = before, after
@@ -468,7 +468,7 @@ class _Worker(NamedTuple):
 
     @staticmethod
     def of(terms: Terms, compiled: Sequence[CompiledScene], max_wall_s: float) -> _Worker:
-        stiff = any(one.parts.implicit is not None for one in compiled)
+        stiff = any(compiled_scene.parts.implicit is not None for compiled_scene in compiled)
         parts = Parts(terms, None, np.zeros(1, SEGMENT), new_implicit(terms.support is not None) if stiff else None)
         work = new_records(WORK, 1)
         work[0] = new_work()
@@ -492,9 +492,14 @@ class _Worker(NamedTuple):
 def _kinds(compiled: Sequence[CompiledScene]) -> list[tuple[int, CompiledScene]]:
     """Return the index and the first scene of each combination of terms, implicit steps, kind of head and options."""
     kinds: dict[object, tuple[int, CompiledScene]] = {}
-    for index, one in enumerate(compiled):
-        key = one.parts.terms, one.parts.implicit is None, one.scene.head.carries, options(one.scene)
-        kinds.setdefault(key, (index, one))
+    for index, compiled_scene in enumerate(compiled):
+        key = (
+            compiled_scene.parts.terms,
+            compiled_scene.parts.implicit is None,
+            compiled_scene.scene.head.carries,
+            options(compiled_scene.scene),
+        )
+        kinds.setdefault(key, (index, compiled_scene))
     return list(kinds.values())
 
 
@@ -508,33 +513,33 @@ def _merge(compiled: Sequence[CompiledScene]) -> Terms:
     """
     first = compiled[0].parts.terms
     merged = first
-    for index, one in _kinds(compiled):
-        terms = one.parts.terms
+    for index, member in _kinds(compiled):
+        scene, terms = member.scene, member.parts.terms
         for name in ("viscous", "integer", "fraction", "ramp"):
             if getattr(terms, name) != getattr(first, name):
                 raise ArgumentError(
-                    f"scenes[{index}].contact: got law {one.scene.contact.law} with exponent "
-                    f"{one.scene.contact.exponent:g}, expected the terms of scenes[0]: {compiled[0].scene.contact.law} "
+                    f"scenes[{index}].contact: got law {scene.contact.law} with exponent "
+                    f"{scene.contact.exponent:g}, expected the terms of scenes[0]: {compiled[0].scene.contact.law} "
                     f"with exponent {compiled[0].scene.contact.exponent:g}"
                 )
         if terms.stick != first.stick:
             raise ArgumentError(
-                f"scenes[{index}].friction: got {one.scene.friction}, expected friction with stick in all or in none: "
+                f"scenes[{index}].friction: got {scene.friction}, expected friction with stick in all or in none: "
                 f"scenes[0] has {compiled[0].scene.friction}"
             )
-        if one.scene.head.carries != compiled[0].scene.head.carries:
+        if scene.head.carries != compiled[0].scene.head.carries:
             raise ArgumentError(
-                f"scenes[{index}].head.carries: got {one.scene.head.carries}, expected that of scenes[0]: "
+                f"scenes[{index}].head.carries: got {scene.head.carries}, expected that of scenes[0]: "
                 f"{compiled[0].scene.head.carries}"
             )
-        if options(one.scene) != options(compiled[0].scene):
+        if options(scene) != options(compiled[0].scene):
             raise ArgumentError(
-                f"scenes[{index}]: got {options(one.scene)}, expected a corner_radius_m and a restitution that falls "
+                f"scenes[{index}]: got {options(scene)}, expected a corner_radius_m and a restitution that falls "
                 f"in all or in none: scenes[0] has {options(compiled[0].scene)}"
             )
         if terms.support != first.support:
             raise ArgumentError(
-                f"scenes[{index}].support: got {one.scene.support}, expected a support in all or in none: scenes[0] "
+                f"scenes[{index}].support: got {scene.support}, expected a support in all or in none: scenes[0] "
                 f"has {compiled[0].scene.support}"
             )
         merged = merged._replace(**{name: 1 for name in _OPTIONAL if getattr(terms, name) is not None})

@@ -175,9 +175,9 @@ class _Run:
         """Return the tasks to run first, one after another, and the tasks that the threads share."""
         groups: dict[object, list[int]] = {}
         alone: list[Callable[[], None]] = []
-        for index, one in enumerate(self._compiled):
-            if fits_lanes(one):
-                groups.setdefault((one.parts.terms, int(self._params["order"][index])), []).append(index)
+        for index, compiled_scene in enumerate(self._compiled):
+            if fits_lanes(compiled_scene):
+                groups.setdefault((compiled_scene.parts.terms, int(self._params["order"][index])), []).append(index)
             else:
                 alone.append(lambda index=index: self._run_alone(index))  # type: ignore[misc]
         shares: list[Callable[[], None]] = []

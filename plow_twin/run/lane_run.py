@@ -67,11 +67,11 @@ class LaneRun:
 
     def go_on(self, waiting: NDArray[np.int64], work: Work, lanes: np.record) -> NDArray[np.bool_]:
         """Advance members by a slice of work, and return whether each member has finished."""
-        one, begin = self._compiled[waiting[0]], _time.perf_counter()
-        terms = one.parts.terms
+        first, begin = self._compiled[waiting[0]], _time.perf_counter()
+        terms = first.parts.terms
         run_lanes(
             self._members, terms.harmonics, terms.second, terms.viscous, terms.hysteretic, *forces(terms),
-            terms.flight, terms.rest, int(one.params.order), lanes, work, waiting, self._t_end, self._max_steps,
+            terms.flight, terms.rest, int(first.params.order), lanes, work, waiting, self._t_end, self._max_steps,
             self._size, self._times,
         )  # fmt: skip
         self._size = next_slice(self._size, _time.perf_counter() - begin)

@@ -300,11 +300,13 @@ def _by_equations(scene: Scene, t_end: float, tol: float, parameters: Sequence[s
     """Return the derivatives from the linearised equations, or None for unsupported terms or too many steps."""
     compiled = compile_scene(scene, tol)
     changed = [ChangedScene.of(scene, path, tol) for path in parameters]
-    if not fits_tangents(compiled) or any(one.compiled.parts.terms != compiled.parts.terms for one in changed):
+    if not fits_tangents(compiled) or any(change.compiled.parts.terms != compiled.parts.terms for change in changed):
         return None
     scale, parts = scale_of(compiled), compiled.parts
     ends, count = _ends(t_end), STATE_COLUMNS + len(changed)
-    columns, omegas, amplitudes = displaced_columns(compiled, [(one.compiled, one.change) for one in changed])
+    columns, omegas, amplitudes = displaced_columns(
+        compiled, [(displaced.compiled, displaced.change) for displaced in changed]
+    )
     out, whole, reached = np.zeros((len(ends), STATE_COLUMNS, count)), np.zeros(len(ends), np.int64), np.zeros(1, int)
     state, work, along = compiled.initial_state(), new_work(), new_record(ALONG)
     room, size = _CLEAR_OF_WALLS * DISPLACEMENT * scale[0], _FIRST_SLICE
@@ -334,8 +336,8 @@ def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str
     scale, free = scale_of(compiled), free_places(scene)
     work, merged, most_merged, size = new_work(), 0, _most_merged(t_end), len(free)
     moved, implicit = DISPLACEMENT, 0
-    scenes = [compiled] * (1 + size) + [one.compiled for one in changed]
-    first_states = [one.compiled.initial_state() for one in changed]
+    scenes = [compiled] * (1 + size) + [change.compiled for change in changed]
+    first_states = [displaced.compiled.initial_state() for displaced in changed]
     states = _displaced(compiled, compiled.initial_state(), moved * scale, free, first_states, work)
     matrices, changes, ended = [], [], []
     for end in _ends(t_end).tolist():
@@ -344,7 +346,7 @@ def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str
         reached = np.array([_pose_and_rate(motion) for motion in followed])
         away = (reached[1:] - reached[0])[:, free] / scale[free]
         matrices.append(away[:size].T / moved)
-        changes.append(away[size:] / np.array([one.change for one in changed])[:, None])
+        changes.append(away[size:] / np.array([displaced.change for displaced in changed])[:, None])
         assert followed[0].penetration is not None
         held = int(states[0].implicit_steps) > implicit
         depths = followed[0].penetration[0, compiled.params.enabled == 1]

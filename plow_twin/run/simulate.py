@@ -227,7 +227,7 @@ class _Watch:
         limit = f"max_steps = {self.max_steps}" if steps >= self.max_steps else f"max_wall_s = {self._max_wall_s:g}"
         if steps >= self.max_steps or wall >= self._max_wall_s:
             mode = motion.state.mode
-            pairs = ", ".join(name for name, one in zip(PAIR_NAMES, mode, strict=True) if one != OFF)
+            pairs = ", ".join(name for name, pair_mode in zip(PAIR_NAMES, mode, strict=True) if pair_mode != OFF)
             raise _StoppedError(
                 f"{limit} reached at t = {motion.time:.9g} s of {self._t_end:g} s after {steps} steps and "
                 f"{wall:.1f} s; the last step was {float(motion.state.last_step_size):.3g} s long, in contact: "

@@ -55,14 +55,14 @@ def displaced_columns(
     amplitudes, start = np.zeros((blocks, len(omegas), 2, 3, WIDTH)), compiled.initial_state()
     for index, (other, change) in enumerate(changed, STATE_COLUMNS):
         block, lane = divmod(index, WIDTH)
-        one, there, here = columns[block], other.params, compiled.params
+        column, there, here = columns[block], other.params, compiled.params
         for name, of in (("stiffness", "stiffness"), ("viscous", "viscous"), ("number", "damping_number")):
-            one[name][lane] = (there[of] - here[of]) / change
-        one["edge"][:, lane] = (there.penetration_rows[4] - here.penetration_rows[4]) / change
-        one["constant"][:, lane] = (there.constant - here.constant) / change
-        one["factor"][:, lane] = (other.initial_state().damping_factor - start.damping_factor) / change
+            column[name][lane] = (there[of] - here[of]) / change
+        column["edge"][:, lane] = (there.penetration_rows[4] - here.penetration_rows[4]) / change
+        column["constant"][:, lane] = (there.constant - here.constant) / change
+        column["factor"][:, lane] = (other.initial_state().damping_factor - start.damping_factor) / change
         waves = np.stack([other.loads.sine - compiled.loads.sine, other.loads.cosine - compiled.loads.cosine], axis=1)
         amplitudes[block, ..., lane] = per_mass(compiled.scene, waves) / change
-        if one["constant"][:, lane].any() or waves.any():
+        if column["constant"][:, lane].any() or waves.any():
             columns["loaded"][block] = 1
     return columns, omegas, amplitudes

@@ -83,7 +83,7 @@ class TwinSensitivity:
         self._scale, self._free, self._enabled = scale_of(compiled), free_places(scene), compiled.params.enabled == 1
         self._reads_speed = bool(compiled.params.damping_number >= 0.0)
         size = len(self._free)
-        members = [scene] * (1 + size) + [one.compiled.scene for one in self._changed]
+        members = [scene] * (1 + size) + [change.compiled.scene for change in self._changed]
         self._shadows = TwinBatch(members, tol=SHADOW_TOLERANCE, start=twin.time)
         self.t = self._begin = twin.time
         self._product, self._logs = StretchProduct(size, len(parameters)), np.zeros(size)
@@ -99,7 +99,8 @@ class TwinSensitivity:
     def by_parameter(self) -> dict[str, Array]:
         """Derivatives of the state at `t` with respect to the parameters."""
         return {
-            one.path: row * self._scale[self._free] for one, row in zip(self._changed, self._product.rows, strict=True)
+            change.path: row * self._scale[self._free]
+            for change, row in zip(self._changed, self._product.rows, strict=True)
         }
 
     @property
@@ -148,7 +149,7 @@ class TwinSensitivity:
 
     def _end(self, t: float, matrix: Array, changes: Array) -> None:
         """End a stretch with its fundamental matrix `matrix` and the scaled effects `changes` of the parameters."""
-        by_unit = changes / np.array([one.change for one in self._changed])[:, None]
+        by_unit = changes / np.array([change.change for change in self._changed])[:, None]
         self._logs += self._product.follow(matrix[None], by_unit[None], np.ones(1, bool))[3][0]
         self.t = t
         self._start()

@@ -92,13 +92,14 @@ class CompiledScene:
 def start_many(compiled: Sequence[CompiledScene], states: NDArray[np.void], members: Sequence[int]) -> None:
     """Write coordinates, rates, damping and wear, but not modes, of the initial states of `members` to zero records."""
     chosen, shared = [compiled[index] for index in members], _Shared()
-    scenes = [one.scene for one in chosen]
+    scenes = [compiled.scene for compiled in chosen]
     # the frame and the wear determine whether a block tumbles
     states["y"][members] = [
         shared.of(_initial_place, one.initial, one.head, one.frame, one.wear, given=(one,)) for one in scenes
     ]
     states["damping_factor"][members] = [
-        [0.0 if one.parts.terms.hysteretic is None else one.scene.contact.damping or 0.0] for one in chosen
+        [0.0 if compiled.parts.terms.hysteretic is None else compiled.scene.contact.damping or 0.0]
+        for compiled in chosen
     ]
     for index, scene in zip(members, scenes, strict=True):
         if scene.wear is not None:
@@ -649,13 +650,13 @@ def _rubbing(scene: Scene) -> dict[str, Any]:
 
 
 def _slip(frictions: Sequence[Friction]) -> dict[str, Any]:
-    static = [one.coefficient if one.static_coefficient is None else one.static_coefficient for one in frictions]
+    static = [law.coefficient if law.static_coefficient is None else law.static_coefficient for law in frictions]
     return dict(
-        friction=[one.coefficient for one in frictions],
-        slip_speed=[one.regularisation_speed_m_s for one in frictions],
+        friction=[law.coefficient for law in frictions],
+        slip_speed=[law.regularisation_speed_m_s for law in frictions],
         static_friction=static,
-        stick_stiffness=[one.stick_stiffness_n_m or 0.0 for one in frictions],
-        stick_damping=[one.stick_damping_n_s_m or 0.0 for one in frictions],
+        stick_stiffness=[law.stick_stiffness_n_m or 0.0 for law in frictions],
+        stick_damping=[law.stick_damping_n_s_m or 0.0 for law in frictions],
     )
 
 

@@ -26,10 +26,10 @@ def load_at(p, harmonics, segments, t, out) -> None:
 def add_harmonics(p, harmonics, t, out) -> None:
     """Add the harmonic loads at time t to `out`, in the units of `load_at`."""
     for i in range(harmonics.size):
-        one = harmonics[i]
-        sine, cosine = math.sin(one.omega * t), math.cos(one.omega * t)
-        s1 = one.first[0] * sine + one.first[1] * cosine
-        s2 = one.second[0] * sine + one.second[1] * cosine
+        harmonic = harmonics[i]
+        sine, cosine = math.sin(harmonic.omega * t), math.cos(harmonic.omega * t)
+        s1 = harmonic.first[0] * sine + harmonic.first[1] * cosine
+        s2 = harmonic.second[0] * sine + harmonic.second[1] * cosine
         out[0] += p.direction[0, 0] * s1 + p.direction[1, 0] * s2
         out[1] += p.direction[0, 1] * s1 + p.direction[1, 1] * s2
-        out[2] += one.moment[0] * sine + one.moment[1] * cosine
+        out[2] += harmonic.moment[0] * sine + harmonic.moment[1] * cosine

@@ -454,7 +454,11 @@ class Session:
             measured.popleft()
         if len(measured) > MOST_MEASURED:
             del measured[
-                next(place for place, one in enumerate(measured) if not isinstance(one.entry, journal.Estimated))
+                next(
+                    place
+                    for place, measurement in enumerate(measured)
+                    if not isinstance(measurement.entry, journal.Estimated)
+                )
             ]
             self.poses_dropped += 1
 
@@ -511,11 +515,11 @@ class Session:
             # if a pose or an estimate had an effect before it became known, the motion would depend on how far the
             # session goes back
             measured, self._measured = self._measured, deque()
-            for one in measured:
-                if one.number > self.following.added:
-                    self._follow(one.stamp_ns, one.entry, one.known)
+            for measurement in measured:
+                if measurement.number > self.following.added:
+                    self._follow(measurement.stamp_ns, measurement.entry, measurement.known)
                 else:
-                    self._measured.append(one)
+                    self._measured.append(measurement)
         # a speed with the stamp of the snapshot may occur twice
         by_stamp = {travel.stamp_ns: travel for travel in (*self._travels, *travels, *pending, *more)}
         self._travels = sorted(by_stamp.values(), key=lambda travel: travel.stamp_ns)

@@ -79,7 +79,10 @@ class Topic:
     def numbers(self, records: NDArray[np.void]) -> list[NDArray[np.float64]]:
         """Return the numbers of messages, an array (n, count) for each of `parts`; floats are not copied."""
         columns = ((records[name], count) for name, count in self.parts)
-        return [np.asarray(one[:, :count] if one.ndim > 1 else one[:, None], np.float64) for one, count in columns]
+        return [
+            np.asarray(column[:, :count] if column.ndim > 1 else column[:, None], np.float64)
+            for column, count in columns
+        ]
 
 
 _INTERVALS: Final = (*PAIR_NAMES, *(f"{name}/{point}" for point in ("p05", "p95") for name in PAIR_NAMES))

@@ -22,10 +22,10 @@ def estimate_picture(
     states = {"horizontal": result.horizontal_state, "vertical": result.vertical_state}
     values = result.values()
     rows = [
-        _value(labels[one.name], values[one.name], prior.get(one.name), one.factor, one.digits,
-               states[one.name].value.replace("_", " ") if one.name in states else "")
-        for one in QUANTITIES
-        if one.name in values
+        _value(labels[quantity.name], values[quantity.name], prior.get(quantity.name), quantity.factor, quantity.digits,
+               states[quantity.name].value.replace("_", " ") if quantity.name in states else "")
+        for quantity in QUANTITIES
+        if quantity.name in values
     ]  # fmt: skip
     rows += [
         _value(f"{name.replace('_', ', ')} [mm]", value, prior.get(name.split("_")[0]), 1e3, ".3f",

@@ -84,7 +84,7 @@ class FaceChart:
             here[piece] = max(here.get(piece, 0.0), float(force[pieces == piece].max()))
         while len(here) > _MOST_PIECES:
             self._piece_m *= 2.0
-            self._passes = [_halved(one) for one in self._passes]
+            self._passes = [_halved(forces) for forces in self._passes]
             here = self._passes[-1]
 
     def restart(self) -> None:
@@ -95,18 +95,18 @@ class FaceChart:
 
     def draw(self, stamp_ns: int, step: int) -> None:
         """Draw the chart."""
-        filled = [one for one in self._passes if one]
+        filled = [forces for forces in self._passes if forces]
         if not filled:
             return
-        places = [piece * self._piece_m for one in filled for piece in (min(one), max(one) + 1)]
+        places = [piece * self._piece_m for pass_forces in filled for piece in (min(pass_forces), max(pass_forces) + 1)]
         first, last = min(places), max(places)
-        top = _round_up(max(1.0, max(max(one.values()) for one in filled) / 1e3))
+        top = _round_up(max(1.0, max(max(pass_forces.values()) for pass_forces in filled) / 1e3))
         across, up = WIDTH / max(last - first, self._piece_m), HEIGHT / top
         strips = [np.array([[0.0, -HEIGHT], [0.0, 0.0], [WIDTH, 0.0]])]
         colors = [_AXIS]
-        for number, one in enumerate(filled):
-            pieces = np.array(sorted(one))
-            force = np.array([one[piece] for piece in pieces.tolist()]) / 1e3
+        for number, pass_forces in enumerate(filled):
+            pieces = np.array(sorted(pass_forces))
+            force = np.array([pass_forces[piece] for piece in pieces.tolist()]) / 1e3
             middle = (pieces + 0.5) * self._piece_m
             strips.append(np.column_stack((across * (middle - first), -up * force)))
             colors.append(_NEWEST if number == len(filled) - 1 else _EARLIER)
@@ -121,9 +121,9 @@ class FaceChart:
         self._ticks.flush()
 
 
-def _halved(one: dict[int, float]) -> dict[int, float]:
+def _halved(forces: dict[int, float]) -> dict[int, float]:
     halved: dict[int, float] = {}
-    for piece, force in one.items():
+    for piece, force in forces.items():
         halved[piece // 2] = max(halved.get(piece // 2, 0.0), force)
     return halved
 

@@ -35,10 +35,10 @@ class Residuals:
         if not len(stamps):
             return stamps, stamps, np.zeros((0, 3))
         self._last = int(stamps[-1]), predicted[-1]
-        ready = [one for one in self._waiting if stamps[0] <= one[0] <= stamps[-1]]
-        self._waiting = [one for one in self._waiting if one[0] > stamps[-1]]
-        at = np.array([one[0] for one in ready], np.int64)
+        ready = [pose for pose in self._waiting if stamps[0] <= pose[0] <= stamps[-1]]
+        self._waiting = [pose for pose in self._waiting if pose[0] > stamps[-1]]
+        at = np.array([pose[0] for pose in ready], np.int64)
         rising = np.maximum.accumulate(stamps) - stamps[0]
         model = np.stack([np.interp(at - stamps[0], rising, column) for column in predicted.T], axis=1)
-        measured = np.array([one[2] for one in ready]).reshape(-1, 3)
-        return at, np.array([one[1] for one in ready], np.int64), _SCALE * (measured - model)
+        measured = np.array([pose[2] for pose in ready]).reshape(-1, 3)
+        return at, np.array([pose[1] for pose in ready], np.int64), _SCALE * (measured - model)

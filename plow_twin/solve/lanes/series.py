@@ -33,11 +33,11 @@ def _gather_harmonic(harmonics, extent, lanes, i) -> None:
     for lane in range(WIDTH):
         member = lanes.member[lane]
         if member >= 0 and i < extent[member, 1]:
-            one = harmonics[extent[member, 0] + i]
-            there[0, lane], there[9, lane] = one.omega, one.omega * lanes.time[lane]
+            harmonic = harmonics[extent[member, 0] + i]
+            there[0, lane], there[9, lane] = harmonic.omega, harmonic.omega * lanes.time[lane]
             for j in range(2):
-                there[3 + j, lane], there[5 + j, lane] = one.first[j], one.second[j]
-                there[7 + j, lane] = one.moment[j]
+                there[3 + j, lane], there[5 + j, lane] = harmonic.first[j], harmonic.second[j]
+                there[7 + j, lane] = harmonic.moment[j]
         else:
             for j in range(10):
                 there[j, lane] = 0.0
@@ -145,9 +145,9 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction,
             torque = fused(exact_row(series[X], j), exact_row(moment[DX], k - j), torque)
             other = fused(exact_row(series[Y], j), exact_row(moment[DY], k - j), other)
             if waves is not None:
-                one = exact_row(load[0], j)
-                wc = fused(one, exact_row(series[COS], k - j), wc)
-                ws = fused(one, exact_row(series[SIN], k - j), ws)
+                load_coefficient = exact_row(load[0], j)
+                wc = fused(load_coefficient, exact_row(series[COS], k - j), wc)
+                ws = fused(load_coefficient, exact_row(series[SIN], k - j), ws)
         share = 0.0 if k == 0 else 1.0  # order 0 has only one product, which must not be added twice
         early = om0 * share
         px, py = fused(om, x0, fused(early, x, px)), fused(om, y0, fused(early, y, py))
@@ -183,9 +183,9 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction,
             if second is not None:
                 wc = ws = zero
                 for j in range(1, k):
-                    one = exact_row(load[1], j)
-                    wc = fused(one, exact_row(series[COS], k - j), wc)
-                    ws = fused(one, exact_row(series[SIN], k - j), ws)
+                    load_coefficient = exact_row(load[1], j)
+                    wc = fused(load_coefficient, exact_row(series[COS], k - j), wc)
+                    ws = fused(load_coefficient, exact_row(series[SIN], k - j), ws)
                 wc, ws = _add_ends(load[1], k, c0, s0, c, s, share, wc, ws)
                 ax = fused(exact_row(direction, 2), wc, fused(exact_row(direction, 3), ws, ax))
                 ay = fused(exact_row(direction, 3), wc, fused(exact_row(direction, 2), ws * -1.0, ay))

@@ -22,12 +22,12 @@ _SAFE = 0.9
 
 
 @kernel(inline="code")
-def amplitudes(p, one, j):
+def amplitudes(p, harmonic, j):
     """Return the sine and cosine amplitudes of a harmonic load's acceleration along x, y or theta (j = 0, 1, 2)."""
     if j == 2:
-        return one.moment[0], one.moment[1]
-    sine = p.direction[0, j] * one.first[0] + p.direction[1, j] * one.second[0]
-    return sine, p.direction[0, j] * one.first[1] + p.direction[1, j] * one.second[1]
+        return harmonic.moment[0], harmonic.moment[1]
+    sine = p.direction[0, j] * harmonic.first[0] + p.direction[1, j] * harmonic.second[0]
+    return sine, p.direction[0, j] * harmonic.first[1] + p.direction[1, j] * harmonic.second[1]
 
 
 @kernel()
@@ -54,12 +54,12 @@ def _bounds(p, harmonics, t, z, w) -> None:
     for j in range(3):
         drift, push, swing = z[3 + j], 0.0, 0.0
         for i in range(harmonics.size):
-            one = harmonics[i]
-            sine, cosine = amplitudes(p, one, j)
-            phase, size = one.omega * t, p.free[j] * math.hypot(sine, cosine)
-            drift += p.free[j] * (sine * math.cos(phase) - cosine * math.sin(phase)) / one.omega
+            harmonic = harmonics[i]
+            sine, cosine = amplitudes(p, harmonic, j)
+            phase, size = harmonic.omega * t, p.free[j] * math.hypot(sine, cosine)
+            drift += p.free[j] * (sine * math.cos(phase) - cosine * math.sin(phase)) / harmonic.omega
             push += size
-            swing += 2.0 * size / (one.omega * one.omega)
+            swing += 2.0 * size / (harmonic.omega * harmonic.omega)
         w.flight[1, j], w.flight[2, j] = abs(z[3 + j]), abs(drift)
         w.flight[3, j], w.flight[4, j] = push, swing
 
@@ -138,11 +138,11 @@ def _swing(p, harmonics, j, t, time):
     """Return the rate and the distance that the harmonic loads add along x, y or theta from t to t + `time`."""
     rate = way = 0.0
     for i in range(harmonics.size):
-        one = harmonics[i]
-        sine, cosine = amplitudes(p, one, j)
-        before, after = one.omega * t, one.omega * (t + time)
+        harmonic = harmonics[i]
+        sine, cosine = amplitudes(p, harmonic, j)
+        before, after = harmonic.omega * t, harmonic.omega * (t + time)
         rise, fall = math.sin(after) - math.sin(before), math.cos(after) - math.cos(before)
-        rate += (cosine * rise - sine * fall) / one.omega
+        rate += (cosine * rise - sine * fall) / harmonic.omega
         steady = sine * math.cos(before) - cosine * math.sin(before)
-        way += (steady * time - (sine * rise + cosine * fall) / one.omega) / one.omega
+        way += (steady * time - (sine * rise + cosine * fall) / harmonic.omega) / harmonic.omega
     return rate, way

@@ -57,16 +57,16 @@ def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:
     for k in range(order + 1):
         load[0, k] = load[1, k] = load[2, k] = 0.0
     for i in range(harmonics.size):
-        one = harmonics[i]
-        omega = one.omega
+        harmonic = harmonics[i]
+        omega = harmonic.omega
         sine, cosine = math.sin(omega * t), math.cos(omega * t)
         sine_before, cosine_before = 0.0, 0.0
-        f0, f1, m0, m1 = one.first[0], one.first[1], one.moment[0], one.moment[1]
+        f0, f1, m0, m1 = harmonic.first[0], harmonic.first[1], harmonic.moment[0], harmonic.moment[1]
         for k in range(order + 1):
             load[0, k] += f0 * sine + f1 * cosine
             load[2, k] += m0 * sine + m1 * cosine
             if second is not None:
-                load[1, k] += one.second[0] * sine + one.second[1] * cosine
+                load[1, k] += harmonic.second[0] * sine + harmonic.second[1] * cosine
             scale = omega * w.inverse[k + 1]
             new_sine = scale * (alpha * cosine + beta * cosine_before)
             new_cosine = -scale * (alpha * sine + beta * sine_before)

@@ -92,15 +92,15 @@ def _dynamic_stiffness(p, w, omega, i, j):
 
 
 @kernel()
-def _answer(p, one, w, gyration):
+def _answer(p, harmonic, w, gyration):
     """Return the amplitudes of |x| in m and of sqrt(x K x), where x is the linear response to a harmonic load."""
-    om = one.omega
+    om = harmonic.omega
     a, b, c = _dynamic_stiffness(p, w, om, 0, 0), _dynamic_stiffness(p, w, om, 0, 1), _dynamic_stiffness(p, w, om, 0, 2)
     d, e, f = _dynamic_stiffness(p, w, om, 1, 0), _dynamic_stiffness(p, w, om, 1, 1), _dynamic_stiffness(p, w, om, 1, 2)
     g, h, k = _dynamic_stiffness(p, w, om, 2, 0), _dynamic_stiffness(p, w, om, 2, 1), _dynamic_stiffness(p, w, om, 2, 2)
-    sx, cx = amplitudes(p, one, 0)
-    sy, cy = amplitudes(p, one, 1)
-    st, ct = amplitudes(p, one, 2)
+    sx, cx = amplitudes(p, harmonic, 0)
+    sy, cy = amplitudes(p, harmonic, 1)
+    st, ct = amplitudes(p, harmonic, 2)
     x, y, t = p.free[0] * complex(cx, -sx), p.free[1] * complex(cy, -sy), p.free[2] * gyration * complex(ct, -st)
     # the inverse matrix, from the adjugate matrix
     first, second, third = e * k - f * h, f * g - d * k, d * h - e * g

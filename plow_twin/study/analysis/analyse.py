@@ -215,9 +215,9 @@ class Analysis:
                 continue
             signal = self.measured.signals[name]
             (at, rows), ours = signal.series(), prediction.is_of_longest(signal)
-            one = compare(times[rising], column[rising], (at[ours] - stamps[0]) * 1e-9, rows[ours, 0])
-            if one is not None:
-                compared[name] = one
+            comparison = compare(times[rising], column[rising], (at[ours] - stamps[0]) * 1e-9, rows[ours, 0])
+            if comparison is not None:
+                compared[name] = comparison
         return compared
 
     def facts(self) -> dict[str, Any]:
@@ -447,8 +447,12 @@ def _walk_other(
     check_units(messages_of(open_source(path), roles), roles, predictions[0].scene, path)
     writer = _writer(out, predictions[0], roles) if out is not None else None
     walkers = [
-        _walker(one, Session(Twin(one.scene, tol=_TOLERANCE, excitation="sampled")), writer if number == 0 else None)
-        for number, one in enumerate(predictions)
+        _walker(
+            prediction,
+            Session(Twin(prediction.scene, tol=_TOLERANCE, excitation="sampled")),
+            writer if number == 0 else None,
+        )
+        for number, prediction in enumerate(predictions)
     ]
     measured = Measured()
 

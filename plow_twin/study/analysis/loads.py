@@ -127,7 +127,9 @@ class LoadTotals:
         """Return the energy [J] that the contacts dissipate between rows: the work of the load minus the gain."""
         now = walked.wrench, walked.rows.q, walked.rows.v, walked.rows.penetration
         first = (column[0] for column in now) if self._last is None else self._last[1:]
-        before = [np.concatenate((one[None], column[:-1])) for one, column in zip(first, now, strict=True)]
+        before = [
+            np.concatenate((first_value[None], column[:-1])) for first_value, column in zip(first, now, strict=True)
+        ]
         work: Array = (0.5 * (now[0] + before[0]) * (now[1] - before[1])).sum(axis=1)
         gain = self._energy(*now[1:]) - self._energy(*before[1:])
         return np.where(steps > 0.0, work - gain, 0.0)

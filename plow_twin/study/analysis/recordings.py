@@ -39,7 +39,7 @@ def left_out(path: Path, results: Sequence[Path] = ()) -> list[Path]:
     if _is_recording(path, results):
         return [item for item in folders if _holds(item) and item not in beside_folders(path)]
     empty = [item for item in folders if not any(item.iterdir())]
-    return empty + sorted(path.glob("*.csv")) + [one for item in folders if _holds(item) for one in left_out(item)]
+    return empty + sorted(path.glob("*.csv")) + [file for item in folders if _holds(item) for file in left_out(item)]
 
 
 def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:

@@ -58,7 +58,7 @@ def _write_tables(prediction: Prediction, out: Path, suffix: str) -> None:
     if prediction.loads.slide_wear:
         places = sorted(prediction.loads.slide_wear)
         depth = np.array([prediction.loads.slide_wear[place] for place in places])
-        where = {"backward": [bool(one) for one, _ in places], "position_m": [piece for _, piece in places]}
+        where = {"backward": [bool(backward) for backward, _ in places], "position_m": [piece for _, piece in places]}
         worn = {name: depth[:, index] for index, name in enumerate(PAIR_NAMES)}
         _write_table({**where, **worn}, out / f"slide_wear{suffix}.parquet")
 

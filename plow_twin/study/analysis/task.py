@@ -116,8 +116,8 @@ class Task:
     def _keep(self, old: Sequence[Path], inputs: Sequence[Path]) -> None:
         for path in inputs:
             real = path.resolve()
-            for one in old:
-                if real.is_relative_to(one.resolve()):
+            for output in old:
+                if real.is_relative_to(output.resolve()):
                     raise RecordingError(f"{path}: --out {self.out} would replace it, expected another folder")
 
     def _inputs(self) -> list[Path]:

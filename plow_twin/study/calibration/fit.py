@@ -123,7 +123,7 @@ class Fit:
             "runs": calibration.runs,
             "objective_before": self.before, "objective": calibration.best.objective, "values": calibration.best.values,
             "targets": [asdict(row) for row in self.targets], "starts": starts,
-            "identifiability": asdict(self.identifiability), "clusters": [asdict(one) for one in self.clusters],
+            "identifiability": asdict(self.identifiability), "clusters": [asdict(cluster) for cluster in self.clusters],
             "package_version": package_version(), "build": dict(build_fingerprint()),
         }  # fmt: skip
 

@@ -52,7 +52,11 @@ def _notes(fit: Fit, space: Space) -> list[str]:
     calibration = fit.calibration
     before = "" if fit.before is None else f", before the fit {fit.before:.3g}"
     lines = [f"starts: {len(calibration.starts)}, objective of the best {calibration.best.objective:.3g}{before}"]
-    chosen = {parameter_words(one.path)[0]: calibration.best.values[one.path] for one in space.unknowns if one.choices}
+    chosen = {
+        parameter_words(unknown.path)[0]: calibration.best.values[unknown.path]
+        for unknown in space.unknowns
+        if unknown.choices
+    }
     words = [f"{name}: {value if isinstance(value, str) else signed(value, 'g')}" for name, value in chosen.items()]
     return [*lines, ", ".join(words)] if words else lines
 

@@ -109,7 +109,7 @@ class Drawn:
             )
             weights = times / self.size
             means.append(weights @ centred)
-            products.append(np.stack([weights @ (centred[:, [one]] * centred) for one in range(width)], axis=1))
+            products.append(np.stack([weights @ (centred[:, [column]] * centred) for column in range(width)], axis=1))
         offset = np.concatenate(means)
         #: Means of the quantities, shape (draws + 1, k), and of the loads, shape (draws + 1, m).
         self.mean, self.load = (usual + offset)[:, width:], (usual + offset)[:, :width]

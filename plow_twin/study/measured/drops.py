@@ -39,7 +39,7 @@ class Drops:
         with np.load(path) as data:
             pose = data["pose"] * data["scale"]
         pose[:, :, 2] = np.unwrap(pose[:, :, 2], axis=1)
-        flights = np.array([_flight_rows(one) for one in pose])
+        flights = np.array([_flight_rows(poses) for poses in pose])
         return cls(pose, flights, tuple(_bounces(one[:, 1]) for one in pose))
 
     def usable(self) -> list[int]:

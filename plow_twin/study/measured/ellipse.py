@@ -190,7 +190,7 @@ def _numbers(contact: EllipseContact, speed: Array, along: Array, normal_arm: Ar
         viscous = 2.0 * restitution * (_STIFFNESS / mobility) ** 0.5
     elif law.number_of is not None:
         grid = np.linspace(_LEAST, _LARGEST, 500)
-        damping = np.interp(e, grid, [law.damping_number(one) for one in grid]) / speed
+        damping = np.interp(e, grid, [law.damping_number(restitution_value) for restitution_value in grid]) / speed
     else:
         damping[:] = restitution / USUAL_SPEED
     spring = contact.stick_stiffness * _STIFFNESS

@@ -35,7 +35,7 @@ def write_parquet(table: Table, path: Path) -> None:
     sweep = table.sweep
     values = [sweep.values(member) for member in range(sweep.size)]
     failed = set(table.failed)
-    columns: dict[str, Any] = {axis.path: [one[axis.path] for one in values] for axis in sweep.axes}
+    columns: dict[str, Any] = {axis.path: [combination[axis.path] for combination in values] for axis in sweep.axes}
     columns["status"] = table.status
     columns["ended"] = [table.reason(member) if member in failed else "done" for member in range(sweep.size)]
     columns |= {name: table.numbers[:, index] for index, name in enumerate(sweep.statistics)}
