@@ -190,8 +190,8 @@ def run_one(name: str, method: str, seed: int) -> dict[str, Any]:
         for t, q in zip(truth.poses.t[1:], truth.poses.q[1:], strict=True):
             filter_.predict(float(t) - filter_.now)
             # a component that was not measured gets so much noise that it has practically no effect
-            there = np.isfinite(q)
-            filter_.update(np.where(there, q, 0.0), np.diag(np.where(there, noise, 1e3) ** 2))
+            finite = np.isfinite(q)
+            filter_.update(np.where(finite, q, 0.0), np.diag(np.where(finite, noise, 1e3) ** 2))
     except np.linalg.LinAlgError as error:
         return row | {"failed": str(error)}
     deviation = np.sqrt(np.maximum(np.diag(filter_.P)[_FIRST:], 0.0))

@@ -35,7 +35,7 @@ SAMPLES = 600
     [
         (["view", "RUN", "--png", "x.png", "--web"], "--png cannot be combined with --out, --web or --follow"),
         (["view", "RUN", "--png", "x.png", "--follow"], "--png cannot be combined with --out, --web or --follow"),
-        (["view", "RUN", "--follow", "--web", "--out", "x.rrd"], "cannot be combined with both --out and --web"),
+        (["view", "RUN", "--follow", "--web", "--out", "x.rrd"], "--follow: got --out and --web, expected at most one"),
         (["analyse", "RUN", "--watch", "1", "--workers", "2"], "--watch cannot be combined with --dask or --workers"),
         (["analyse", "RUN", "--dask", "tcp://127.0.0.1:1"], "--dask: got one recording, expected many"),
         (["analyse", "RUN", "--workers", "2"], "--workers: got one recording, expected many"),

@@ -137,8 +137,8 @@ def test_rows_on_a_grid_equal_rows_at_the_samples(truth: Truth) -> None:
     every = follow(truth.nominal, load, poses, MEMBERS).rows
     grid = follow(truth.nominal, load, poses, MEMBERS, dt=0.005).rows
     assert np.allclose(np.diff(grid.t), 0.005)
-    there = np.searchsorted(grid.t, load.t - 1e-9)[:-1]
-    assert np.allclose(grid.force[there], every.force[:-1], rtol=1e-6, atol=1.0)
+    load_on_grid = np.searchsorted(grid.t, load.t - 1e-9)[:-1]
+    assert np.allclose(grid.force[load_on_grid], every.force[:-1], rtol=1e-6, atol=1.0)
 
 
 def test_without_measurements_the_motion_stays_nominal(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -300,7 +300,7 @@ def test_intervals_allow_for_the_load_error_of_a_rough_estimate(truth: Truth, fo
     figures = {f"load_error_{name}": 0.01 for name in ("fx", "fy", "m")}
     rough = replace(_known(truth, State.ROUGH), figures=figures)
     wrench = truth.load.wrench + np.array([4e3, 0.0, 0.0])
-    held, there = {}, slice(200, 401)
+    held, rows_used = {}, slice(200, 401)
     for name, estimate in (("plain", _known(truth)), ("rough", rough)):
         follower = Follower(truth.nominal, MEMBERS)
         follower.every_row = True
@@ -318,7 +318,7 @@ def test_intervals_allow_for_the_load_error_of_a_rough_estimate(truth: Truth, fo
                 one.advance_rows(off.load.t[index : index + 1], wrench[index : index + 1], rows[row : row + 1])
             assert one is follower or np.array_equal(rows, rows_given)
             rows_given = rows
-        true = forces[there]
+        true = forces[rows_used]
         inside = (rows_given["force_low"] <= true) & (true <= rows_given["force_high"])
         held[name] = float(inside[true > 0.0].mean())
     assert held["plain"] < 0.6 and held["rough"] > 0.8

@@ -148,6 +148,8 @@ def test_forces_from_the_estimate_include_the_harmonics(truth: Truth, found: Est
     late = truth.load.t > 3.0
     for result, least, most in ((found, 0.0, 0.1), (replace(found, load_harmonics=None), 0.2, 9.0)):
         forces = forces_of(truth.nominal, result, truth.load, 20, 3.0)
-        there = np.isin(truth.load.t, forces.t) & late
-        error = _error(forces.force[1][np.isin(forces.t, truth.load.t[there])], run.force[: len(truth.load.t)][there])
+        at_forces = np.isin(truth.load.t, forces.t) & late
+        error = _error(
+            forces.force[1][np.isin(forces.t, truth.load.t[at_forces])], run.force[: len(truth.load.t)][at_forces]
+        )
         assert least < error < most

@@ -302,8 +302,8 @@ def test_sparse_or_noisy_poses_give_no_narrow_wrong_interval(missing: float, noi
 def test_a_silence_of_the_load_is_not_bridged() -> None:
     """If a lost period of the load were interpolated linearly, the sensor would seem faulty."""
     truth, _ = known()[0]
-    there = (truth.load.t < 11.0) | (truth.load.t > 14.0)
-    load = Load(truth.load.t[there], truth.load.wrench[there])
+    kept = (truth.load.t < 11.0) | (truth.load.t > 14.0)
+    load = Load(truth.load.t[kept], truth.load.wrench[kept])
     assert load.longest_stretch().t[-1] < 11.0
     result = estimate(truth.nominal, load, truth.poses)
     assert (result.model, result.sensor, result.horizontal_state) == ("ok", "ok", State.ESTIMATED)

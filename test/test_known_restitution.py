@@ -43,7 +43,9 @@ def test_exact_restitution_is_returned_for_any_stiffness_exponent_and_mass(n: fl
     ("e", "d"), [(0.1, 9.998159), (0.3, 3.087082), (0.5, 1.432751), (0.7, 0.634828), (0.9, 0.166482)]
 )
 @pytest.mark.parametrize("n", [1.0, 2.2])
-def test_a_constant_factor_of_the_published_d_returns_its_restitution(e: float, d: float, n: float) -> None:
+def test_a_damping_factor_in_the_scene_gives_the_restitution_of_its_damping_number(
+    e: float, d: float, n: float
+) -> None:
     """D = lambda v0 is given as a damping, so that the law does not use the identity."""
     speed = 0.4
     contact = Contact("hunt_crossley", 1e9, n, damping=d / speed)
@@ -60,13 +62,13 @@ def test_impacts_below_the_speed_floor_have_a_higher_restitution() -> None:
 
 
 @pytest.mark.parametrize("law", DELIVERED)
-def test_the_other_laws_deliver_their_published_restitution(law: str) -> None:
+def test_the_other_laws_have_their_published_restitution(law: str) -> None:
     for nominal, published in zip(ASKED, DELIVERED[law], strict=True):
         assert restitution.measure(law, [nominal])[0].delivered == pytest.approx(published, abs=6e-5)
 
 
 @pytest.mark.parametrize("law", restitution.restitution_laws())
-def test_every_law_delivers_the_restitution_that_the_identity_gives(law: str) -> None:
+def test_every_law_has_the_restitution_of_the_energy_identity(law: str) -> None:
     for nominal in (0.15, 0.55, 0.85):
         delivered = restitution.measure(law, [nominal])[0].delivered
         assert exact_damping_number(delivered) == pytest.approx(LAWS[law].damping_number(nominal), rel=1e-7)
@@ -136,7 +138,7 @@ def test_the_page_shows_the_results_of_the_solver() -> None:
         assert row.delivered == pytest.approx(again.delivered, abs=2e-9)
 
 
-def test_validity_is_where_asked_and_delivered_are_within_five_percent() -> None:
+def test_a_law_is_valid_where_its_restitution_is_within_five_percent_of_the_nominal() -> None:
     rows = [
         restitution.Row("x", e, e * f)
         for e, f in [(0.0, 1), (0.1, 1.2), (0.2, 1.04), (0.3, 0.96), (0.4, 0.9), (0.5, 1)]

@@ -48,8 +48,8 @@ def test_the_load_depends_on_position_seed_and_pass() -> None:
     np.testing.assert_allclose(fine[::10][: len(coarse)], coarse, rtol=0.0, atol=0.01)
     assert (LOAD.at(times) == coarse).all()
     assert not np.allclose(replace(LOAD, seed=4).at(times), coarse)
-    there, back = LOAD.at(np.array([52.0])), LOAD.at(np.array([52.0 + 102.0]))
-    assert not np.allclose(there, back)
+    force, back = LOAD.at(np.array([52.0])), LOAD.at(np.array([52.0 + 102.0]))
+    assert not np.allclose(force, back)
     assert (LOAD.at(np.array([0.0])) == 0.0).all()  # at this time, the head is at the end of the face
 
 

@@ -349,8 +349,8 @@ def test_live_and_offline_give_the_same_rows(truth: Truth) -> None:
     """The live run gets the estimates of the offline run at the same rows."""
     end = truth.load.t < 5.0
     load = replace(truth.load, t=truth.load.t[end], wrench=truth.load.wrench[end])
-    there = truth.poses.t < 5.0
-    poses = replace(truth.poses, t=truth.poses.t[there], q=truth.poses.q[there])
+    early = truth.poses.t < 5.0
+    poses = replace(truth.poses, t=truth.poses.t[early], q=truth.poses.q[early])
     offline = follow(truth.nominal, load, poses, MEMBERS)
     assert offline.taken_over
     live = Live(truth.nominal)
@@ -573,8 +573,8 @@ def test_a_real_node_publishes_the_forces_of_its_machine(tmp_path: Path) -> None
     forces = {_seconds(one): np.array(one.effort) for one in by_topic["contact_forces"]}
     t = np.array([time for time in forces if time > 14.0])
     published = np.array([forces[time] for time in t.tolist()])
-    there = np.round(100.0 * t).astype(int)
-    true, nominal = (simulate(one, 17.0, 0.01, 1e-6).force[there] for one in (truth.scene, truth.nominal))
+    indices = np.round(100.0 * t).astype(int)
+    true, nominal = (simulate(one, 17.0, 0.01, 1e-6).force[indices] for one in (truth.scene, truth.nominal))
     assert _error(published, true) < 0.08 and _error(nominal, true) > 0.2
     assert [_seconds(one) for one in by_topic["force_intervals"]] == list(forces)
     last = dict(zip(by_topic["force_intervals"][-1].name, by_topic["force_intervals"][-1].effort, strict=True))
@@ -709,8 +709,8 @@ def test_forces_are_sent_before_the_other_twins_are_advanced(
         assert [count for name, count in order if name == topic] == list(range(before, 50 + before)), topic
 
 
-@pytest.mark.parametrize(("follow", "there"), [("off", "False"), ("full", "True")])
-def test_without_following_its_code_is_not_loaded(tmp_path: Path, follow: str, there: str) -> None:
+@pytest.mark.parametrize(("follow", "output"), [("off", "False"), ("full", "True")])
+def test_without_following_its_code_is_not_loaded(tmp_path: Path, follow: str, output: str) -> None:
     code = f"""
 import sys
 from plow_twin.live import parameters
@@ -735,7 +735,7 @@ runtime.close()
         encoding="utf-8",
     )
     completed = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert completed.stdout.strip() == there, completed.stderr
+    assert completed.stdout.strip() == output, completed.stderr
 
 
 def test_hard_real_time_excludes_following(truth: Truth) -> None:

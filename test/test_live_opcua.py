@@ -210,8 +210,8 @@ def test_a_wrong_mapping_of_nodes_names_the_key(tmp_path: Path) -> None:
         ("excitation: {fx: {node: 5}, fy: {node: a}, m: {node: b}}", "excitation.fx"),
         ("head_pose: {x: {node: a, unit: kN}}", "unit.x: got 'kN', expected one of m"),
         ("head_pose: {x: {node: a}, stamp: t}", "stamp: got 't', expected source or server"),
-        ("head_pose: {x: {node: a}, stamp_unit: ms}", "stamp_unit: got 'ms', expected none"),
-        ("head_pose: {x: {node: a}, sequence: n}", "sequence: got 'n', expected none"),
+        ("head_pose: {x: {node: a}, stamp_unit: ms}", "stamp_unit: got 'ms', expected no stamp_unit"),
+        ("head_pose: {x: {node: a}, sequence: n}", "sequence: got 'n', expected no sequence"),
     ):
         path.write_text(text)
         with pytest.raises(Exception, match="got") as caught:

@@ -77,8 +77,8 @@ def test_pose_and_body_coordinates_agree(
     body = geometry.body_state(q, rate, com)
     rows = geometry.penetration_rows(scene)
     c, s, om = body[5], body[6], body[4]
-    moving = np.array([-om * s, om * c, body[2] + om * body[1], body[3] - om * body[0]])
-    assert moving @ rows[:4] == pytest.approx(difference, abs=1e-7)
+    rates = np.array([-om * s, om * c, body[2] + om * body[1], body[3] - om * body[0]])
+    assert rates @ rows[:4] == pytest.approx(difference, abs=1e-7)
 
 
 def test_senses_are_those_of_the_paper() -> None:

@@ -377,10 +377,10 @@ def _entries(run: Path) -> list[object]:
 
 def test_messages_for_a_broker_are_limited_counted_and_sent_in_order(tmp_path: Path) -> None:
     port = _free_port()
-    there = Message("online", b"true", True)
+    online = Message("online", b"true", True)
     output = Broker(
-        host="127.0.0.1", port=port, client_id="out", user="", password="", tls=None, will=lambda: there,
-        on_connected=lambda: [there], waiting=5,
+        host="127.0.0.1", port=port, client_id="out", user="", password="", tls=None, will=lambda: online,
+        on_connected=lambda: [online], waiting=5,
     )  # fmt: skip
     output.open()
     for number in range(8):
@@ -395,7 +395,7 @@ def test_messages_for_a_broker_are_limited_counted_and_sent_in_order(tmp_path: P
         assert (output.state.lost, output.state.trouble) == (3, "")
         subscriber.close()
     until(lambda: not output.state.connected)
-    asyncio.run(output.close(there, 0.0))
+    asyncio.run(output.close(online, 0.0))
 
 
 class EdgeNode:

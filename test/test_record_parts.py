@@ -270,7 +270,7 @@ def test_repeated_entries_are_counted_and_used_once(tmp_path: Path) -> None:
 def test_on_a_full_disk_a_repair_leaves_no_incomplete_file(tmp_path: Path) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)))
     run.file.write_bytes(run.file.read_bytes()[:-1000])
-    there = sorted(run.folder.iterdir())
+    files = sorted(run.folder.iterdir())
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))  # a write beyond this size fails, as on a full disk
     try:
@@ -278,7 +278,7 @@ def test_on_a_full_disk_a_repair_leaves_no_incomplete_file(tmp_path: Path) -> No
             repair(run.folder)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert error.value.filename == f"{run.file}.partial" and sorted(run.folder.iterdir()) == there
+    assert error.value.filename == f"{run.file}.partial" and sorted(run.folder.iterdir()) == files
 
 
 def test_a_change_of_files_on_a_full_disk_is_undone_and_done_later(

@@ -251,7 +251,7 @@ def test_little_free_space_ends_a_recording_that_can_be_read(tmp_path: Path) -> 
 
 
 def record_around_a_pause(folder: Path, stop: Callable[[], object], go_on: Callable[[], object]) -> Recorder:
-    """Record a twin. The disk fails in the middle and recovers. Counts of the recorder end each stage, not the time."""
+    """Record a twin. The disk fails in the middle and recovers. Each stage ends at a count of the recorder."""
     scene = load_scene(scene_path("paper"))
     recorder = Recorder(folder, RunHeader(dump_scene(scene)), flush_period_s=0.02, min_free_bytes=1)
     session = Session(Twin(scene, excitation="sampled"), on_entry=recorder.journal)

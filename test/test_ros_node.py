@@ -315,10 +315,10 @@ def test_an_alarm_stays_until_it_is_acknowledged_and_writes_the_time_before_it(t
         finally:
             screen.close()
         probe.until_figure("recorder", "marks", "2")
-        there = {
+        publishers = {
             topic.name: probe.node.get_publishers_info_by_topic(f"{running.namespace}/{topic.name}") for topic in TOPICS
         }
-        offered = {name: infos[0].qos_profile.durability.name.lower() for name, infos in there.items() if infos}
+        offered = {name: infos[0].qos_profile.durability.name.lower() for name, infos in publishers.items() if infos}
     stated = yaml.safe_load((tmp_path / "run" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     profiles = {
         found["topic_metadata"]["name"].rpartition("/")[2]: found["topic_metadata"]["offered_qos_profiles"][0]

@@ -108,7 +108,7 @@ def test_contact_continues_at_45_degrees_under_the_corner_s_new_name() -> None:
     assert passed[0]["time"] == passed[1]["time"]
     # the force is continuous across the event, so its differences are continuous too
     force = result.force[:, [4, 6]].sum(axis=1)
-    # the force continues smoothly, so its steps before, across and after the event grow alike
+    # the force is smooth, so its differences before, across and after the event follow one curve
     steps = np.abs(np.diff(force[turned[0] - 3 : turned[0] + 2]))
     assert force[turned[0]] > 0.0
     assert np.abs(np.diff(steps)).max() < steps.max()
@@ -164,7 +164,9 @@ def both(scene: Scene, **options: float) -> tuple[Result, Result]:
         pytest.param({"loads": ()}, id="free", marks=pytest.mark.stress),
     ],
 )
-def test_corners_without_rotation_are_a_mirrored_head_with_walls(changes: dict[str, object]) -> None:
+def test_without_rotation_a_head_with_corners_moves_like_the_mirrored_head_with_walls(
+    changes: dict[str, object],
+) -> None:
     block_run, head_run = both(replace(GUIDED, **changes), t_end=0.5, output_dt=1e-3, tol=1e-9)  # type: ignore[arg-type]
     np.testing.assert_allclose(block_run.q, -head_run.q, atol=1e-8)
     assert sum(pair["makes"] for pair in block_run.statistics.values()) > 4
@@ -173,7 +175,7 @@ def test_corners_without_rotation_are_a_mirrored_head_with_walls(changes: dict[s
     }
 
 
-def test_corners_that_turn_little_are_nearly_a_mirrored_head_with_walls() -> None:
+def test_with_little_rotation_a_head_with_corners_moves_nearly_like_the_mirrored_head_with_walls() -> None:
     def difference(angle: float) -> float:
         scene = replace(
             GUIDED,

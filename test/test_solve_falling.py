@@ -82,7 +82,7 @@ def returned(scene: Scene) -> float:
         pytest.param(1.0, Frame(SIDE, SIDE), marks=pytest.mark.stress),
     ],
 )
-def test_drop_returns_the_restitution_that_its_speed_leaves(speed: float, exponent: float, frame: Frame) -> None:
+def test_a_drop_has_the_restitution_for_its_speed(speed: float, exponent: float, frame: Frame) -> None:
     contact = replace(LAW, exponent=exponent, stiffness=1e8 * 1e3 ** (exponent - 1.0))
     restitution = returned(impact(contact, (0.0, -speed, 0.0), head=HEAVY, frame=frame, pairs=("bottom_left_bottom",)))
     assert restitution == pytest.approx(E * max(speed / SPEED, 1.0) ** -FALL, abs=2e-5)

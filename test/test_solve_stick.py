@@ -370,7 +370,7 @@ def furthest_off(scene: Scene, tolerances: tuple[float, ...]) -> float:
     ],
 )
 def test_even_a_tiny_force_decides_whether_a_corner_sticks(law: str, seed: int) -> None:
-    """Steps that are accurate only for the motion would release sticking corners and move their anchors."""
+    """A step that controls only the error of the motion would release sticking corners and move their anchors."""
     assert furthest_off(held_scene(law, seed), (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)) < 10.0
 
 

@@ -234,12 +234,12 @@ def test_a_partial_recording_beside_a_run_is_read_as_far_as_it_goes_and_its_loss
     )
 
 
-def test_a_unit_of_stamps_that_would_be_left_out_is_refused(tmp_path: Path) -> None:
+def test_a_stamp_unit_without_a_stamp_column_is_refused(tmp_path: Path) -> None:
     (tmp_path / "load.csv").write_text("zeit,fx,fy,m\n" + "".join(f"{t},0,0,0\n" for t in range(100)))
     mapping = tmp_path / "map.yaml"
     for stamp, message in (
         ("", "with the name of its column: the columns zeit, fx, fy, m have none of"),
-        ("stamp: log, ", "none"),
+        ("stamp: log, ", "no stamp_unit with stamp: log"),
     ):
         mapping.write_text(f"excitation: {{topic: load, {stamp}stamp_unit: ms}}")
         with pytest.raises(RecordingError, match=f"excitation.stamp_unit: got 'ms', expected .*{message}"):
@@ -252,7 +252,7 @@ def test_a_unit_of_stamps_that_would_be_left_out_is_refused(tmp_path: Path) -> N
         connection = writer.add_connection("/load", kind, typestore=STORE)
         writer.write(connection, BASE_NS, wrench_message(BASE_NS, (0.0, 0.0, 0.0)))
     mapping.write_text("excitation: {topic: /load, stamp_unit: ms}")
-    with pytest.raises(RecordingError, match=f"stamp_unit: got 'ms', expected none: {kind} has stamps in ns"):
+    with pytest.raises(RecordingError, match=f"stamp_unit: got 'ms', expected no stamp_unit: {kind} has stamps in ns"):
         analyse(bag / "run", scene=PAPER, mapping=mapping)
 
 

@@ -197,7 +197,7 @@ def test_published_forces_are_those_of_the_calibration_s_targets() -> None:
 def test_a_contact_set_counts_if_it_lasts_five_milliseconds() -> None:
     timeline = [Hold(0.0, 1.0, ""), Hold(1.0, 1.004, "a"), Hold(1.004, 1.010, "ab"), Hold(1.010, 1.014, "a")]
     figures = paper_sets.figures(timeline)
-    # two times of 4 ms do not count as one time of 5 ms
+    # two contacts of 4 ms each are not a contact of 5 ms
     assert (figures["a"].count, figures["ab"].count) == (0, 1)
     assert figures["a"].share == pytest.approx(8 / 14)
     distance, hold = paper_sets.nearest(timeline, 1.009, "a") or (None, None)

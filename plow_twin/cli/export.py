@@ -27,9 +27,9 @@ def export(recording: Path, kind: str, out: Path, quiet: bool) -> int:
     from plow_twin.record.recording import read_recording
 
     opened = read_recording(recording)
-    there = [path for path in ([out] if kind == "npz" else _tables(out, kind)) if path.is_file()]
-    if there:
-        raise click.UsageError(f"{there[0]}: exists already, expected another path: --out")
+    existing = [path for path in ([out] if kind == "npz" else _tables(out, kind)) if path.is_file()]
+    if existing:
+        raise click.UsageError(f"{existing[0]}: exists already, expected another path: --out")
     with busy("exporting", quiet):
         rows = write(opened, kind, out)
     if not quiet:

@@ -43,7 +43,9 @@ def replay(recording: Path, digests_only: bool, write: Path | None, as_json: boo
         show_facts(output_console(), facts)
     say_end(recording, report.status.value)
     if report.build_differences:
-        other = ", ".join(f"{key} {there} (here {here})" for key, (there, here) in report.build_differences.items())
+        other = ", ".join(
+            f"{key} {recorded} (here {present})" for key, (recorded, present) in report.build_differences.items()
+        )
         say_error(f"plow-twin: warning: recorded by another build, which may round differently: {other}")
     for file, read in report.repeated_parts.items():
         say_error(f"plow-twin: warning: {file} repeats {read}: it is not read")

@@ -97,7 +97,7 @@ def view(
         if file is not None:
             _check_still(option, moving=out is not None or web or follow, exaggerate=exaggerate, others=others)
     if follow and out is not None and web:
-        raise click.UsageError("--follow cannot be combined with both --out and --web")
+        raise click.UsageError("--follow: got --out and --web, expected at most one of them")
     if follow:
         return _follow(recording, out, exaggerate, _scenes(others), web_port if web else None, wait, quiet)
     with ExitStack() as opened:

@@ -76,8 +76,8 @@ def _estimate_stamps(reader: RunReader) -> list[int]:
     """Return the stamp [ns] of the last sample before each estimate."""
     stamps: list[int] = []
     for batch in reader.batches(outputs=False):
-        there = np.flatnonzero(batch.entries.sample)
+        indices = np.flatnonzero(batch.entries.sample)
         places = [index for index, entry in batch.entries.rest.items() if isinstance(entry, Estimated)]
-        before = np.searchsorted(there, places) - 1
-        stamps += batch.entries.stamp_ns[there[before[before >= 0]]].tolist()
+        before = np.searchsorted(indices, places) - 1
+        stamps += batch.entries.stamp_ns[indices[before[before >= 0]]].tolist()
     return stamps

@@ -448,14 +448,14 @@ def _likeliest(features: Array, targets: Array, paths: Array, measured: Array, m
     """
     before, after = _NO_LAG - 1, _NO_LAG + 1
     paths, measured_path = (path[..., : path.shape[-1] // 2] for path in (paths, measured_path))
-    there = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(measured_path).all(axis=0)
+    finite = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(measured_path).all(axis=0)
 
     def motions(features: Array, paths: Array) -> PathFeatures:
         like = np.concatenate([features[:, :2], features[:, 5:]], axis=1)
         late = (paths[:, after] - paths[:, before]) / (_OF_DRAWN_S[after] - _OF_DRAWN_S[before])
         return PathFeatures(
-            np.concatenate([like, paths[:, _NO_LAG, there]], axis=1),
-            np.concatenate([np.zeros_like(like), late[:, there]], axis=1),
+            np.concatenate([like, paths[:, _NO_LAG, finite]], axis=1),
+            np.concatenate([np.zeros_like(like), late[:, finite]], axis=1),
         )
 
     reach = features[:, :2]
@@ -471,11 +471,11 @@ def path_delay(motion_features: MotionFeatures, features: Array, drawn: list[Arr
     """Return the delay in s with which the measured path is nearest to the motions `drawn` without a delay."""
     paths = np.array([motion_features.paths(q, np.zeros(1))[0] for q in drawn])
     measured_path = motion_features.paths(motion_features.q, _LAGS_S)
-    there = np.isfinite(paths).all(axis=0) & np.isfinite(measured_path).all(axis=0)
-    if there.sum() < tuning.PATH_PHASES:
+    finite = np.isfinite(paths).all(axis=0) & np.isfinite(measured_path).all(axis=0)
+    if finite.sum() < tuning.PATH_PHASES:
         return 0.0
-    value, residual = _Near.to(features, measured).left_over(paths[:, there])
-    off = ((measured_path[:, there] - value) ** 2 / ((residual**2).mean(axis=0) + _NO_SCATTER)).sum(axis=1)
+    value, residual = _Near.to(features, measured).left_over(paths[:, finite])
+    off = ((measured_path[:, finite] - value) ** 2 / ((residual**2).mean(axis=0) + _NO_SCATTER)).sum(axis=1)
     # the delay of a sensor cannot be negative
     return max(float(_LAGS_S[int(np.argmin(off))]), 0.0)
 
@@ -536,10 +536,13 @@ def path_deviate(measured_path: Array, features: Array, drawn: list[Array], meas
     """
     # shape (n, lags, parts), with several lags because the delay is not known exactly
     paths = np.array(drawn)
-    there = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(measured_path).all(axis=0)
-    if there.sum() < tuning.PATH_PHASES:
+    finite = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(measured_path).all(axis=0)
+    if finite.sum() < tuning.PATH_PHASES:
         return 0.0
-    paths, off = paths[:, :, there], _distance_of_paths(features, paths[:, :, there], measured, measured_path[:, there])
+    paths, off = (
+        paths[:, :, finite],
+        _distance_of_paths(features, paths[:, :, finite], measured, measured_path[:, finite]),
+    )
     distance = (((features - measured) / (features.std(axis=0) + 1e-12)) ** 2).mean(axis=1)
     others = []
     for index in np.argsort(distance, kind="stable")[:FEWEST_FOR_SCATTER]:

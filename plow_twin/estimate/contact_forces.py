@@ -174,13 +174,13 @@ def cells_of(forces_of_fit: ForcesOfFit, solution: Fit, forces: ContactForces) -
     # the resolution of a cell limits its noise
     noise = np.maximum(noise, 1e-4 * largest)
     for i, name in enumerate(PAIR_NAMES):
-        there = np.isfinite(measured[:, i]) & (fitted.swing >= 0)
-        if not there.any():
+        finite = np.isfinite(measured[:, i]) & (fitted.swing >= 0)
+        if not finite.any():
             continue
-        reason = _contradiction(measured[there], fitted.force[there], i, largest, float(noise[i]))
+        reason = _contradiction(measured[finite], fitted.force[finite], i, largest, float(noise[i]))
         if reason:
             found_out.append(f"contact forces: {name}: {reason}")
-        elif (fitted.force[there, i] > 0.0).sum() >= FEWEST_IN_CONTACT:
+        elif (fitted.force[finite, i] > 0.0).sum() >= FEWEST_IN_CONTACT:
             pairs.append(i)
     if not (found_out or pairs):
         return None, []

@@ -188,9 +188,9 @@ class Fit:
     def loss(self) -> float:
         """Twice the negative log likelihood, for the comparison of fits to the same measurements."""
         variance = self.noise**2 + tuning.JITTER_WEIGHT[1] * self.jitter
-        there = np.isfinite(self.point.residual)
-        z = np.abs(self.point.residual[there]) / np.sqrt(variance[there])
-        return float(huber_loss(z).sum() + np.log(variance[there]).sum())
+        finite = np.isfinite(self.point.residual)
+        z = np.abs(self.point.residual[finite]) / np.sqrt(variance[finite])
+        return float(huber_loss(z).sum() + np.log(variance[finite]).sum())
 
     @property
     def shared(self) -> Array:
@@ -686,9 +686,9 @@ def unpredicted(problem: Problem, point: Point, jacobian: Array, seed: int, prob
         change[:, :SIZE] = shared - point.shared
         change[inside, SIZE:] = states[point.swing[inside]]
         error = point.residual - other.residual - np.einsum("nij,nj->ni", jacobian, change)
-        there = np.isfinite(error)
-        total[there] += error[there] ** 2
-        count += there
+        finite = np.isfinite(error)
+        total[finite] += error[finite] ** 2
+        count += finite
     return _spread(total / np.maximum(count, 1.0))
 
 
@@ -704,9 +704,9 @@ def noise_of(residual: Array, before: Array, jitter: Array) -> Array:
     """Return the standard deviation of each component, shape (3,), from the median of the absolute residuals."""
     out = before.copy()
     for i, column in enumerate(residual.T):
-        there = np.isfinite(column)
-        calm = there & (jitter[:, i] < 0.1 * before[i] ** 2)
-        there = calm if calm.sum() > 0.2 * there.sum() else there
-        if there.sum() > 10:
-            out[i] = 1.4826 * np.median(np.abs(column[there]))
+        finite = np.isfinite(column)
+        calm = finite & (jitter[:, i] < 0.1 * before[i] ** 2)
+        finite = calm if calm.sum() > 0.2 * finite.sum() else finite
+        if finite.sum() > 10:
+            out[i] = 1.4826 * np.median(np.abs(column[finite]))
     return np.maximum(out, 1e-9)

@@ -295,9 +295,11 @@ class Follower:
         failed, digests, begin = 0, list[str](), 0
         while begin < len(t):
             end = self._stop(t, begin, stops)
-            here = slice(begin, end)
-            out = rows[here] if rows is not None else np.zeros(end - begin, ROW)
-            failed += self._advance_first(t[here], wrench[here], out, needed[here], ends[here])
+            rows_of_span = slice(begin, end)
+            out = rows[rows_of_span] if rows is not None else np.zeros(end - begin, ROW)
+            failed += self._advance_first(
+                t[rows_of_span], wrench[rows_of_span], out, needed[rows_of_span], ends[rows_of_span]
+            )
             self.catch_up()
             if end in stops:
                 digests += [self.digest()] * stops[end]

@@ -167,11 +167,11 @@ class _Steps:
             while (due := float(self._load.t[0]) + self._count * dt) < t[index]:
                 self._count += 1
                 yield Followed.of(np.array([due]), self._follower.held(due - float(self._load.t[0])))
-            here = slice(index, index + 1)
-            now = self._session.advance(stamps[here], wrench[here], np.zeros(1, ROW)).rows
+            interval = slice(index, index + 1)
+            now = self._session.advance(stamps[interval], wrench[interval], np.zeros(1, ROW)).rows
             if due == t[index]:
                 self._count += 1
-                yield Followed.of(t[here], now)
+                yield Followed.of(t[interval], now)
 
     def _add_gaps(self, now: float) -> None:
         if self._gaps is None:
@@ -179,9 +179,9 @@ class _Steps:
         last = int(np.searchsorted(self._gaps.t, now, side="right"))
         stamps = _stamps(self._gaps.t, self._load.t[0]).tolist()
         for index in range(self._gaps_added, last):
-            there = np.flatnonzero(np.isfinite(self._gaps.gap[index]))
-            values = tuple(self._gaps.gap[index, there].tolist())
-            self._windows.add_gaps(stamps[index], tuple(there.tolist()), values)
+            finite = np.flatnonzero(np.isfinite(self._gaps.gap[index]))
+            values = tuple(self._gaps.gap[index, finite].tolist())
+            self._windows.add_gaps(stamps[index], tuple(finite.tolist()), values)
         self._gaps_added = last
 
     def _estimate(self, window: Window) -> None:

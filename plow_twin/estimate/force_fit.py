@@ -341,12 +341,12 @@ class _Joint:
 
     def _left_over(self, at: _Evaluation) -> list[list[float]]:
         out: list[list[float]] = []
-        residual, there = self._measured - at.force, np.isfinite(at.force)
+        residual, finite = self._measured - at.force, np.isfinite(at.force)
         for k, pair in enumerate(self._cells.pairs.tolist()):
             out.append([])
             variance = float(self._cells.noise[pair]) ** 2
             for swing in range(self._problem.window.swings):
-                inside = there & (self._cell == k) & (self._swing == swing)
+                inside = finite & (self._cell == k) & (self._swing == swing)
                 square = float((at.force[inside] ** 2).mean()) if inside.sum() >= FEWEST_IN_CONTACT else 0.0
                 if square > tuning.OUTLYING**2 * variance:
                     beyond = max(float((residual[inside] ** 2).mean()) - variance, 0.0)

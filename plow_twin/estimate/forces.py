@@ -162,8 +162,8 @@ def quantiles(values: Array) -> Array:
     places = [min(int(share * len(values)), len(values) - 1) for share in POINTS]
     out = np.zeros((len(POINTS), *values.shape[1:]))
     # in most pairs the forces of all members are 0
-    there = values.any(axis=0)
-    out[:, there] = np.partition(np.ascontiguousarray(values[:, there].T), places, axis=1)[:, places].T
+    touched = values.any(axis=0)
+    out[:, touched] = np.partition(np.ascontiguousarray(values[:, touched].T), places, axis=1)[:, places].T
     return out
 
 

@@ -121,11 +121,11 @@ def fit_gaps(scene: Scene, gaps: Gaps, poses: Poses) -> GapsFit | str:
 
 
 def _theta_at(t: Array, poses: Poses) -> Array:
-    there = np.isfinite(poses.q[:, 2]) if len(poses.t) else np.zeros(0, bool)
-    if not there.any():
+    finite = np.isfinite(poses.q[:, 2]) if len(poses.t) else np.zeros(0, bool)
+    if not finite.any():
         return np.full(len(t), np.nan)
-    at = poses.t[there]
-    theta: Array = np.interp(t, at, poses.q[there, 2], left=np.nan, right=np.nan)
+    at = poses.t[finite]
+    theta: Array = np.interp(t, at, poses.q[finite, 2], left=np.nan, right=np.nan)
     return theta
 
 

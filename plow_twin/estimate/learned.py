@@ -112,16 +112,16 @@ class Learner:
 
     def take_over(self, before: Learner) -> None:
         """Combine the distribution with that of the previous learner, unless they contradict each other."""
-        both, here, there = np.intersect1d(self.open, before.open, return_indices=True)
+        both, in_self, in_before = np.intersect1d(self.open, before.open, return_indices=True)
         if not len(both):
             return
-        covariance, off = before.covariance[np.ix_(there, there)], before.mean[there] - self.mean[here]
-        total = covariance + self.covariance[np.ix_(here, here)]
+        covariance, off = before.covariance[np.ix_(in_before, in_before)], before.mean[in_before] - self.mean[in_self]
+        total = covariance + self.covariance[np.ix_(in_self, in_self)]
         if off @ np.linalg.solve(total, off) > tuning.OUTLYING**2:
             return
-        gain = self.covariance[:, here] @ np.linalg.inv(total)
+        gain = self.covariance[:, in_self] @ np.linalg.inv(total)
         self.mean = np.clip(self.mean + gain @ off, self._least, self._most)
-        self.covariance = self.covariance - gain @ self.covariance[here]
+        self.covariance = self.covariance - gain @ self.covariance[in_self]
 
     def add(self, numbers: Array, measured_change: Array, off: Array, noise: Array) -> None:
         """Add the information from a pose.

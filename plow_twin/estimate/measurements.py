@@ -391,9 +391,9 @@ def filled(poses: Poses) -> Array:
     """
     out = np.zeros_like(poses.q) if poses.assumed is None else poses.assumed.copy()
     for i, column in enumerate(poses.q.T):
-        there = np.isfinite(column)
-        if there.any():
-            out[:, i] = np.interp(poses.t, poses.t[there], column[there])
+        finite = np.isfinite(column)
+        if finite.any():
+            out[:, i] = np.interp(poses.t, poses.t[finite], column[finite])
     return out
 
 

@@ -332,15 +332,15 @@ class Ensemble:
         corrected too. A late pose is not used; an outlier is used only after several consecutive outliers.
         """
         self.settle()
-        there = np.flatnonzero(np.isfinite(q) & self._free)
+        finite = np.flatnonzero(np.isfinite(q) & self._free)
         times = [time for time, _ in self._path]
-        if t <= times[0] or not len(there):
+        if t <= times[0] or not len(finite):
             return False
         after = min(bisect_left(times, t), len(times) - 1)
         path = np.stack([self._path[index][1] for index in range(after - 1, len(times))])
         share = min((t - times[after - 1]) / (times[after] - times[after - 1]), 1.0)
         # pose that the sensor of each member would have measured
-        then = ((1.0 - share) * path[0] + share * path[1] + biases_of(self._numbers))[:, there]
+        then = ((1.0 - share) * path[0] + share * path[1] + biases_of(self._numbers))[:, finite]
         since = self.first.time - self._drifted
         self._drift(load_error)
         state = np.concatenate([self._v, *path, self._load_off], axis=1)
@@ -349,25 +349,25 @@ class Ensemble:
             use = use & (np.arange(len(use)) > 0)
         about, centred_poses = state - state[use].mean(axis=0), then - then[use].mean(axis=0)
         freedom = max(int(use.sum()) - 1, 1)
-        scatter = centred_poses[use].T @ centred_poses[use] / freedom + np.diag(noise[there] ** 2)
-        center = _off(q, then[use].mean(axis=0), there)
+        scatter = centred_poses[use].T @ centred_poses[use] / freedom + np.diag(noise[finite] ** 2)
+        center = _off(q, then[use].mean(axis=0), finite)
         if (np.abs(center) <= tuning.OUTLYING * np.sqrt(np.diag(scatter))).all():
             self.outlying = 0
         else:
             self.outlying += 1
             if self.outlying <= _MOST_OUTLYING:
                 return False
-        white = self._rng.standard_normal((len(then), len(there)))
+        white = self._rng.standard_normal((len(then), len(finite)))
         white[0] = 0.0
         if self._learner is not None:
-            self._learner.add(self._numbers[use], centred_poses[use], center, noise[there])
-        off = _off(q, then, there)
+            self._learner.add(self._numbers[use], centred_poses[use], center, noise[finite])
+        off = _off(q, then, finite)
         # limit the influence of a single wrong pose
-        most = tuning.OUTLYING * noise[there]
-        self.square += ((off.clip(-most, most) / noise[there]) ** 2).sum(axis=1)
+        most = tuning.OUTLYING * noise[finite]
+        self.square += ((off.clip(-most, most) / noise[finite]) ** 2).sum(axis=1)
         weight = np.linalg.solve(scatter, centred_poses[use].T @ about[use] / freedom)
         weight[:, ~np.tile(self._free, len(path) + 2)] = 0.0
-        moved = state + (off + noise[there] * white) @ weight
+        moved = state + (off + noise[finite] * white) @ weight
         v, places = moved[:, :3], moved[:, 3:-3].reshape(len(moved), -1, 3).transpose(1, 0, 2)
         allowed = np.flatnonzero(self._allowed(places[-1], self._force(self._depth)))
         allowed = allowed[allowed >= 1 - self._steers_first]
@@ -465,8 +465,8 @@ class Ensemble:
 
     def _allowed(self, q: Array, force: Array, which: NDArray[np.int64] | slice = _ALL) -> NDArray[np.bool_]:
         """Return whether no pair of a member at the poses `q`, (m, 3), bears much more than `force` [N], (m, 8)."""
-        there = self._force(self._penetration(q, which), which)
-        return np.asarray((there < force + self._pressed).all(axis=1))
+        present_force = self._force(self._penetration(q, which), which)
+        return np.asarray((present_force < force + self._pressed).all(axis=1))
 
     def _put(self, which: NDArray[np.int64], q: Array, v: Array) -> None:
         for place in np.flatnonzero(which == 0):

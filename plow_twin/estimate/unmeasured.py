@@ -103,9 +103,9 @@ class _Simulation:
             trial = vector.copy()
             trial[free] -= np.clip(step, -spread, spread)
             trial = self.unknowns.within(trial)
-            there = self._normalised(trial, rows, scale)
-            if there is not None and self._cost(there) < self._cost(here):
-                return (trial, there), max(0.2 * damping, 1e-6)
+            measured_poses = self._normalised(trial, rows, scale)
+            if measured_poses is not None and self._cost(measured_poses) < self._cost(here):
+                return (trial, measured_poses), max(0.2 * damping, 1e-6)
             damping = max(8.0 * damping, 1e-3)
         return None, damping
 
@@ -124,9 +124,9 @@ class _Simulation:
         for place, index in enumerate(self.free):
             moved = vector.copy()
             moved[index] += _STEPS[index]
-            there = self._normalised(moved, rows, scale)
-            if there is not None:
-                columns[:, place] = (there - here) / _STEPS[index]
+            measured_poses = self._normalised(moved, rows, scale)
+            if measured_poses is not None:
+                columns[:, place] = (measured_poses - here) / _STEPS[index]
             else:  # the moved motion cannot be simulated, so only the prior acts on this unknown
                 columns[place - len(self.free), place] = 1.0 / self.deviation[index]
         weight = np.append(huber_weight(np.abs(here[: -len(self.free)])), np.ones(len(self.free)))

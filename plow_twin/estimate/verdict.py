@@ -95,15 +95,15 @@ def judge_sensor(poses: Poses) -> list[str]:
 
 def predicted(fit: Fit) -> NDArray[np.bool_]:
     """Return which measurements the model predicts almost to within the noise, shape (n, 3)."""
-    there: NDArray[np.bool_] = np.isfinite(fit.point.residual) & (fit.variance < 1.5 * fit.noise**2)
-    return there
+    finite: NDArray[np.bool_] = np.isfinite(fit.point.residual) & (fit.variance < 1.5 * fit.noise**2)
+    return finite
 
 
 def _colour(fit: Fit, verdict: Verdict) -> None:
-    there = predicted(fit)
+    is_predicted = predicted(fit)
     for i, name in enumerate(COMPONENTS):
         quick = quick_noise(fit.point.residual[:, i], fit.point.swing)
-        rows = fit.point.residual[there[:, i], i]
+        rows = fit.point.residual[is_predicted[:, i], i]
         if quick <= 0.0 or len(rows) < 50:
             continue
         ratio = float(np.mean(np.minimum(np.abs(rows), 5.0 * quick) ** 2) / quick**2)
@@ -119,7 +119,7 @@ def _repeated(problem: Problem, fit: Fit, period: float, verdict: Verdict) -> No
 
     A wrong contact law or a wrong shape of the load causes residuals that repeat.
     """
-    t, there = problem.window.poses.t, predicted(fit)
+    t, predictions = problem.window.poses.t, predicted(fit)
     turns = np.floor((t - t[0]) / period).astype(int)
     phase = np.minimum(((t - t[0]) / period % 1.0 * tuning.PHASES).astype(int), tuning.PHASES - 1)
     between, within, cells = 0.0, 0.0, 0
@@ -127,7 +127,7 @@ def _repeated(problem: Problem, fit: Fit, period: float, verdict: Verdict) -> No
     for i in range(3):
         scale = fit.noise[i]
         for k in range(tuning.PHASES):
-            inside = there[:, i] & (phase == k)
+            inside = is_predicted[:, i] & (phase == k)
             means = (
                 np.array([fit.point.residual[inside & (turns == turn), i].mean() for turn in np.unique(turns[inside])])
                 / scale
@@ -184,15 +184,15 @@ def _scale(problem: Problem, fit: Fit, verdict: Verdict) -> None:
         verdict.by_scale = True
         x, y, theta = scales.scale.tolist()
         verdict.sensor.append(
-            f"scales of x, y, theta like {x:.3f}, {y:.3f}, {theta:.3f}: chi^2 {scales.chi2:.0f}, expected at most "
-            f"{tuning.MOST_SCALE:g}"
+            f"scale factors of x, y, theta: got {x:.3f}, {y:.3f}, {theta:.3f} with chi^2 {scales.chi2:.0f}, "
+            f"expected at most {tuning.MOST_SCALE:g}"
         )
 
 
 def quick_noise(residual: Array, swing: NDArray[np.int64]) -> float:
     """Return the standard deviation of a residual from differences of successive rows within swings."""
-    there = np.isfinite(residual)
-    value, part = residual[there], swing[there]
+    finite = np.isfinite(residual)
+    value, part = residual[finite], swing[finite]
     if len(value) < 10:
         return 0.0
     change = np.diff(value)[np.diff(part) == 0]
@@ -203,8 +203,8 @@ def _stuck(problem: Problem, fit: Fit, verdict: Verdict) -> None:
     measured = problem.window.poses.q
     for i, name in enumerate(COMPONENTS):
         column, residual = measured[:, i], fit.point.residual[:, i]
-        there = np.isfinite(column)
-        value, predicted = column[there], (column - residual)[there]
+        finite = np.isfinite(column)
+        value, predicted = column[finite], (column - residual)[finite]
         if len(value) < tuning.STUCK[0]:
             continue
         ends = np.flatnonzero(np.append(np.diff(value) != 0.0, True))
@@ -213,7 +213,7 @@ def _stuck(problem: Problem, fit: Fit, verdict: Verdict) -> None:
             span = predicted[end - length + 1 : end + 1]
             moved = float(np.nanmax(span) - np.nanmin(span)) if np.isfinite(span).any() else 0.0
             if (
-                moved > tuning.STUCK[1] * max(noise_level(column[there][:, None])[0], 1e-5)
+                moved > tuning.STUCK[1] * max(noise_level(column[finite][:, None])[0], 1e-5)
                 or length > FEWEST_FOR_SCATTER
             ):
                 verdict.sensor.append(f"{name}: the same value {length} times in a row")

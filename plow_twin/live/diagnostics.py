@@ -227,8 +227,8 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
         (WARN, runtime.others_publish, "another node also publishes contact_forces: is it a second twin?"),
         (WARN, silent, f"silent: {silent}"),
     ]
-    for trouble_level, there, text in troubles:
-        if there and text:
+    for trouble_level, is_present, text in troubles:
+        if is_present and text:
             level = max(level, trouble_level)
             texts.append(text)
     return level, "; ".join(texts), values

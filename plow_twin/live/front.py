@@ -305,10 +305,10 @@ def roles_of(
         raise BridgeError("mapping: expected drive and load_model together, and no excitation beside them")
     if source == "excitation" and not {"drive", "excitation"} & roles.keys():
         # each type is truncated, because the first line of a file that is not a table may be long
-        there = "; ".join(f"{topic} ({str(kind)[:120]})" for topic, kind in (topics or {}).items())
+        complaints = "; ".join(f"{topic} ({str(kind)[:120]})" for topic, kind in (topics or {}).items())
         setup = "" if topics is None else "; plow-twin setup FILE writes a mapping"
         raise BridgeError(
-            f"excitation: got no load by names or mapping in {there}, expected the columns fx, fy, m{setup}"
+            f"excitation: got no load by names or mapping in {complaints}, expected the columns fx, fy, m{setup}"
         )
     return with_units(roles, units)
 

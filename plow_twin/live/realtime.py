@@ -26,8 +26,8 @@ def apply_realtime(settings: Settings) -> list[str]:
         try:
             os.sched_setaffinity(0, {int(number) for number in settings.cpu_affinity.split(",")})
         except (OSError, ValueError) as error:
-            there = ",".join(map(str, sorted(os.sched_getaffinity(0))))
-            refused.append(f"cpu_affinity {settings.cpu_affinity!r}: {error}; expected numbers among {there}")
+            available = ",".join(map(str, sorted(os.sched_getaffinity(0))))
+            refused.append(f"cpu_affinity {settings.cpu_affinity!r}: {error}; expected numbers among {available}")
     if settings.lock_memory:
         library = ctypes.CDLL(None, use_errno=True)
         if library.mlockall(_MCL_CURRENT | _MCL_FUTURE):

@@ -70,7 +70,7 @@ class WearKeeper:
         return kept.depth_m if kept is not None and stored in (None, *kept.older_files) else self._saved
 
     def kept(self, depth: NDArray[np.float64]) -> KeptWear:
-        """Return the wear depths [m] for the next runtime of the process. `close` must be called before."""
+        """Return the wear depths [m] for the next runtime of the process. Call `close` first."""
         return KeptWear(tuple(depth.tolist()), self._own_contents if self.error else ())
 
     def save(self, depth: NDArray[np.float64]) -> None:

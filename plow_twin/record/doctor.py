@@ -224,9 +224,9 @@ def _metadata_problems(reader: RunReader) -> list[str]:
         listed = listed_parts(folder)
     except RecordingError as error:
         return [f"metadata.yaml: {str(error).rpartition(': ')[2]}"]
-    there = [part.name for part in reader.parts]
+    part_names = [part.name for part in reader.parts]
     missing = [f"{name} is missing: metadata.yaml names it" for name in listed if not (folder / name).is_file()]
-    return missing + [f"{name}: metadata.yaml does not name it" for name in there if name not in listed]
+    return missing + [f"{name}: metadata.yaml does not name it" for name in part_names if name not in listed]
 
 
 def repair(path: Path) -> list[Path]:

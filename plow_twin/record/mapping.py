@@ -361,9 +361,11 @@ def _check_nodes(path: Path, role: str, read_role: Role) -> None:
     if read_role.stamp not in (SOURCE_STAMP, SERVER_STAMP):
         raise map_error(path, f"{role}.stamp", read_role.stamp, f"{SOURCE_STAMP} or {SERVER_STAMP} for nodes")
     if read_role.stamp_unit != "ns":
-        raise map_error(path, f"{role}.stamp_unit", read_role.stamp_unit, "none: the stamps of nodes are dates")
+        raise map_error(
+            path, f"{role}.stamp_unit", read_role.stamp_unit, "no stamp_unit: the stamps of nodes are dates"
+        )
     if read_role.sequence:
-        raise map_error(path, f"{role}.sequence", read_role.sequence, "none: the server numbers its messages")
+        raise map_error(path, f"{role}.sequence", read_role.sequence, "no sequence: the server numbers its messages")
 
 
 def with_units(roles: Mapping[str, Role], units: Mapping[str, str]) -> dict[str, Role]:
@@ -385,8 +387,8 @@ def with_units(roles: Mapping[str, Role], units: Mapping[str, str]) -> dict[str,
             continue
         having = [key for key, role in roles.items() if name in role.fields]
         if not having:
-            there = sorted({field for role in roles.values() for field in role.fields} | {"t"})
-            raise UnitError(f"unit of {name}: got an unknown name, expected one of {', '.join(there)}")
+            names = sorted({field for role in roles.values() for field in role.fields} | {"t"})
+            raise UnitError(f"unit of {name}: got an unknown name, expected one of {', '.join(names)}")
         for key in having:
             factors = UNITS[QUANTITIES[key, name]]
             if unit not in factors:
@@ -418,11 +420,11 @@ def _check_columns(path: Path, name: str, role: Role) -> None:
 def _check_stamp_unit(path: Path, name: str, role: Role) -> None:
     kind, reason = role.message_type, ""
     if role.stamp == "log":
-        reason = "none with stamp: log"
+        reason = "no stamp_unit with stamp: log"
     elif role.stamp == "header" and isinstance(kind, Columns) and not set(TIMES) & set(kind.names):
         reason = f"also a stamp with the name of its column: the {kind} have none of {', '.join(TIMES)}"
     elif role.stamp == "header" and not isinstance(kind, Columns) and kind != "json":
-        reason = f"none: {kind} has stamps in ns"
+        reason = f"no stamp_unit: {kind} has stamps in ns"
     if reason:
         raise map_error(path, f"{name}.stamp_unit", role.stamp_unit, reason)
 

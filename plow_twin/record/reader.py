@@ -138,13 +138,16 @@ class RunReader:
         """Number of missing parts, according to `metadata.yaml` and to the part numbers of the existing files."""
         if not self._place.is_dir():
             return 0
-        there = {self.number(file) for file in self.parts}
+        part_numbers = {self.number(file) for file in self.parts}
         numbers = sorted(self._headers[file].part for file in self.parts if file in self._headers)
         between = (
-            numbers[-1] - numbers[0] + 1 - len({number for number in there if numbers[0] <= number <= numbers[-1]})
+            numbers[-1]
+            - numbers[0]
+            + 1
+            - len({number for number in part_numbers if numbers[0] <= number <= numbers[-1]})
         )
         missing = missing_files(self._place, {file.name for file in self.foreign})
-        named = {part_number(Path(name))[0] for name in missing} - there
+        named = {part_number(Path(name))[0] for name in missing} - part_numbers
         return between + sum(number >= 0 and not numbers[0] < number < numbers[-1] for number in named)
 
     @property
@@ -324,9 +327,9 @@ class _Merger:
         """Add the messages of a chunk, and yield the batches that are complete."""
         assert self._chunks is not None
         counts = np.bincount(messages.channel)
-        there = counts.nonzero()[0]
+        present = counts.nonzero()[0]
         journal, sent, samples, digests = [], [], -1, -1
-        for number, count in zip(there.tolist(), counts[there].tolist(), strict=True):
+        for number, count in zip(present.tolist(), counts[present].tolist(), strict=True):
             channel = self._chunks.channels.get(number)
             if channel is None:
                 continue
@@ -341,11 +344,11 @@ class _Merger:
                 if self._topics.get(number) != named:  # a new dictionary, because earlier outputs refer to the old one
                     self._topics = {**self._topics, number: named}
         if journal:
-            chosen = messages if len(journal) == len(there) else _of(messages, journal)
+            chosen = messages if len(journal) == len(present) else _of(messages, journal)
             self._entries.append(self._read(chosen, samples, digests))
             self._count += len(chosen)
         if sent and self._with_outputs:
-            chosen = messages if len(sent) == len(there) else _of(messages, sent)
+            chosen = messages if len(sent) == len(present) else _of(messages, sent)
             self._outputs.append(Outputs(chosen, self._unwrap(chosen.sequence), self._topics))
         if self._count < self._least and len(self._outputs) < _LEAST // 16:
             return

@@ -128,9 +128,11 @@ class _Replay:
         self.all_outputs = not digests_only and header.record_outputs == "all"
         self.header = header
         self.report = report
-        here = build_fingerprint()
+        present = build_fingerprint()
         report.build_differences = {
-            key: (there, here.get(key, "")) for key, there in header.build.items() if there != here.get(key, "")
+            key: (recorded, present.get(key, ""))
+            for key, recorded in header.build.items()
+            if recorded != present.get(key, "")
         }
         scene = header.scene(report.path)
         excitation: Any = "scene" if header.excitation_source == "scene" else "sampled"

@@ -289,7 +289,7 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
 
 
 class _Stretches(NamedTuple):
-    """Scaled derivatives at the times of `_ends`, each with respect to the beginning of its stretch (`scale_of`)."""
+    """Derivatives, scaled by `scale_of`, at the times of `_ends` with respect to the start of the stretch."""
 
     matrices: Array  #: derivatives with respect to the state, shape (n, k, k)
     changes: Array  #: derivatives with respect to the parameters, shape (n, p, k)

@@ -24,11 +24,11 @@ def fits_tangents(compiled: CompiledScene) -> bool:
     A law with a constant restitution is supported, although slow touches under it need implicit steps.
     """
     terms, contact = compiled.parts.terms, compiled.scene.contact
-    there = {name for name, term in zip(Terms._fields, terms, strict=True) if term is not None}
+    present = {name for name, term in zip(Terms._fields, terms, strict=True) if term is not None}
     supported = terms.fraction is None or contact.exponent == 1.5
     explicit = compiled.parts.implicit is None or contact.restitution is not None
     alike = not (options(compiled.scene).corners or options(compiled.scene).falling)
-    return supported and explicit and there <= _COVERED and alike
+    return supported and explicit and present <= _COVERED and alike
 
 
 def is_curved(terms: Terms) -> int | None:
@@ -55,11 +55,11 @@ def displaced_columns(
     amplitudes, start = np.zeros((blocks, len(omegas), 2, 3, WIDTH)), compiled.initial_state()
     for index, (other, change) in enumerate(changed, STATE_COLUMNS):
         block, lane = divmod(index, WIDTH)
-        column, there, here = columns[block], other.params, compiled.params
+        column, displaced_params, own_params = columns[block], other.params, compiled.params
         for name, of in (("stiffness", "stiffness"), ("viscous", "viscous"), ("number", "damping_number")):
-            column[name][lane] = (there[of] - here[of]) / change
-        column["edge"][:, lane] = (there.penetration_rows[4] - here.penetration_rows[4]) / change
-        column["constant"][:, lane] = (there.constant - here.constant) / change
+            column[name][lane] = (displaced_params[of] - own_params[of]) / change
+        column["edge"][:, lane] = (displaced_params.penetration_rows[4] - own_params.penetration_rows[4]) / change
+        column["constant"][:, lane] = (displaced_params.constant - own_params.constant) / change
         column["factor"][:, lane] = (other.initial_state().damping_factor - start.damping_factor) / change
         waves = np.stack([other.loads.sine - compiled.loads.sine, other.loads.cosine - compiled.loads.cosine], axis=1)
         amplitudes[block, ..., lane] = per_mass(compiled.scene, waves) / change

@@ -132,8 +132,8 @@ class Twin:
     def signature(self) -> tuple[bool, ...]:
         """Optional terms of the equations. Twins with equal signatures share their compiled code."""
         parts = self._parts
-        there = (*parts.terms, parts.harmonics, parts.segments, parts.implicit, self._bound)
-        return (*(part is not None for part in there), *options(self.scene))
+        arguments = (*parts.terms, parts.harmonics, parts.segments, parts.implicit, self._bound)
+        return (*(part is not None for part in arguments), *options(self.scene))
 
     def like(self, scene: Scene) -> Twin:
         """Return a new twin of the given scene, with the tolerance, excitation and limits of this twin.

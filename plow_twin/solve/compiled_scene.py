@@ -306,10 +306,10 @@ def _compile_alike(
     common = shared.of(_unchanged, kind, *_sources(first, sampled), given=(kind, first, sampled, shared))
     values, overdamped = _varied(scenes, tol, common)
     # numpy writes to a slice faster than to a list of indices
-    there = slice(which[0], which[-1] + 1) if which[-1] - which[0] < len(which) else which
-    params.view(common.record.dtype)[there] = common.record
+    members = slice(which[0], which[-1] + 1) if which[-1] - which[0] < len(which) else which
+    params.view(common.record.dtype)[members] = common.record
     for name, value in values.items():
-        params[name][there] = value
+        params[name][members] = value
     segments = None
     if sampled:
         segments = np.zeros(1, SEGMENT)
@@ -371,10 +371,10 @@ def options(scene: Scene) -> Options:
 
 
 def _of_frame(scene: Scene) -> dict[str, Any]:
-    there, constants = options(scene), dict[str, Any]()
-    if there.corners:
+    terms, constants = options(scene), dict[str, Any]()
+    if terms.corners:
         constants["tumbles"] = float(geometry.tumbles(scene))
-    if there.rounded:
+    if terms.rounded:
         constants["roll"] = geometry.roll(scene)
     return constants
 
@@ -528,7 +528,7 @@ def _law_terms(viscous: bool, damped: bool, exponent: float, ramp: bool) -> Term
 
 
 def _flags(present: dict[str, bool]) -> dict[str, int]:
-    return {name: 1 for name, there in present.items() if there}
+    return {name: 1 for name, is_present in present.items() if is_present}
 
 
 def _harmonics(head: Head, loads: LoadSet) -> tuple[Array, Harmonics | None]:
@@ -637,11 +637,11 @@ def _overdamped(
 
 
 def _rubbing(scene: Scene) -> dict[str, Any]:
-    wear, there, options_of_scene = scene.wear, _wear_terms(scene.wear), dict[str, Any]()
-    if wear is not None and there.get("sliding"):
+    wear, wear_terms, options_of_scene = scene.wear, _wear_terms(scene.wear), dict[str, Any]()
+    if wear is not None and wear_terms.get("sliding"):
         options_of_scene["slip_rows"] = geometry.slip_rows(scene)
         options_of_scene["speed_per_wear"] = wear.pad_area_m2 / wear.coefficient_m2_n
-    if wear is not None and there.get("running_in") and wear.running_in_depth_m is not None:
+    if wear is not None and wear_terms.get("running_in") and wear.running_in_depth_m is not None:
         options_of_scene |= {
             "running_in": wear.running_in_ratio - 1.0,
             "running_in_rate": 1.0 / wear.running_in_depth_m,

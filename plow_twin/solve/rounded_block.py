@@ -39,8 +39,8 @@ _STEPS = 70.0
 _SLOWEST, _LEAST, _LARGEST = 0.01, 0.05, 0.9
 #: Impact speed in m/s below which restitution and friction are constant.
 _SMALLEST_IMPACT = 0.05
-#: Mobility of a corner times the mass, for a uniform square that lands on the end of an edge, to which the effective
-#: mass of an impact is relative.
+#: Mobility of a corner times the mass of the block [1], for a uniform square that lands on the end of an edge. The
+#: effective mass of an impact is expressed relative to this case.
 _USUAL_MOBILITY = 1.5
 
 

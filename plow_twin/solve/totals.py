@@ -35,8 +35,8 @@ def _seal(row_of, window) -> None:
 def publish(rows, stamps, held, taken, windows, waits) -> int:
     """Sum up advances, and write the sums since the previous publication to each row that is published.
 
-    A published row whose advance failed has the motion of the last successful row since the previous publication, or
-    the stamp 0 without such a row.
+    If the advance of a published row failed, the row has the motion of the last successful row since the previous
+    publication. If there is no successful row, its stamp is 0.
 
     Parameters
     ----------

@@ -250,7 +250,7 @@ class Session:
             samples = samples[count:]
 
     def apply_samples(self, samples: Sequence[journal.Sample], *, each: bool = False) -> Applied:
-        """Emit and apply a part of the samples that `parts` has yielded.
+        """Write a part of the samples, as divided by `parts`, to the journal and apply it.
 
         The motion does not depend on the division into parts. If `each` is set, each sample is published, except that
         samples inserted late are published together. If `each` is not set, `outputs` collects the samples for the next

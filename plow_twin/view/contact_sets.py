@@ -47,7 +47,7 @@ class ContactSets:
         self._before: str | None = None
         self._at: int | None = None
         self._last: tuple[int, int] | None = None
-        #: Newest set of the present span that has not been written, and the step of its row.
+        #: Newest contact set that has not been written, and the step of its row; a span is written at its end.
         self._pending: tuple[str, int] | None = None
         names: dict[str, Color] = {}
         for ccw, cw in product(range(16), range(16)):

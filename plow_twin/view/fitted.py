@@ -151,8 +151,8 @@ class FittedPicture:
 
 
 def _broken(t: Array, values: Array) -> tuple[Array, Array]:
-    there = np.isfinite(values)
-    t, values = t[there], values[there]
+    finite = np.isfinite(values)
+    t, values = t[finite], values[finite]
     steps = np.diff(t)
     gaps = np.flatnonzero(steps > _GAP * np.median(steps)) + 1 if len(steps) else np.zeros(0, np.int64)
     return np.insert(t, gaps, np.nan), np.insert(values, gaps, np.nan)
@@ -206,9 +206,9 @@ def _write_rrd(picture: FittedPicture, path: Path) -> None:
                 f"residual/{name}": motion.residual,
             }
             for entity, rows in curves.items():
-                there = np.isfinite(rows[:, number])
-                times = rr.TimeColumn(RUN_TIME, duration=motion.t[there])
-                values = rr.Scalars.columns(scalars=_SCALE * rows[there, number])
+                finite = np.isfinite(rows[:, number])
+                times = rr.TimeColumn(RUN_TIME, duration=motion.t[finite])
+                values = rr.Scalars.columns(scalars=_SCALE * rows[finite, number])
                 rr.send_columns(entity, [times], values, recording=stream)
         document = rr.TextDocument(markdown(picture), media_type=rr.MediaType.MARKDOWN)
         stream.log("values", document, static=True)

@@ -162,8 +162,8 @@ class _Dated:
         return self._tails[-1].path if self._tails else self._pattern
 
     def columns(self, *, grows: bool) -> list[str] | None:
-        there = self.files()
-        return _Tail(max(there, key=_changed_ns)).columns(grows=grows) if there else None
+        files = self.files()
+        return _Tail(max(files, key=_changed_ns)).columns(grows=grows) if files else None
 
     def files(self) -> list[Path]:
         return sorted(self._pattern.parent.glob(self._pattern.name), key=_numbered)
@@ -173,11 +173,11 @@ class _Dated:
         if arrived_rows or time.monotonic() < self._look_s:
             return arrived_rows
         self._look_s = time.monotonic() + _LOOK_FOR_FILES_S
-        there = self.files()
-        new = [file for file in there if file not in self._seen_files]
+        files = self.files()
+        new = [file for file in files if file not in self._seen_files]
         if new and not self._seen_files:
             new = [max(new, key=_changed_ns)]
-        self._seen_files.update(there)
+        self._seen_files.update(files)
         for file in new:
             rows = self._tails[-1].rows if self._tails else Rows()
             unread = 0

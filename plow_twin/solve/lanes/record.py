@@ -202,8 +202,8 @@ _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "integer", "f
 def fits_lanes(compiled: CompiledScene, *, sampled: bool = False) -> bool:
     """Return whether a scene can run in lanes: it has only the terms `_COVERED` or samples, and no `Options`."""
     parts = compiled.parts._replace(terms=compiled.parts.terms._replace(segments=None)) if sampled else compiled.parts
-    there = (name for name, term in zip(Terms._fields, parts.terms, strict=True) if term is not None)
-    return parts.implicit is None and _COVERED.issuperset(there) and not any(options(compiled.scene))
+    present = (name for name, term in zip(Terms._fields, parts.terms, strict=True) if term is not None)
+    return parts.implicit is None and _COVERED.issuperset(present) and not any(options(compiled.scene))
 
 
 def forces(terms: Terms) -> tuple[int | None, int | None, int | None]:

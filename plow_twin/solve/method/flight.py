@@ -101,7 +101,7 @@ def _lay_out(p, harmonics, flight, state, w, span, penetrating) -> bool:
 
 @kernel()
 def safe_time(p, harmonics, state, w, span) -> float:
-    """Return a time, at most `span`, within which the head cannot reach a wall, or 0 if a series can step as far."""
+    """Return a time, at most `span`, within which the head cannot reach a wall; 0 if a step of a series is as long."""
     least = _LEAST_PHASE / p.fastest
     if span < least:
         return 0.0

@@ -53,7 +53,7 @@ STAGES = 9
 #: Ratio of the decay rate of a contact's dampers to the angular frequency of its springs, above which the contact is
 #: overdamped and the scene may need implicit steps.
 OVERDAMPED_RATIO = 20.0
-#: Cost of an implicit step in explicit steps. An implicit step must be longer than that.
+#: Cost of an implicit step in explicit steps, so an implicit step must be longer than this number of explicit steps.
 _WORTH = 30.0
 #: Admissible error of an implicit step, which replaces many explicit steps, divided by that of an explicit step.
 _GAIN = 100.0

@@ -261,7 +261,7 @@ def _loads_along_world(p, w, k, alpha, beta, harmonics, second, segments):
 
 @kernel(fast=True, inline="source")
 def _applied(p, along_x, along_y, torque):
-    """Return the accelerations by forces (in head axes) and moments of the pairs, in the lanes of the state's rates."""
+    """Return the accelerations that forces (head axes) and moments of the pairs cause, in the lanes of the rates."""
     mass, inertia = p.inverse_mass, p.inverse_inertia
     return three_totals(along_x, along_y, torque) * pack(0.0, 0.0, mass, mass, inertia, 0.0, 0.0, 0.0)
 

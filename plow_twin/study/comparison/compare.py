@@ -133,8 +133,8 @@ def compare(
         labels = np.array([label(name, stamp) for stamp in windows.start_ns.tolist()])
         for group in dict.fromkeys(labels.tolist()):
             chosen = windows.chosen(labels == group)
-            for other, there in zip(names.get(group, ()), parts.get(group, ()), strict=True):
-                twice = _overlapping(chosen, there)
+            for other, other_value in zip(names.get(group, ()), parts.get(group, ()), strict=True):
+                twice = _overlapping(chosen, other_value)
                 if twice.any():
                     notes.append(
                         f"{name}: {twice.sum()} of {len(twice)} windows in {group} left out: {other} covers their time"

@@ -62,8 +62,8 @@ class PaperStudy:
         """Largest distance [m] between the head in the recording and in the run of the report."""
         if self.recording is None:
             return None
-        apart = self.recording.q[:, :2] - self.runs.case.q[:, :2]
-        return float(np.hypot(*apart.T).max())
+        difference = self.recording.q[:, :2] - self.runs.case.q[:, :2]
+        return float(np.hypot(*difference.T).max())
 
 
 def compare(
