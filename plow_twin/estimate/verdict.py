@@ -95,8 +95,8 @@ def judge_sensor(poses: Poses) -> list[str]:
 
 def predicted(fit: Fit) -> NDArray[np.bool_]:
     """Return which measurements the model predicts almost to within the noise, shape (n, 3)."""
-    finite: NDArray[np.bool_] = np.isfinite(fit.point.residual) & (fit.variance < 1.5 * fit.noise**2)
-    return finite
+    close: NDArray[np.bool_] = np.isfinite(fit.point.residual) & (fit.variance < 1.5 * fit.noise**2)
+    return close
 
 
 def _colour(fit: Fit, verdict: Verdict) -> None:
@@ -119,7 +119,7 @@ def _repeated(problem: Problem, fit: Fit, period: float, verdict: Verdict) -> No
 
     A wrong contact law or a wrong shape of the load causes residuals that repeat.
     """
-    t, predictions = problem.window.poses.t, predicted(fit)
+    t, is_predicted = problem.window.poses.t, predicted(fit)
     turns = np.floor((t - t[0]) / period).astype(int)
     phase = np.minimum(((t - t[0]) / period % 1.0 * tuning.PHASES).astype(int), tuning.PHASES - 1)
     between, within, cells = 0.0, 0.0, 0
