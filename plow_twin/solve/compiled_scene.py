@@ -371,10 +371,10 @@ def options(scene: Scene) -> Options:
 
 
 def _of_frame(scene: Scene) -> dict[str, Any]:
-    terms, constants = options(scene), dict[str, Any]()
-    if terms.corners:
+    scene_options, constants = options(scene), dict[str, Any]()
+    if scene_options.corners:
         constants["tumbles"] = float(geometry.tumbles(scene))
-    if terms.rounded:
+    if scene_options.rounded:
         constants["roll"] = geometry.roll(scene)
     return constants
 
