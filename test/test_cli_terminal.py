@@ -16,6 +16,7 @@ from record_support import paper_sample, record_run
 from rich.console import Console
 
 from plow_twin.cli import analyse as analyse_verb
+from plow_twin.cli import app
 from plow_twin.cli import doctor as doctor_verb
 from plow_twin.cli import estimate as estimate_verb
 from plow_twin.cli import info as info_verb
@@ -157,3 +158,13 @@ def test_the_help_of_the_node_starts_no_node() -> None:
     code = "import sys; sys.modules['rclpy'] = None; from plow_twin.ros.main import main; main(['--help'])"
     completed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert completed.returncode == 0 and "--ros-args" in completed.stdout
+
+
+def test_a_text_that_the_locale_cannot_encode_is_printed_with_escapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="ascii", write_through=True))
+    monkeypatch.setattr(signal, "signal", lambda number, handler: None)
+    monkeypatch.setattr(app, "run", lambda arguments: print("bottom_right_\u2026"))
+    with pytest.raises(SystemExit):
+        app.main([])
+    assert written.getvalue() == b"bottom_right_\\u2026\n"

@@ -677,6 +677,7 @@ def test_lines_on_standard_input_are_used_and_a_silence_is_held(tmp_path: Path) 
         values = live.until(lambda heard: int(heard["input"]["values"]["holds"]) > 0, "a hold")
         live.process.stdin.close()
         assert (values["samples_used"], values["dropped_malformed"]) == ("100", "2")
+        assert values["newest_sample_age_s"] == ""  # the stamps count from the start of the source
         live.process.stdin = None
         live.process.communicate(timeout=60.0)
         assert live.process.returncode == 3  # two lines were not used, and the exit code shows a loss

@@ -281,7 +281,7 @@ def test_a_file_that_another_program_rewrote_is_a_run(run: Run, tmp_path: Path) 
     [
         (b"", "empty: its recorder was killed"),
         (b"something else entirely", "not an MCAP file"),
-        (b"\x89MCAP0\r\n", "is missing"),
+        (b"\x89MCAP0\r\n", "truncated before its first message"),
         (None, "no such recording"),
     ],
 )

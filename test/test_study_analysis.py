@@ -557,3 +557,14 @@ def test_rainflow_cycles_of_long_and_short_series_are_exact(monkeypatch: pytest.
 def test_turning_points_keep_peaks_and_ends() -> None:
     np.testing.assert_array_equal(reversals(np.array([0.0, 0, 1, 3, 3, 2, 5, 0, 0])), [0, 3, 2, 5, 0])
     np.testing.assert_array_equal(reversals(np.zeros(5)), [0.0])
+
+
+@pytest.mark.parametrize(("content", "expected"), [(b"", "empty"), (b"\x89MCAP0\r\n", "truncated")])
+@pytest.mark.parametrize("read", [analyse, read_recording])
+def test_a_recording_without_a_message_is_not_called_a_recording_of_another_program(
+    read: Callable[[Path], object], content: bytes, expected: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "cut.mcap"
+    file.write_bytes(content)
+    with pytest.raises(RecordingError, match=f"^{file}: {expected}"):
+        read(file)

@@ -21,6 +21,7 @@ from plow_twin import Friction, simulate
 from plow_twin.cli.app import run
 from plow_twin.errors import SceneError
 from plow_twin.scene_file import dump_scene
+from plow_twin.study.cluster import connect
 from plow_twin.study.parameters import StudyError, parameter_of, parameter_paths, with_parameters
 from plow_twin.study.store import Store
 from plow_twin.study.sweep.run import run_here, run_on_cluster
@@ -183,6 +184,14 @@ def test_a_missing_library_is_named_before_the_work(
     assert run([*arguments, "--out", str(tmp_path / "out")]) == 1
     assert f"{module}, which is not installed: pip install 'plow_twin[{extra}]'" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("address", ["http://127.0.0.1:8786", "tcp://127.0.0.1", ""])
+def test_no_client_is_made_for_an_invalid_address(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # such a client would wait 40 s at the end of the process, and then print a traceback
+    monkeypatch.setattr("distributed.Client", None)
+    with pytest.raises(StudyError, match=f"got '{address}', expected the address of a scheduler"):
+        connect(address)
 
 
 def test_killing_a_dask_worker_loses_no_result(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Sequence
+from io import TextIOWrapper
 from typing import Final, NoReturn
 
 import click
@@ -85,6 +86,9 @@ for _verb in (
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line, and exit with its exit code."""
+    # in the locale C, a name or the ellipsis of a table cannot be encoded
+    if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.encoding.lower() != "utf-8":
+        sys.stdout.reconfigure(errors="backslashreplace")
     code = run(arguments)
     if threading.current_thread() is threading.main_thread():
         # a terminal and `ros2 launch` may both send a signal, and the second signal would change the exit code

@@ -27,6 +27,7 @@ from plow_twin.live.wear_keeper import KeptWear, WearKeeper
 from plow_twin.model.scene import Scene, fastest_travel
 from plow_twin.record.alarms import alarms_of
 from plow_twin.record.messages import DiagnosticStatus
+from plow_twin.record.times import EPOCH_S
 from plow_twin.record.wear_state import scene_identity
 from plow_twin.stream.driver import Arrival, Driver, Policy
 from plow_twin.stream.health import Periods
@@ -195,14 +196,19 @@ class Runtime:
         return None if newest is None else self.inputs.residual(newest["q"][0])
 
     def newest_sample_age_s(self) -> float | None:
-        """Return the time since the stamp of the newest used sample [s], or None without a sample."""
-        newest_ns = self.driver.newest_ns
-        return None if newest_ns is None else (self._front.now_ns() - newest_ns) * 1e-9
+        """Return the time since the stamp of the newest used sample [s], or None if it is unknown."""
+        return self._age_s(self.driver.newest_ns)
 
     def estimate_age_s(self) -> float | None:
-        """Return the time since the end of the window of the last estimate [s], or None without an estimate."""
-        end_ns = self.estimation.end_ns if self.estimation else None
-        return None if end_ns is None else (self._front.now_ns() - end_ns) * 1e-9
+        """Return the time since the end of the window of the last estimate [s], or None if it is unknown."""
+        return self._age_s(self.estimation.end_ns if self.estimation else None)
+
+    def _age_s(self, stamp_ns: int | None) -> float | None:
+        now_ns = self._front.now_ns()
+        # a stamp that is not a date cannot be compared with a date
+        if stamp_ns is None or stamp_ns < EPOCH_S * 1e9 <= now_ns:
+            return None
+        return (now_ns - stamp_ns) * 1e-9
 
     def look_at_clock(self) -> None:
         """Update the state of the clock. A clock without a change since the last call is paused."""

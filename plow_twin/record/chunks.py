@@ -456,7 +456,9 @@ def open_mcap(path: Path) -> IO[bytes]:
     if stream.read(len(MAGIC)) != MAGIC:
         stream.close()
         if path.stat().st_size == 0:
-            raise ForeignRecordingError(f"{path}: empty: its recorder was killed before it wrote anything")
+            # an empty table is not a recording that a killed recorder has left
+            kind = RecordingError if path.suffix == ".mcap" else ForeignRecordingError
+            raise kind(f"{path}: empty: its recorder was killed before it wrote anything")
         table = path.suffix.lower() in _TABLES
         more = "; plow-twin live makes a recording of a table, and commands with --map read a table" if table else ""
         raise ForeignRecordingError(f"{path}: not an MCAP file (its first bytes are not {MAGIC!r}){more}")

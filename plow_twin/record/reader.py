@@ -96,6 +96,8 @@ class RunReader:
             if part in self._headers:
                 self.header = self._headers[part]
                 return
+        if all(map(_has_no_message, self.parts)):
+            raise RecordingError(f"{self.path}: truncated before its first message, expected a complete recording")
         raise ForeignRecordingError(f"{self.path}: metadata {HEADER_RECORD!r} is missing: not a recording of plow_twin")
 
     def _look_for_parts(self) -> None:
@@ -451,6 +453,15 @@ def read_header(path: Path) -> RunHeader | None:
         for name, record in metadata_records(path):
             on_metadata(name, record)
     return headers[0] if headers else None
+
+
+def _has_no_message(path: Path) -> bool:
+    """Return whether a file ends before its first message and has no end mark."""
+    begins = is_mcap(path)
+    if not begins:
+        return begins is None
+    reader = ChunkReader(path)
+    return not any(map(len, reader)) and not reader.finished
 
 
 def run_parts(path: Path) -> list[Path]:

@@ -21,8 +21,13 @@ _LOOK_S: Final = 2.0
 def connect(address: str) -> Client:
     """Return a client of the scheduler at `address`, or raise a `StudyError` if the scheduler does not answer."""
     from distributed import Client
+    from distributed.comm.addressing import parse_address
+    from distributed.comm.registry import get_backend
 
     try:
+        # a client with a wrong address waits 40 s at the end of the process, and then prints a traceback
+        scheme, place = parse_address(address)
+        get_backend(scheme).get_address_host(place)  # type: ignore[no-untyped-call]
         return Client(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)  # type: ignore[no-untyped-call]
     except (OSError, TimeoutError, ValueError) as error:
         raise StudyError(f"dask: got {address!r}, expected the address of a scheduler ({error})") from None
