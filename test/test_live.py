@@ -58,6 +58,7 @@ from plow_twin.record.times import time_ns
 from plow_twin.record.unused import unused_messages
 from plow_twin.record.writer import RunWriter
 from plow_twin.scene_file import load_scene
+from plow_twin.solve.state import Status
 from plow_twin.stream.intake import Verdict
 from plow_twin.stream.journal import Gaps, Mark, Parameter, PartOfPose, Pose, Unused
 from plow_twin.stream.limits import pose_limits, value_limits
@@ -95,6 +96,16 @@ def _run(path: Path, mapping: Path | None = None, reports: list[Part] | None = N
     front = BridgeFront(Files([path], follow=False), mapping, settings, prepared, say, messages.append)
     assert front.run(lambda: False) == []
     return front.parts()
+
+
+@pytest.mark.parametrize("follow", ["off", "full"])
+def test_an_advance_of_a_live_twin_fails_after_the_limit_of_steps(follow: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # without the limit, a very stiff contact keeps the node from answering for over a minute
+    for module in ("plow_twin.live.solver_start", "plow_twin.estimate.members"):
+        monkeypatch.setattr(f"{module}.MOST_STEPS", 20)
+    settings = parameters.settings({"estimate": follow != "off", "follow": "full", "follow_members": 20})
+    twin = Preparation(settings).result(lambda: False).twin
+    assert twin.advance(10.0, (1e3, 1e3, 0.0)).status is Status.BUDGET
 
 
 def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(
