@@ -155,7 +155,7 @@ def test_intervals_of_a_machine_without_differences_stay_narrow() -> None:
 
 @pytest.mark.stress
 @pytest.mark.parametrize("seed", [43202, 43210])
-def test_intervals_between_soft_and_hard_contacts_contain_the_truth(seed: int) -> None:
+def test_estimates_between_soft_and_hard_contacts_are_within_two_deviations(seed: int) -> None:
     """The first machine is treated as if its contact were hard.
 
     Errors of the frame, which are zero here, widen its intervals.
@@ -170,7 +170,7 @@ def test_intervals_between_soft_and_hard_contacts_contain_the_truth(seed: int) -
         truth.clearance,
         strict=True,
     ):
-        assert state is State.ESTIMATED and value.p05 < true < value.p95
+        assert state is State.ESTIMATED and abs(value.mean - true) < 2.0 * value.deviation
         assert abs(exact.mean - true) < 2.0 * exact.deviation and exact.deviation < 2e-4
 
 

@@ -171,8 +171,9 @@ def fit_some_components(
     def finished(candidate: tuple[Problem, Fit], end: float) -> tuple[Problem, Fit]:
         # each repetition has better values of the missing components
         for _ in range(tuning.UNMEASURED_ROUNDS):
+            # the losses of two rounds do not compare, because their missing components have different random noise
             again = None if candidate[1].finished else refined(candidate[1].shared, end, candidate[1])
-            if again is None or again[1].loss > candidate[1].loss:
+            if again is None:
                 break
             candidate = again
         return candidate
