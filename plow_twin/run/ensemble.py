@@ -26,7 +26,7 @@ from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, check_limits
 from plow_twin.run.simulate import check_times, output_times
 from plow_twin.solve.compiled_scene import compile_scenes
 from plow_twin.solve.lanes.record import fits_lanes, new_lanes
-from plow_twin.solve.state import State, Status, Totals, Work, first_of, new_work
+from plow_twin.solve.state import WORK, State, Status, Totals, first_of, new_records, new_work
 
 Array = NDArray[np.float64]
 
@@ -193,16 +193,17 @@ class _Run:
                     shares.append(lambda share=share: self._run_lanes(run, share))  # type: ignore[misc]
         return alone[:1], shares + alone[1:]
 
-    def _work(self) -> Work:
+    def _work(self) -> NDArray[np.void]:
         if not hasattr(self._local, "work"):
-            self._local.work = new_work()
-        work: Work = self._local.work
+            self._local.work = new_records(WORK, 1)
+            self._local.work[0] = new_work()
+        work: NDArray[np.void] = self._local.work
         return work
 
-    def _lanes(self) -> np.record:
+    def _lanes(self) -> NDArray[np.void]:
         if not hasattr(self._local, "lanes"):
-            self._local.lanes = first_of(new_lanes())
-        lanes: np.record = self._local.lanes
+            self._local.lanes = new_lanes()
+        lanes: NDArray[np.void] = self._local.lanes
         return lanes
 
     def _check_time(self, motion: Motion | None = None) -> None:
@@ -230,7 +231,7 @@ class _Run:
         compiled, ensemble = self._compiled[index], self._ensemble
         motion = Motion.start(compiled, ensemble.q[index], ensemble.v[index])
         status, _ = run_events(
-            compiled, motion, ensemble.t, self._t_end, self._work(), self._max_steps, self._check_time
+            compiled, motion, ensemble.t, self._t_end, first_of(self._work()), self._max_steps, self._check_time
         )
         self._store(index, motion.totals, motion.state, status)
         self._report_progress(1)

@@ -14,7 +14,7 @@ from plow_twin.solve.compiled_scene import CompiledScene, start_many
 from plow_twin.solve.lanes.loop import OTHER_METHOD, Members, run_lanes
 from plow_twin.solve.lanes.record import forces
 from plow_twin.solve.modes import settle_many
-from plow_twin.solve.state import EVENT, HARMONIC, STATE, TOTALS, Status, Work, new_records
+from plow_twin.solve.state import EVENT, HARMONIC, STATE, TOTALS, Status, Work, first_of, new_records
 
 #: Number of steps of each lane in the first slice.
 _FIRST_SLICE: Final = 256
@@ -65,8 +65,11 @@ class LaneRun:
             q, v,
         )  # fmt: skip
 
-    def go_on(self, waiting: NDArray[np.int64], work: Work, lanes: np.record) -> NDArray[np.bool_]:
-        """Advance members by a slice of work, and return whether each member has finished."""
+    def go_on(self, waiting: NDArray[np.int64], work: NDArray[np.void], lanes: NDArray[np.void]) -> NDArray[np.bool_]:
+        """Advance members by a slice of work, and return whether each member has finished.
+
+        `work` of `WORK` and `lanes` of `LANES`, shape (1,), are scratch space.
+        """
         first, begin = self._compiled[waiting[0]], _time.perf_counter()
         terms = first.parts.terms
         run_lanes(
@@ -76,7 +79,7 @@ class LaneRun:
         )  # fmt: skip
         self._size = next_slice(self._size, _time.perf_counter() - begin)
         for index in waiting[self.status[waiting] == OTHER_METHOD].tolist():
-            self._step_otherwise(index, work)
+            self._step_otherwise(index, first_of(work))
         status = self.status[waiting]
         done: NDArray[np.bool_] = (status != Status.PAUSED) & (status != OTHER_METHOD)
         return done

@@ -346,17 +346,18 @@ def _load(members, power, slip, lanes, lane, member) -> None:
 
 @kernel(entry=True)
 def run_lanes(
-    members, waves, second, viscous, hysteretic, power, fraction, slip, flight, rest, order, lanes, w, queue, t_end,
-    budget, iterations, t,
+    members, waves, second, viscous, hysteretic, power, fraction, slip, flight, rest, order, eight, work, queue,
+    t_end, budget, iterations, t,
 ) -> bool:  # fmt: skip
     """Advance the members with the indices `queue` to `t_end`, eight at a time.
 
     `power`, `fraction` and `slip` are those of `record.forces`, `order` is the order of the series, `budget` the
-    largest number of steps of a scene, and `t` contains the times of the output rows. A scene leaves its lane with a
-    `Status` or with `OTHER_METHOD`. If `iterations` iterations are not sufficient, all scenes leave with `PAUSED`, and
-    the result is False.
+    largest number of steps of a scene, and `t` contains the times of the output rows. `eight` and `work` are lanes and
+    scratch space, shape (1,), because numba takes 30 us a call to find the types of such records. A scene leaves its
+    lane with a `Status` or with `OTHER_METHOD`. If `iterations` iterations are not sufficient, all scenes leave with
+    `PAUSED`, and the result is False.
     """
-    members, queue, t = _unowned_members(members), unowned(queue), unowned(t)
+    members, queue, t, lanes, w = _unowned_members(members), unowned(queue), unowned(t), eight[0], work[0]
     waiting = 0
     for _ in range(iterations):
         in_range, live = bits_in_range(lanes), 0
