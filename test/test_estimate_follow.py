@@ -30,6 +30,7 @@ from plow_twin.model.scene import Scene, Wear
 from plow_twin.run.batch import TwinBatch
 from plow_twin.solve.state import ROW
 from plow_twin.stream.journal import Estimated, Restore, Sample, SetModel
+from plow_twin.stream.model_changes import changed_twin
 from plow_twin.stream.session import Session
 
 sys.path.insert(0, str(ROOT / "benchmark"))
@@ -234,6 +235,15 @@ def test_kernels_with_friction_are_compiled_at_the_start_only_without_a_cache(
         monkeypatch.setattr("plow_twin.estimate.follow.kept_on_disk", lambda kept=kept: kept)
         follower.warm_up()
         assert compiled == expected
+
+
+def test_a_change_of_numbers_is_accepted_when_members_are_overdamped(truth: Truth) -> None:
+    twin = Follower(truth.nominal, FEWEST)
+    overdamped = replace(_known(truth), damping=Interval.normal(1e3, 1.0))
+    twin._draw(json.dumps(overdamped.as_dict()), 0.0, np.zeros(PAIR_COUNT))
+    changed = changed_twin(twin, truth.nominal, {"clearance.horizontal_m": 0.024})
+    assert isinstance(changed, Follower)
+    assert changed.scene.clearance.horizontal_m == 0.024
 
 
 def test_a_changed_model_is_followed_from_its_prior(truth: Truth) -> None:

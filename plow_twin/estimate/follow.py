@@ -162,6 +162,8 @@ class Follower:
         #: number of times that members were drawn, and model time in s of the latest draw from an estimate
         self.drawn, self._since = 0, start
         self._draw("", start, self._unworn())
+        #: compiled terms of the nominal scene, as in `Twin`; the draw decides whether members have further terms
+        self.signature: tuple[bool, ...] = self._ensemble.first.signature
         self._drop_measurements()
 
     def _drop_measurements(self) -> None:
@@ -189,12 +191,6 @@ class Follower:
         self._note_clearance()
 
     # -- as a `Twin` -------------------------------------------------------------------------------------------------
-
-    @property
-    def signature(self) -> tuple[bool, ...]:
-        """The compiled terms of the equations, as in `Twin`."""
-        others = self._ensemble.others
-        return self._ensemble.first.signature + (() if others is None else others.signature)
 
     @property
     def time(self) -> float:
