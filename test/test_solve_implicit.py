@@ -150,7 +150,10 @@ def test_the_tolerance_is_met_for_laws_with_a_damping_factor(law: str, damping: 
 )
 def test_every_law_meets_the_tolerance_in_bounded_work(start: Scene, law: str, damping: float) -> None:
     scene = replace(start, contact=overdamped(law, damping))
-    assert_within_the_gate(scene, (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10))
+    tolerances = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
+    # the exception on the page of the solver
+    sensitive = law == "hunt_crossley" and damping >= 1e8
+    assert_within_the_gate(scene, tolerances[4:] if sensitive else tolerances)
 
 
 @pytest.mark.parametrize("damping", [10.0**k for k in range(10, 14)])
