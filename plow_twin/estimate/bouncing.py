@@ -704,15 +704,14 @@ class MotionFeatures:
         self._phases: dict[float, list[_Phases]] = {}
 
     def simulated(
-        self, forward: Forward, unknowns: Unknowns, clearance: Array, numbers: Array, delay: float,
-        rng: np.random.Generator,
-    ) -> Array | None:  # fmt: skip
-        """Return a simulated motion as a sensor with a delay of `delay` s would measure it; None after a failure.
+        self, forward: Forward, unknowns: Unknowns, clearance: Array, numbers: Array, rng: np.random.Generator
+    ) -> Array | None:
+        """Return a simulated motion as the sensor would measure it; None after a failure.
 
         `clearance` and `numbers` are those of `start`.
         """
         motion_start = self.start(unknowns, clearance, numbers, rng)
-        edges, t = np.array([0, len(self._t)]), self._t - delay
+        edges, t = np.array([0, len(self._t)]), self._t
         run = forward.run(motion_start.scene, motion_start.gain, t[:1] - _BEFORE, motion_start.state[None], edges, t)
         return None if run is None else self.with_noise(run.q, rng)
 

@@ -110,17 +110,15 @@ class Graded:
     harmonics: Harmonics | None = None
 
 
-def graded(problem: Problem, fitted: Fit, doubtful: bool = False, seed: int = 0) -> Graded:
+def graded(problem: Problem, fitted: Fit, doubtful: bool = False) -> Graded:
     """Return the result of a fit for a machine that may differ from the model.
 
     Parameters
     ----------
-    problem, found : Problem, Fit
+    problem, fitted : Problem, Fit
         The fit, which need not have reached an optimum.
     doubtful : bool
         Whether the fit fails a check or has not reached an optimum, so that a difference is likely.
-    seed : int
-        Seed of the sampler.
 
     Raises
     ------
@@ -135,7 +133,7 @@ def graded(problem: Problem, fitted: Fit, doubtful: bool = False, seed: int = 0)
         linear.learn(rounds)
         linear.temper()
     linear.eliminate()
-    mean, covariance, often, halves = linear.averaged(np.random.default_rng(seed), tuning.DIFFERS[int(doubtful)])
+    mean, covariance, often, halves = linear.averaged(np.random.default_rng(0), tuning.DIFFERS[int(doubtful)])
     surprise, named = linear.surprise(mean, often), linear.named(mean, often)
     share, exponent, _ = named.get(EXPONENT, (0.0, 0.0, 0.0))
     bent = tuning.BENT_BY_EXPONENT * share * (exponent - problem.unknowns.changes.get(EXPONENT, 0.0)) ** 2

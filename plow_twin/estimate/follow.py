@@ -121,8 +121,6 @@ class Follower:
         Number of twins, either 1 or at least 20. Poses do not move a single twin, and its forces have no intervals.
     tol : float
         Tolerance of the solver, as for `Twin`.
-    start : float
-        Time in s of the scene's initial state.
     seed : int
         Seed of the random numbers.
 
@@ -137,9 +135,7 @@ class Follower:
     #: number of advances that `max_evaluations` has cut short, always 0 for a follower
     bounded = 0
 
-    def __init__(
-        self, scene: Scene, members: int = MEMBERS, *, tol: float = TOLERANCE, start: float = 0.0, seed: int = 0
-    ) -> None:
+    def __init__(self, scene: Scene, members: int = MEMBERS, *, tol: float = TOLERANCE, seed: int = 0) -> None:
         if members != 1 and members < FEWEST:
             raise ArgumentError(f"members: got {members}, expected 1 or at least {FEWEST}")
         self.scene, self.tol = scene, tol
@@ -156,12 +152,12 @@ class Follower:
         #: minimum and maximum of each component of the load so far, shape (2, 3)
         self._range = np.zeros((2, 3))
         self._ends, self._begins = _NO_DIGESTS, False
-        self._span_start = start
+        self._span_start = 0.0
         self._wrench = np.zeros(3)
         self.poses = PoseCounts()
         #: number of times that members were drawn, and model time in s of the latest draw from an estimate
-        self.drawn, self._since = 0, start
-        self._draw("", start, self._unworn())
+        self.drawn, self._since = 0, 0.0
+        self._draw("", 0.0, self._unworn())
         #: compiled terms of the nominal scene, as in `Twin`; the draw decides whether members have further terms
         self.signature: tuple[bool, ...] = self._ensemble.first.signature
         self._drop_measurements()

@@ -89,12 +89,10 @@ class ForceEnsemble:
     ----------
     scene : Scene
         The nominal scene. All members have its geometry, masses and gravity.
-    found : Estimate
+    estimate : Estimate
         The estimate from which members are drawn; it must not be withdrawn.
     members : int
         Number of members, at least 20.
-    seed : int
-        Seed of the random numbers.
     start : float
         Time in s at which all members are in the scene's initial state.
 
@@ -104,16 +102,14 @@ class ForceEnsemble:
         If the estimate is withdrawn, or there are too few members.
     """
 
-    def __init__(
-        self, scene: Scene, estimate: Estimate, members: int = MEMBERS, *, seed: int = 0, start: float = 0.0
-    ) -> None:
+    def __init__(self, scene: Scene, estimate: Estimate, members: int = MEMBERS, *, start: float = 0.0) -> None:
         if State.WITHDRAWN in (estimate.horizontal_state, estimate.vertical_state):
             raise ForcesError(
                 f"estimate: got a withdrawn estimate ({'; '.join(estimate.reasons)}), expected a valid one"
             )
         if members < FEWEST:
             raise ForcesError(f"members: got {members}, expected at least {FEWEST}")
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(0)
         scenes, self._gain = draw_scenes(scene, estimate, members, rng)
         self._lacking = estimate.load_harmonics, amplitudes_of(estimate, members, rng)
         self._twins = TwinBatch(scenes, tol=tuning.TOLERANCE, start=start)

@@ -100,13 +100,13 @@ class _Comparison:
 
 
 def compare_under_uncertain_load(
-    measured_load: Load | None, unknowns: Unknowns, poses: Poses, period: float, seed: int = 0
+    measured_load: Load | None, unknowns: Unknowns, poses: Poses, period: float
 ) -> tuple[Compared | None, int]:
     """Return the comparison of the measured motion with motions under random load errors, and its work.
 
     Parameters
     ----------
-    felt : Load or None
+    measured_load : Load or None
         The measured load without samples that hardly move the head; None if it was not measured.
     unknowns : Unknowns
         The prior.
@@ -114,8 +114,6 @@ def compare_under_uncertain_load(
         The measured poses; theta may be missing.
     period : float
         Period of the load in s.
-    seed : int
-        Seed of the random numbers.
 
     Returns
     -------
@@ -124,7 +122,7 @@ def compare_under_uncertain_load(
     work : int
         Number of solver steps.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     motion_features = MotionFeatures(unknowns, poses, period)
     if measured_load is None:
         by = _without_load(motion_features, unknowns, poses, period)
@@ -142,7 +140,7 @@ def compare_under_uncertain_load(
             clearance, numbers, ln_error = _draw(spread, rng)
             other = _with_exponent(unknowns, rng)
             forward = Forward(other.scene, _with_error(by.load(clearance, numbers), math.exp(ln_error), rng))
-            q = motion_features.simulated(forward, other, clearance, numbers, 0.0, rng)
+            q = motion_features.simulated(forward, other, clearance, numbers, rng)
             work += forward.work
             if q is not None:
                 rows.append(by.features(q))

@@ -134,7 +134,7 @@ class _Simulation:
 
 
 def fit_some_components(
-    forward: Forward, unknowns: Unknowns, poses: Poses, period: float, drift: Array, seed: int = 0
+    forward: Forward, unknowns: Unknowns, poses: Poses, period: float, drift: Array
 ) -> tuple[Problem, Fit] | None:
     """Return a fit of poses in which one or two components were never measured; None if no motion is near the poses.
 
@@ -148,10 +148,8 @@ def fit_some_components(
         Period of the load in s.
     drift : ndarray, shape (3,)
         Spectral density of an unknown acceleration, in m2/s3 and rad2/s3, which links the swings.
-    seed : int
-        Seed of the random numbers.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     whole = _Simulation(forward, unknowns, poses, period)
     end = float(poses.t[0]) + tuning.FIRST_PERIODS * period
     noise = np.where(whole.measured, whole.noise, _like_measured(whole))

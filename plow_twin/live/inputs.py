@@ -185,7 +185,7 @@ class Inputs:
         for pair, gap in gaps.items():
             before_ns, before = self._newest_gaps.get(pair, (stamp_ns, gap))
             passed_s = (stamp_ns - before_ns) * 1e-9
-            if limits.exceeded((gap,)) or (passed_s > 0.0 and limits.too_fast((before,), (gap,), passed_s)):
+            if limits.exceeded((gap,)) or (passed_s > 0.0 and not limits.keep((before,), (gap,), passed_s)):
                 return True
         return False
 

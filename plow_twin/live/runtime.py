@@ -174,8 +174,7 @@ class Runtime:
     @property
     def follower(self) -> Follower | None:
         """The twin, or None if it does not follow measurements."""
-        recorder: Follower | None = cast(Any, self.driver.session.following)
-        return recorder
+        return cast("Follower | None", self.driver.session.following)
 
     @property
     def reads_at_once(self) -> bool:

@@ -49,7 +49,8 @@ class RosFront:
         self.topics: Mapping[str, str] = {topic.name: node.resolve_topic_name(topic.name) for topic in TOPICS}
         self.follows_samples: bool = node.get_parameter("use_sim_time").value
         self.sends_motion = True
-        self._changed = changed
+        #: updates the status, because the state of the stream may have changed
+        self.changed = changed
         #: lock that protects the twin; see `Turns`
         self.turns = Turns()
         self._lost: list[str] = []
@@ -133,10 +134,6 @@ class RosFront:
     def time_text(self, stamp_ns: int) -> str:
         """Return a stamp as text."""
         return time_text(stamp_ns)
-
-    def changed(self) -> None:
-        """Update the status, because the state of the stream may have changed."""
-        self._changed()
 
     def say_error(self, text: str) -> None:
         """Log an error."""

@@ -14,12 +14,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from plow_twin.errors import ArgumentError, LimitError, RunInterrupted
+from plow_twin.errors import ArgumentError
 from plow_twin.model import geometry
 from plow_twin.model.scene import Scene, check_travel_speed
 from plow_twin.run.advance import AdvanceBatch, check_times
 from plow_twin.run.lane_twins import LaneTwins
-from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, Pace, check_limits
+from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, Pace, check_limits, clear_sums, raise_stopped
 from plow_twin.run.twin import DEFAULT_BUDGET, read_snapshot
 from plow_twin.solve import loop
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scenes, inertias, options, start_many, wear_rate
@@ -408,11 +408,8 @@ class TwinBatch:
         except (OutOfTimeError, KeyboardInterrupt) as stop:
             self._stop(begun)
             self._states, self._before = before, after
-            late = isinstance(stop, OutOfTimeError)
-            reason = f"max_wall_s = {self._max_wall_s:g} reached" if late else "interrupted"
-            span = f"t = {self.time:.9g} s to {float(times[-1]):.9g} s"
-            message = f"{reason} in advances from {span} of {len(self)} twins"
-            raise (LimitError if late else RunInterrupted)(message, None, self.time) from None
+            progress = f"in advances from t = {self.time:.9g} s to {float(times[-1]):.9g} s of {len(self)} twins"
+            raise_stopped(stop, self._max_wall_s, progress, None, self.time)
         return rows
 
     def _reload(self) -> None:
@@ -437,8 +434,7 @@ class TwinBatch:
         wait(begun)
         for worker in self._workers:
             worker.pace.stopped = False
-            for name in ("peak", "impulse", "time_in_contact", "makes"):
-                worker.totals[name] = 0
+            clear_sums(worker.totals)
             if worker.lanes is not None:
                 worker.lanes.clear()
 
@@ -511,38 +507,31 @@ def _merge(compiled: Sequence[CompiledScene]) -> Terms:
     ArgumentError
         Terms that cannot be merged differ between members.
     """
-    first = compiled[0].parts.terms
-    merged = first
+    first = compiled[0]
+    merged = first.parts.terms
     for index, member in _kinds(compiled):
-        scene, terms = member.scene, member.parts.terms
-        for name in ("viscous", "integer", "fraction", "ramp"):
-            if getattr(terms, name) != getattr(first, name):
-                raise ArgumentError(
-                    f"scenes[{index}].contact: got law {scene.contact.law} with exponent "
-                    f"{scene.contact.exponent:g}, expected the terms of scenes[0]: {compiled[0].scene.contact.law} "
-                    f"with exponent {compiled[0].scene.contact.exponent:g}"
-                )
-        if terms.stick != first.stick:
-            raise ArgumentError(
-                f"scenes[{index}].friction: got {scene.friction}, expected friction with stick in all or in none: "
-                f"scenes[0] has {compiled[0].scene.friction}"
-            )
-        if scene.head.carries != compiled[0].scene.head.carries:
-            raise ArgumentError(
-                f"scenes[{index}].head.carries: got {scene.head.carries}, expected that of scenes[0]: "
-                f"{compiled[0].scene.head.carries}"
-            )
-        if options(scene) != options(compiled[0].scene):
-            raise ArgumentError(
-                f"scenes[{index}]: got {options(scene)}, expected a corner_radius_m and a restitution that falls "
-                f"in all or in none: scenes[0] has {options(compiled[0].scene)}"
-            )
-        if terms.support != first.support:
-            raise ArgumentError(
-                f"scenes[{index}].support: got {scene.support}, expected a support in all or in none: scenes[0] "
-                f"has {compiled[0].scene.support}"
-            )
+        for (own, path, got, expected), (common, _, in_first, _) in zip(_shared(member), _shared(first), strict=True):
+            if own != common:
+                raise ArgumentError(f"scenes[{index}]{path}: got {got}, expected {expected}: scenes[0] has {in_first}")
+        terms = member.parts.terms
         merged = merged._replace(**{name: 1 for name in _OPTIONAL if getattr(terms, name) is not None})
     if merged.wear is not None or merged.slip is not None:
         merged = merged._replace(rest=None)
     return merged
+
+
+def _shared(member: CompiledScene) -> tuple[tuple[object, str, object, str], ...]:
+    """Return the properties that all members must share.
+
+    Each property has a value to compare, its path in the scene, its value for a message, and the expected value.
+    """
+    terms, scene = member.parts.terms, member.scene
+    law = f"law {scene.contact.law} with exponent {scene.contact.exponent:g}"
+    carries, kind = scene.head.carries, options(scene)
+    return (
+        ((terms.viscous, terms.integer, terms.fraction, terms.ramp), ".contact", law, "the terms of scenes[0]"),
+        (terms.stick, ".friction", scene.friction, "friction with stick in all or in none"),
+        (carries, ".head.carries", carries, "the same in all"),
+        (kind, "", kind, "a corner_radius_m and a restitution that falls in all or in none"),
+        (terms.support, ".support", scene.support, "a support in all or in none"),
+    )

@@ -12,17 +12,17 @@ import time as _time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.errors import LimitError, RunInterrupted
 from plow_twin.kernel.linked import garbage_kept
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
 from plow_twin.run.lane_run import LaneRun
 from plow_twin.run.motion import BUDGET, Motion, run_events
-from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, check_limits
+from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, check_limits, raise_stopped
 from plow_twin.run.simulate import check_times, output_times
 from plow_twin.solve.compiled_scene import compile_scenes
 from plow_twin.solve.lanes.record import fits_lanes, new_lanes
@@ -139,10 +139,8 @@ def simulate_many(
         except (OutOfTimeError, KeyboardInterrupt) as stop:
             run.stopped.set()
             pool.shutdown(cancel_futures=True)
-            late = isinstance(stop, OutOfTimeError)
-            reason = f"max_wall_s = {max_wall_s:g} reached" if late else "interrupted"
-            message = f"{reason} after {run.done} of {len(scenes)} members"
-            raise (LimitError if late else RunInterrupted)(message, ensemble, 0.0) from None
+            progress = f"after {run.done} of {len(scenes)} members"
+            raise_stopped(stop, max_wall_s, progress, ensemble, 0.0)
     return ensemble
 
 
@@ -150,6 +148,14 @@ def simulate_many(
 _LEAST_SHARE = 64
 #: Number of shares per thread. With several shares, all threads end at about the same time.
 _SHARES = 4
+
+
+class _Scratch(threading.local):
+    """Scratch space of a thread."""
+
+    def __init__(self) -> None:
+        self.work, self.lanes = new_records(WORK, 1), new_lanes()
+        self.work[0] = new_work()
 
 
 class _Run:
@@ -168,7 +174,7 @@ class _Run:
         with garbage_kept():  # collection takes a third of the time, for no compiled scene is garbage
             self._params, self._compiled = compile_scenes(scenes, tol)
         self._t_end, self._ensemble, self._on_progress, self._max_steps = t_end, ensemble, on_progress, max_steps
-        self._end, self._local, self._lock = end, threading.local(), threading.Lock()
+        self._end, self._scratch, self._lock = end, _Scratch(), threading.Lock()
         self.stopped, self.done = threading.Event(), 0
 
     def tasks(self, threads: int) -> tuple[list[Callable[[], None]], list[Callable[[], None]]]:
@@ -179,7 +185,7 @@ class _Run:
             if fits_lanes(compiled_scene):
                 groups.setdefault((compiled_scene.parts.terms, int(self._params["order"][index])), []).append(index)
             else:
-                alone.append(lambda index=index: self._run_alone(index))  # type: ignore[misc]
+                alone.append(partial(self._run_alone, index))
         shares: list[Callable[[], None]] = []
         members = sorted(index for group in groups.values() for index in group)
         if members:
@@ -190,21 +196,8 @@ class _Run:
                 size = max(_LEAST_SHARE, -(-len(group) // parts))
                 for start in range(0, len(group), size):
                     share = np.array(group[start : start + size])
-                    shares.append(lambda share=share: self._run_lanes(run, share))  # type: ignore[misc]
+                    shares.append(partial(self._run_lanes, run, share))
         return alone[:1], shares + alone[1:]
-
-    def _work(self) -> NDArray[np.void]:
-        if not hasattr(self._local, "work"):
-            self._local.work = new_records(WORK, 1)
-            self._local.work[0] = new_work()
-        work: NDArray[np.void] = self._local.work
-        return work
-
-    def _lanes(self) -> NDArray[np.void]:
-        if not hasattr(self._local, "lanes"):
-            self._local.lanes = new_lanes()
-        lanes: NDArray[np.void] = self._local.lanes
-        return lanes
 
     def _check_time(self, motion: Motion | None = None) -> None:
         if self.stopped.is_set() or _time.perf_counter() > self._end:
@@ -221,7 +214,7 @@ class _Run:
         waiting = share
         while len(waiting):
             self._check_time()
-            is_done = run.go_on(waiting, self._work(), self._lanes())
+            is_done = run.go_on(waiting, self._scratch.work, self._scratch.lanes)
             done, waiting = waiting[is_done], waiting[~is_done]
             self._store(done, run.totals[done], run.states[done], run.status[done])
             self._report_progress(len(done))
@@ -231,7 +224,7 @@ class _Run:
         compiled, ensemble = self._compiled[index], self._ensemble
         motion = Motion.start(compiled, ensemble.q[index], ensemble.v[index])
         status, _ = run_events(
-            compiled, motion, ensemble.t, self._t_end, first_of(self._work()), self._max_steps, self._check_time
+            compiled, motion, ensemble.t, self._t_end, first_of(self._scratch.work), self._max_steps, self._check_time
         )
         self._store(index, motion.totals, motion.state, status)
         self._report_progress(1)

@@ -41,7 +41,7 @@ class LaneTwins:
         self, params: NDArray[np.void], terms: Terms, members: range, work: NDArray[np.void], max_steps: int
     ) -> None:
         self._params, self._terms, self._work = params, terms, work
-        self._members, self._max_steps, self._order = members, max_steps, int(params["order"][members[0]])
+        self._max_steps, self._order = max_steps, int(params["order"][members[0]])
         count = -(-len(members) // WIDTH)
         self._blocks, self._noted = new_records(BLOCK, count), np.empty(count, np.int64)
         self._place, self._other = np.zeros(len(params), np.int64), np.zeros(len(params), np.int64)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time as _time
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
-from plow_twin.errors import ArgumentError
+from plow_twin.errors import ArgumentError, LimitError, RunInterrupted
 from plow_twin.solve.state import PACE, first_of, new_records
 
 #: Default wall-clock time in s after which a call ends with an error.
@@ -19,6 +20,19 @@ _SLICE, _SLICE_IMPLICIT = 2048, 64
 
 class OutOfTimeError(Exception):
     """The wall-clock time of a call has expired, or the call was stopped."""
+
+
+def raise_stopped(stop: BaseException, max_wall_s: float, progress: str, result: Any, time_s: float) -> NoReturn:
+    """Raise the error of a call that `OutOfTimeError` or Ctrl-C has stopped, with the result up to the stop."""
+    if isinstance(stop, OutOfTimeError):
+        raise LimitError(f"max_wall_s = {max_wall_s:g} reached {progress}", result, time_s) from None
+    raise RunInterrupted(f"interrupted {progress}", result, time_s) from None
+
+
+def clear_sums(totals: NDArray[np.void]) -> None:
+    """Set the sums since the previous advance to zero."""
+    for name in ("peak", "impulse", "time_in_contact", "makes"):
+        totals[name] = 0
 
 
 class Pace:

@@ -12,13 +12,13 @@ from typing import Any, Literal, NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from plow_twin.errors import ArgumentError, LimitError, RunInterrupted
+from plow_twin.errors import ArgumentError
 from plow_twin.kernel.compiler import for_arguments
 from plow_twin.model import geometry
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Initial, Scene, check_travel_speed
 from plow_twin.run.advance import Advance, AdvanceSeries, check_times
-from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, Pace, check_limits
+from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, Pace, check_limits, clear_sums, raise_stopped
 from plow_twin.solve import loop
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, options, wear_rate
 from plow_twin.solve.method.rest import AT_REST
@@ -256,8 +256,7 @@ class Twin:
         """
         sampled, count, with_rows = self.excitation == "sampled", len(t), rows is not None
         t, wrench = np.ascontiguousarray(t, np.float64), np.ascontiguousarray(wrench, np.float64)
-        if not (count == 1 and self._time.item() <= t.item() < math.inf):
-            check_times(self.time, t)
+        check_times(self.time, t)
         per_inertia = None
         if sampled:
             per_inertia = self._one_load if count == 1 else np.empty((1, count + 1, 3))
@@ -375,8 +374,7 @@ class Twin:
         """
         self._states[0], self._wrench, speed = read_snapshot(data, self._states.dtype)
         self._set_wear_rate(speed)
-        if self._state.step_size >= 0.0:
-            loop.lay_out_again(self._compiled.params, self._parts, self._state, self._work)
+        self._lay_out_again()
 
     def digest(self) -> str:
         """Return a hash of the exact state, as 16 hexadecimal digits."""
@@ -466,19 +464,20 @@ class Twin:
         if samples is not None and done > 0:
             self._wrench = samples[done - 1].copy()
         part = None if rows is None else AdvanceSeries(rows[:done])
-        late = isinstance(stop, OutOfTimeError)
-        reason = f"max_wall_s = {self._max_wall_s:g} reached" if late else "interrupted"
-        message = f"{reason} at t = {self.time:.9g} s after {done} of {count} advances, {steps} steps in all"
-        raise (LimitError if late else RunInterrupted)(message, part, self.time) from None
+        progress = f"at t = {self.time:.9g} s after {done} of {count} advances, {steps} steps in all"
+        raise_stopped(stop, self._max_wall_s, progress, part, self.time)
 
     def _go_back(self) -> None:
         if self._pace.record.underway == 0:
             return
         self._states[0] = self._pace.saved[0]
+        self._lay_out_again()
+        clear_sums(self._all_totals)
+
+    def _lay_out_again(self) -> None:
+        """Compute the series of the step in which the restored state is, if it is in a step."""
         if self._state.step_size >= 0.0:
             loop.lay_out_again(self._compiled.params, self._parts, self._state, self._work)
-        for name in ("peak", "impulse", "time_in_contact", "makes"):
-            self._all_totals[name] = 0
 
     def _end_step(self) -> None:
         loop.interrupt_step(self._compiled.params, self._parts, self._state, self._work, self._totals)

@@ -22,7 +22,7 @@ receives the additional impulse C dd. At all other changes of contact mode the f
 from __future__ import annotations
 
 import math
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 
@@ -85,7 +85,6 @@ ALONG: Final = np.dtype(
         ("waiting", "i8"),  # number of successive times at which a new stretch could not begin
     ]
 )
-Along: TypeAlias = np.record
 
 _OK, _RANGE, _NON_FINITE, _BUDGET = (
     int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE), int(Status.BUDGET),

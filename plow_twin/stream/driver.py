@@ -296,8 +296,7 @@ class Driver:
         self.failed.end()
         self.session.apply(journal.Restore(stamp_ns, snapshot.data))
         self._restart_stream()
-        self.intake.restart()
-        self.clock.restart()
+        self._restart_stamps()
 
     def set_model(self, stamp_ns: int, changes: Mapping[str, float]) -> None:
         """Continue with changed numbers of the scene; a number without a key in `changes` is that of the scene file.
@@ -322,8 +321,7 @@ class Driver:
         self.failed.end()
         self.session.apply(journal.SetWear(stamp_ns, depth, reason))
         self._restart_stream()
-        self.intake.restart()
-        self.clock.restart()
+        self._restart_stamps()
 
     def unsteady(self, now_ns: int) -> bool:
         """Return whether stamps have jumped repeatedly, so that resets were refused or many stamps were stray."""
@@ -333,8 +331,7 @@ class Driver:
     def reset(self, stamp_ns: int, reason: str) -> None:
         """Reset the motion to its initial state without a change of the wear; the next stamp is the new time origin."""
         self._restart_model(stamp_ns, reason, None)
-        self.intake.restart()
-        self.clock.restart()
+        self._restart_stamps()
 
     def resume(self, now_ns: int) -> None:
         """Continue after a pause of the node; a silence is measured from `now_ns`."""
@@ -383,6 +380,10 @@ class Driver:
         self.newest_ns = self._counted_ns = None
         self.silences.restart()
         self.state = StreamState.WAITING
+
+    def _restart_stamps(self) -> None:
+        self.intake.restart()
+        self.clock.restart()
 
     def _use(self, run: list[journal.Sample], now_ns: int) -> Iterator[Published]:
         samples = run.copy()
@@ -437,8 +438,7 @@ class Driver:
     def _restart_after_failures(self) -> None:
         if self.failed.wants_restart(self.policy.failure_limit):
             self._restart_model(self.session.stamp_ns or 0, self.failed.restarted(), None)
-            self.intake.restart()
-            self.clock.restart()
+            self._restart_stamps()
 
 
 def counters(driver: Driver) -> dict[str, int]:
