@@ -229,6 +229,18 @@ def test_a_hard_motion_unlike_the_model_is_rough() -> None:
     assert result.horizontal.deviation > 2.0 * tuning.UNEXPLAINED_HARD
 
 
+@pytest.mark.parametrize(("deviation", "horizontal"), [(1e-4, State.ESTIMATED), (5e-4, State.NOT_OBSERVABLE)])
+def test_a_clearance_whose_walls_do_not_limit_the_motion_is_not_observable(deviation: float, horizontal: State) -> None:
+    """The other clearance is not observable either if it is rough."""
+    poses = Poses.of(np.arange(100) * 0.01, 1e-3 * np.random.default_rng(1).standard_normal((100, 3)))[0]
+    found = (-7.0, 1.0), (0.0, 1.0), np.ones(3), 1.0, 1.0, 0.0, -np.inf
+    two = np.full(2, 0.02), np.full(2, deviation)
+    bounced = Bounced(*two, np.zeros(3), np.zeros(3), *found, follows=np.array([0.9, 0.4]))
+    result = summarise_bounced(Unknowns(preset("paper")), poses, bounced, 0, 0)
+    assert (result.horizontal_state, result.vertical_state) == (horizontal, State.NOT_OBSERVABLE)
+    assert result.reasons[-1] == "vertical clearance not observable: the reach follows 40% of a clearance, expected 50%"
+
+
 def test_a_clearance_at_its_bound_is_not_observable() -> None:
     rng = np.random.default_rng(1)
     poses = Poses.of(np.arange(100) * 0.01, 1e-3 * rng.standard_normal((100, 3)))[0]

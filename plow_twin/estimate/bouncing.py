@@ -43,6 +43,7 @@ from plow_twin.estimate.unknowns import (
     with_other_law,
 )
 from plow_twin.model import geometry
+from plow_twin.solve.lanes.record import WIDTH
 
 Array = NDArray[np.float64]
 
@@ -116,6 +117,9 @@ class Bounced:
     rounded : ndarray, shape (2,)
         Distance in m by which the clearances are overestimated if the frame's corners have the radius
         `priors.ROUNDING`. It is zero if the scene states the radius or the deviations of the sides.
+    follows : ndarray, shape (2,)
+        Change of the reach if the walls are farther apart, relative to the change of the clearance. It is near 0 for
+        walls that the head does not touch.
     """
 
     clearance: Array
@@ -131,6 +135,7 @@ class Bounced:
     odds: float
     unseen: Array = field(default_factory=lambda: np.zeros(2))
     rounded: Array = field(default_factory=lambda: np.zeros(2))
+    follows: Array = field(default_factory=lambda: np.ones(2))
 
 
 def bounces(unknowns: Unknowns, poses: Poses) -> bool:
@@ -284,7 +289,20 @@ def compare(
         # near an earlier estimate the odds are not tested, because their limit was tuned for searches without one
         odds if near is None else -math.inf,
         *hidden_by_geometry(unknowns, poses, period, measured[:2]),
+        _follows(drawn, centre, delay, measured[:2], seed),
     )
+
+
+def _follows(drawn: _Drawn, centre: Array, delay: float, reach: Array, seed: int) -> Array:
+    """Return `Bounced.follows`, from motions between walls that are farther apart than the measured motion shows."""
+    shares = np.ones(2)
+    for axis, farther in enumerate(np.diag([tuning.FARTHER, tuning.FARTHER])):
+        others = _Drawn(drawn.forward, drawn.unknowns, drawn.motion_features, drawn.spread, np.random.default_rng(seed))
+        others.add(WIDTH, centre + farther, 0.0, delay, 0)
+        if others.features:
+            moved = np.array(others.features)[:, axis].mean() - reach[axis]
+            shares[axis] = float(moved) / tuning.FARTHER
+    return shares
 
 
 def by_range(unknowns: Unknowns, poses: Poses) -> Bounced:

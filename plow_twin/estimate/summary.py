@@ -85,13 +85,17 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     for index in (GX, GY):
         # only a predicted motion tests a clearance; hard contacts are exempt, because their bounces are unpredictable
         tested = share[index] > tuning.PREDICTED or unknowns.penetration_of(float(shared[SOFTNESS])) < tuning.HARD
-        if not tested and finished and not suspect:
-            reasons.append(
-                f"{'horizontal' if index == GX else 'vertical'} clearance not observable: {share[index]:.0%} of "
-                f"{COMPONENTS[index]} is predicted, expected {tuning.PREDICTED:.0%} or more"
-            )
+        most = 2.0 * tuning.OBSERVED if rough else tuning.OBSERVED
         observed = tested and seconds[index] > tuning.TOUCHED and shared[index] > LEAST_CLEARANCE
-        observed &= deviation[index] < (2.0 * tuning.OBSERVED if rough else tuning.OBSERVED) and (finished or rough)
+        observed &= deviation[index] < most and (finished or rough)
+        if not observed and (finished or rough) and (rough or not suspect):
+            why = f"deviation of {deviation[index]:.2g} m, expected less than {most:g} m"
+            if not tested:
+                predictable = f"{share[index]:.0%} of {COMPONENTS[index]} is predicted"
+                why = f"{predictable}, expected {tuning.PREDICTED:.0%} or more"
+            elif seconds[index] <= tuning.TOUCHED:
+                why = f"a wall is touched for {seconds[index]:.2g} s, expected more than {tuning.TOUCHED:g} s"
+            reasons.append(_not_observable(index, why))
         apparent.append(Interval.normal(shared[index], deviation[index]))
         value = Interval.of_halves(published[index], *spread[:, index])
         if not observed:
@@ -338,6 +342,10 @@ def _unobserved(unknowns: Unknowns, deviation: Array, index: int, reach: float, 
     return Interval.normal(nominal, spread).above(reach - 3.0 * float(np.hypot(noise[index], 1e-4)))
 
 
+def _not_observable(index: int, why: str) -> str:
+    return f"{'horizontal' if index == GX else 'vertical'} clearance not observable: {why}"
+
+
 def state_of(withdrawn: bool, observed: bool, rough: bool = False) -> State:
     """Return the state of a clearance."""
     if withdrawn:
@@ -369,7 +377,7 @@ def summarise_bounced(
     if bounced.odds > tuning.MOST_ODDS[0]:
         odds = f"ln odds {bounced.odds:.1f}, expected at most {tuning.MOST_ODDS[0]:g}"
         model.append(f"motion likely under another contact law: {odds}")
-    reasons = sensor or model
+    reasons = list(sensor or model)
     beyond = max(1.0, *(value / most for _, value, most in distances)) if model else 0.0
     apparent, clearances, states = [], [], []
     for index in (GX, GY):
@@ -381,8 +389,16 @@ def summarise_bounced(
         lowest = math.hypot(value.mean - value.p05, _HALF_NORMAL_P95 * bounced.rounded[index])
         value = replace(value, p05=value.mean - lowest)
         observed = deviation < 2.0 * tuning.OBSERVED and bounced.clearance[index] > LEAST_CLEARANCE
-        observed &= bool(touched[index] > 0.0)
+        observed &= bool(touched[index] > 0.0 and bounced.follows[index] > tuning.FOLLOWS)
+        # walls that are not touched make the other clearance uncertain too
+        observed &= not rough or bool(bounced.follows.min() > tuning.FOLLOWS)
         if not observed:
+            why = f"deviation of {deviation:.2g} m, expected less than {2.0 * tuning.OBSERVED:g} m"
+            if touched[index] <= 0.0:
+                why = "a wall is never touched"
+            elif bounced.follows.min() <= tuning.FOLLOWS:
+                why = f"the reach follows {bounced.follows.min():.0%} of a clearance, expected {tuning.FOLLOWS:.0%}"
+            reasons.append(_not_observable(index, why))
             value = _unobserved(unknowns, np.zeros(2), index, 0.0, bounced.noise)
         clearances.append(value.above(0.0))
         states.append(state_of(bool(sensor), observed, rough))

@@ -49,6 +49,19 @@ OBSERVED: Annotated[
         "for a group of pads, and the smallest reported change within a window, are half of it",
     ),
 ] = 1e-3
+FARTHER: Annotated[
+    float,
+    Tuned("m", "increase of a clearance from a comparison of motions at which the reach is tested"),
+] = 3e-3
+FOLLOWS: Annotated[
+    float,
+    Tuned(
+        "1",
+        "smallest change of the reach, relative to that of the clearance, for a clearance that is observed",
+        "ten clearances that were 2.6 to 15 mm off: at most 0.40; 11 of 12 of `hard`, `firm`, `middle` and "
+        "`hard_sensor`, seeds 60200 to 60204: at least 0.84",
+    ),
+] = 0.5
 BOUNCED_MOST: Annotated[
     float,
     Tuned(
