@@ -248,4 +248,4 @@ class Intake:
     def _too_fast(self, stamp_ns: int, values: Sequence[float]) -> bool:
         if self.limits is None or self._newest_ns is None:
             return False
-        return not self.limits.keep(self._newest_values, values, (stamp_ns - self._newest_ns) * 1e-9)
+        return self.limits.too_fast(self._newest_values, values, (stamp_ns - self._newest_ns) * 1e-9)
