@@ -222,7 +222,9 @@ def test_twins_have_the_friction_that_an_estimate_finds(truth: Truth) -> None:
     assert restored.digest() == follower.digest()
     # kernels with friction are compiled only for a friction that is more probable than not
     improbable = replace(estimate, differs={"friction.coefficient": (0.4, 0.1, 0.02)})
-    members = Ensemble(truth.nominal, improbable, FEWEST, np.random.default_rng(0), 0.0, TOLERANCE, np.zeros(PAIR_COUNT))
+    members = Ensemble(
+        truth.nominal, improbable, FEWEST, np.random.default_rng(0), 0.0, TOLERANCE, np.zeros(PAIR_COUNT)
+    )
     assert members.first.scene.friction is None
     assert not rubs(replace(truth.nominal, wear=Wear(1e-14, pad_area_m2=0.02, travel_speed_m_s=0.5)), estimate)
 
