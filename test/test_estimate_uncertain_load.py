@@ -56,6 +56,14 @@ def test_rare_samples_are_averages_of_unknown_amplitude() -> None:
     assert smooth.gain_deviations()[:2] == pytest.approx(tuning.COARSE_GAIN, rel=0.1)
 
 
+@pytest.mark.stress
+def test_averages_taken_for_samples_are_no_shift_of_the_sensor() -> None:
+    truth = mismatched(KINDS["averages_1hz"], 99003)
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert result.horizontal_state is result.vertical_state is State.ROUGH and "taken as averages" in result.reasons[0]
+    assert _holds(result, truth.clearance)
+
+
 def test_without_an_angle_the_range_of_motion_gives_the_clearance() -> None:
     truth, _ = known()[0]
     q = truth.poses.q.copy()

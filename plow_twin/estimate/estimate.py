@@ -185,7 +185,8 @@ def _known(result: Estimate) -> bool:
 
 
 def _unexplained(result: Estimate) -> bool:
-    return result.model == "suspect" and not _known(result)
+    # averages taken for samples can resemble a shift of the sensor
+    return "suspect" in (result.model, result.sensor) and not _known(result)
 
 
 def _from_motion(
