@@ -185,18 +185,18 @@ def _next_mode(p, mode, viscous, fraction, ramp):
 
 @kernel()
 def _stays(column, order, h) -> bool:
-    """Return whether a guard that begins positive stays positive on [0, h], by the bound of `_unsafe_pairs`."""
+    """Return whether a guard function stays positive on [0, h] by the lower bound of `_unsafe_pairs`."""
     reach = 0.0
     for k in range(order, 1, -1):
         reach = (reach + max(-column[k], 0.0)) * h
-    return column[0] + column[1] * h >= reach * h
+    return column[0] >= 0.0 and column[0] + column[1] * h >= reach * h
 
 
 @kernel()
 def _sooner(state, w, order, best) -> float:
     """Return the sigma at which the guard function in `w.column[0]` first becomes negative, at most `best`."""
     column = w.column[0]
-    if column[0] >= 0.0 and _stays(column, order, best):
+    if _stays(column, order, best):
         return best
     state.guard_roots += 1
     return min(best, first_root(column, order, best, w))

@@ -88,9 +88,9 @@ def _normal_force(p, state, pair, depth):
 @kernel()
 def _normal_rounding(p, state, pair):
     """Return the rounding error in N of a corner's normal force, which follows from that of its penetration."""
-    depth, rate = max(penetration_of(p, state, pair, state.y), 0.0), rate_of(p, pair, state.y)
-    more = law_force(p, state, pair, depth + _FINEST * p.leverage, rate)
-    return abs(more - law_force(p, state, pair, depth, rate))
+    depth = max(penetration_of(p, state, pair, state.y), 0.0)
+    more = _normal_force(p, state, pair, depth + _FINEST * p.leverage)
+    return abs(more - _normal_force(p, state, pair, depth))
 
 
 @kernel()
