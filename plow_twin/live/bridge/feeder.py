@@ -244,20 +244,22 @@ class Feeder:
         self._runtime.inputs.senders.alive([self._name])
 
     def _measured(self, name: str, role: Role, arrived: Arrived) -> None:
-        values, intake, inputs = role.read(arrived), self._optional[name], self._runtime.inputs
+        signal, intake, inputs = role.read(arrived), self._optional[name], self._runtime.inputs
         inputs.arriving = (name, arrived.topic.encode())
-        if values is None:
+        if signal is None:
             intake.refuse(Verdict.MALFORMED)
-        elif arrived.retained and name != "travel":
+            return
+        stamp_ns, values = signal
+        if arrived.retained and name != "travel":
             # a retained message is old: its speed is still valid, but its pose or gap is not
-            intake.refuse(Verdict.INACTIVE, values[0], tuple(values[1].values()))
-        elif not role.plausible(values[1]):
-            intake.refuse(Verdict.IMPLAUSIBLE, values[0], tuple(values[1].values()))
+            intake.refuse(Verdict.INACTIVE, stamp_ns, tuple(values.values()))
+        elif not role.plausible(values):
+            intake.refuse(Verdict.IMPLAUSIBLE, stamp_ns, tuple(values.values()))
         elif name == "travel":
-            self._runtime.add_travel(values[0], values[1]["speed"])
+            self._runtime.add_travel(stamp_ns, values["speed"])
         elif name == "gaps":
-            gaps = {PAIR_NAMES.index(pair): gap for pair, gap in values[1].items() if not math.isnan(gap)}
-            self._runtime.add_gaps(values[0], gaps)
+            gaps = {PAIR_NAMES.index(pair): gap for pair, gap in values.items() if not math.isnan(gap)}
+            self._runtime.add_gaps(stamp_ns, gaps)
         else:
-            x, y, theta = (values[1].get(name, math.nan) for name in ROLES["head_pose"])
-            self._runtime.add_pose(values[0], (x, y, theta))
+            x, y, theta = (values.get(component, math.nan) for component in ROLES["head_pose"])
+            self._runtime.add_pose(stamp_ns, (x, y, theta))
