@@ -97,8 +97,11 @@ def overdamped(law: str, damping: float) -> Contact:
     )  # fmt: skip
 
 
-def assert_within_the_gate(scene: Scene, tolerances: tuple[float, ...]) -> None:
-    """Check that errors are within ten tolerances of a more accurate run, and that the number of steps is limited."""
+def assert_within_the_gate(scene: Scene, tolerances: tuple[float, ...], inaccurate: tuple[float, ...] = ()) -> None:
+    """Check that errors are within ten tolerances of a more accurate run, and that the number of steps is limited.
+
+    At the tolerances in `inaccurate`, only the number of steps is checked.
+    """
     run = balanced if scene.contact.law == "kelvin_voigt" else simulate
     exact = run(scene, 2.0, output_dt=0.01, tol=1e-12)
     growth = 0.0
@@ -111,7 +114,7 @@ def assert_within_the_gate(scene: Scene, tolerances: tuple[float, ...]) -> None:
         result = run(scene, 2.0, output_dt=0.01, tol=tol)
         assert result.solver["steps"] <= (15_000 if tol >= 1e-8 else 30_000), tol
         # if displacements grow by more than this factor, no method can keep the tolerance
-        if growth < 1e3:
+        if growth < 1e3 and tol not in inaccurate:
             assert pose_error(shown, result.q, exact.q) <= 10.0 * tol, (tol, growth)
 
 
@@ -152,8 +155,8 @@ def test_every_law_meets_the_tolerance_in_bounded_work(start: Scene, law: str, d
     scene = replace(start, contact=overdamped(law, damping))
     tolerances = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
     # the exception on the page of the solver
-    sensitive = law == "hunt_crossley" and damping >= 1e8
-    assert_within_the_gate(scene, tolerances[4:] if sensitive else tolerances)
+    sensitive = start is THROWN and law == "hunt_crossley" and damping >= 1e8
+    assert_within_the_gate(scene, tolerances, inaccurate=(1e-4, 1e-5) if sensitive else ())
 
 
 @pytest.mark.parametrize("damping", [10.0**k for k in range(10, 14)])
