@@ -24,6 +24,8 @@ from work_precision import OURS_BARE, OURS_CALL
 RESULTS = ROOT / "benchmark" / "results"
 #: File with the name of the machine of the newest complete run, which the pages quote.
 NEWEST = RESULTS / "newest.txt"
+#: Processors by the beginning of a machine's name, which contains vendor, brand, family and model.
+_PROCESSORS = {"amd_epyc_f26m": "an AMD EPYC (Zen 5)", "intel_r_xeon_r_processor_f6m207": "an Intel Xeon with AVX-512"}
 _PEERS = (
     "CVODE from C", "CVODE from C, rootfinding", "heyoka", "best of SciPy and scikit-sundae", "lean jitted RK4",
 )  # fmt: skip
@@ -32,6 +34,13 @@ _PEERS = (
 def solver_rows() -> list[Row]:
     """Return the rows of the newest complete run of `make bench`."""
     return read_rows(RESULTS / f"{NEWEST.read_text(encoding='utf-8').strip()}.csv")
+
+
+def machine() -> str:
+    """Return a sentence with the processor of the newest complete run, and the file with its tables."""
+    name = NEWEST.read_text(encoding="utf-8").strip()
+    processor = next((text for prefix, text in _PROCESSORS.items() if name.startswith(prefix)), f"the machine `{name}`")
+    return f"The figures before it were measured on {processor}. `benchmark/results/{name}.md` contains all tables."
 
 
 def speed() -> str:
@@ -187,7 +196,7 @@ def _in_unit(row: dict[str, str], key: str) -> str:
 
 
 FIGURES: dict[str, Callable[[], str]] = {
-    "speed": speed, "located": located, "work": work, "missed": missed,
+    "machine": machine, "speed": speed, "located": located, "work": work, "missed": missed,
     "random_scenes": random_scenes, "siconos": siconos, "lives": life_table, "lives_sum": life_sum,
     "month": month_table, "follow": follow_table, "follow_sum": follow_sum,
     **estimate_pages.FIGURES, **measured_pages.FIGURES,
