@@ -103,6 +103,33 @@ def test_errors_that_a_function_raises_are_documented(package: griffe.Module) ->
     assert undescribed == []
 
 
+def test_every_described_parameter_exists() -> None:
+    """A section `Parameters` names only arguments of its function, or of the constructor of its class."""
+    mistakes = []
+    for path in (ROOT / "plow_twin").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            section = re.search(
+                r"^Parameters\n-+\n(.*?)(?:^\w+\n-+\n|\Z)",
+                (ast.get_docstring(node) or "") if isinstance(node, DOCUMENTED) else "",
+                re.MULTILINE | re.DOTALL,
+            )
+            if section is None:
+                continue
+            lines = re.findall(r"^(\S.*?)(?: : .*)?$", section[1], re.MULTILINE)
+            names = {name.strip().lstrip("*") for line in lines for name in line.split(",")}
+            mistakes += [f"{path.name}: {name}" for name in sorted(names - arguments(node))]
+    assert mistakes == []
+
+
+def arguments(node: ast.AST) -> set[str]:
+    """Return the names of the arguments of a function, or of the constructor and the fields of a class."""
+    functions = [node, *(part for part in getattr(node, "body", ()) if getattr(part, "name", "") == "__init__")]
+    found = {argument.arg for function in functions for argument in ast.walk(getattr(function, "args", ast.Pass()))
+             if isinstance(argument, ast.arg)}  # fmt: skip
+    fields = [part.target for part in getattr(node, "body", ()) if isinstance(part, ast.AnnAssign)]
+    return found | {field.id for field in fields if isinstance(field, ast.Name)}
+
+
 def test_no_docstring_begins_with_an_empty_word() -> None:
     """A docstring begins with a verb or the name of its subject, for example `Return whether`, not `Tell whether`."""
     mistakes = []

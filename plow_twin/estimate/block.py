@@ -98,7 +98,7 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, prior_estimate: Estim
         The measured load.
     poses : Poses
         The poses, measured in the axes of the guide.
-    known : Estimate
+    prior_estimate : Estimate
         The prior, in the form of an estimate.
     """
     whole = np.isfinite(poses.q).all(axis=1) & np.append(np.diff(poses.t) > 0.0, True)[: len(poses.t)]

@@ -81,8 +81,7 @@ def estimate(
     Parameters
     ----------
     scene : Scene
-        The nominal scene. Its geometry, masses and gravity are assumed to be exact; its clearances and contact
-        parameters are the means of the prior.
+        The nominal scene. Its gravity is assumed to be exact. All other numbers are the means of their priors.
     load : Load
         The measured load.
     poses : Poses

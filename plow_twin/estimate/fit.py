@@ -604,7 +604,7 @@ def whole_step(
 
     Parameters
     ----------
-    problem, found : Problem, Fit
+    problem, result : Problem, Fit
         The fit at which the problem is linearised.
     columns : ndarray, shape (n, 3, k)
         Derivatives of the prediction with respect to the k further unknowns.

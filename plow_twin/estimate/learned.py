@@ -82,7 +82,7 @@ class Learner:
     ----------
     drawn : ndarray, shape (m, 10)
         Parameters of the members as drawn from an estimate; the first row belongs to the median twin.
-    learned : ndarray of int, shape (k,)
+    open_columns : ndarray of int, shape (k,)
         Indices of the learned parameters.
     time : float
         Time of the estimate in s.
@@ -130,7 +130,7 @@ class Learner:
         ----------
         numbers : ndarray, shape (m, 10)
             Parameters of the members.
-        seen : ndarray, shape (m, c)
+        measured_change : ndarray, shape (m, c)
             Predictions of the members, minus their mean.
         off : ndarray, shape (c,)
             The pose minus the mean prediction.

@@ -64,7 +64,7 @@ class Ensemble:
     ----------
     scene : Scene
         The nominal scene.
-    known : Estimate
+    estimate : Estimate
         The prior with the clearances of unworn pads, or an estimate with the present clearances.
     members : int
         Number of twins.

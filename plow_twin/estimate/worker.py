@@ -95,7 +95,7 @@ class Worker:
         The nominal scene.
     windows : Windows
         The empty object that forms the windows in the process.
-    asked : Requests
+    requests : Requests
         The answers that are requested in addition to the estimate.
     """
 
