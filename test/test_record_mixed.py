@@ -324,7 +324,8 @@ def _mixed(folder: Path, seed: int, **more: Any) -> None:
     assert not any(frame.rows["force"].max() > 1e12 for frame in live.front.frames)
 
 
-@pytest.mark.parametrize("seed", [*range(20), 2002])  # with seed 2002, a step ends just after a sample
+# with seed 2002, a step ends just after a sample; with seed 4781, the motion restarts because late samples fail
+@pytest.mark.parametrize("seed", [*range(20), 2002, 4781])
 def test_a_replay_gives_the_messages_of_any_mix(seed: int, tmp_path: Path) -> None:
     _mixed(tmp_path, seed)
 

@@ -129,9 +129,7 @@ class Driver:
                 self.intake.accept(stamp_ns, wrench)
                 self.newest_ns, self._received_ns, self._zeroed = stamp_ns, now_ns, False
                 self.silences.add_one(stamp_ns)
-                published = self._apply([journal.Sample(stamp_ns, wrench)], now_ns)
-                if len(published.rows):
-                    yield published
+                yield from self._apply([journal.Sample(stamp_ns, wrench)], now_ns)
                 continue
             for settled in self._steps.settle(stamp_ns, wrench, now_ns, self.session.stamp_ns):
                 yield from self._use_samples(run, *settled[:2], now_ns)
@@ -389,14 +387,12 @@ class Driver:
         samples = run.copy()
         run.clear()
         for part in self.session.parts(samples, each=self.every_sample):
-            published = self._apply(part, now_ns)
-            if len(published.rows):
-                yield published
+            yield from self._apply(part, now_ns)
         if self.newest_ns is None:
             # after a reset, a silence is measured from the stamp that the model has reached
             self.newest_ns = self.session.stamp_ns
 
-    def _apply(self, samples: Sequence[journal.Sample], now_ns: int) -> Published:
+    def _apply(self, samples: Sequence[journal.Sample], now_ns: int) -> Iterator[Published]:
         applied = self.session.apply_samples(samples, each=self.every_sample)
         self.rolled_back += applied.late
         self._advanced(now_ns)
@@ -405,7 +401,10 @@ class Driver:
         else:
             self.failed.end()
             self.state = StreamState.RUNNING
-        return applied.published
+        if len(applied.published.rows):
+            yield applied.published
+        # a restart is journalled after the publication, because a replay publishes nothing of the motion before it
+        self._restart_after_failures()
 
     def _advance(self, entry: journal.Hold | journal.Unload, now_ns: int, state: StreamState) -> Published:
         rows = self.session.apply(entry)
@@ -425,7 +424,6 @@ class Driver:
         stamps = (self.session.origin_ns or 0) + np.rint(rows["t"] * NS_PER_S).astype(np.int64)
         for status, stamp_ns in zip(rows["status"].tolist(), stamps.tolist(), strict=True):
             self._judge_advance(status, stamp_ns, StreamState.RUNNING)
-        self._restart_after_failures()
 
     def _judge_advance(self, status: int, stamp_ns: int, state: StreamState) -> None:
         if status:
