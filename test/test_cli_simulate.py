@@ -88,7 +88,7 @@ def test_a_device_is_written_directly(tmp_path: Path) -> None:
     assert read.result() == other.read_text() and pipe.is_fifo() and (tmp_path / "link.csv").is_symlink()
 
 
-def test_npz_keeps_the_contract(tmp_path: Path) -> None:
+def test_npz_contains_exactly_the_documented_arrays(tmp_path: Path) -> None:
     done = plow_twin_here(*RUN, "--out", str(tmp_path / "run.npz"), "--quiet")
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     result = simulate(load_scene(scene_path("paper")), 2.0, 0.01)

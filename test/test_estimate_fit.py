@@ -41,7 +41,7 @@ def test_a_load_with_a_certain_component_limits_swings_by_the_other_components(m
 
 
 @pytest.mark.parametrize("swings", [1, 2, 9])
-def test_the_normal_equations_of_linked_swings_agree_with_dense_ones(swings: int) -> None:
+def test_the_normal_equations_of_linked_swings_agree_with_dense_equations(swings: int) -> None:
     rng = np.random.default_rng(swings)
     arrow, size = Arrow.empty(3, swings), 3 + 6 * swings
     dense = np.zeros((size, size))

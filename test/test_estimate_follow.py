@@ -179,7 +179,7 @@ def test_a_withdrawn_estimate_is_undone(truth: Truth) -> None:
     assert (np.ptp(follower.clearance(), axis=1) > 0.3 * before).all()
 
 
-def test_an_estimate_of_one_clearance_is_replaced_by_a_later_estimate_of_it(truth: Truth) -> None:
+def test_an_estimate_of_one_clearance_is_replaced_by_a_later_estimate_of_the_same_clearance(truth: Truth) -> None:
     follower, both = Follower(truth.nominal, MEMBERS), _known(truth)
     _run(follower, truth, 1.0)
     horizontal = replace(both, vertical_state=State.NOT_OBSERVABLE)

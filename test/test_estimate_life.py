@@ -122,7 +122,7 @@ def test_scenarios_are_separate_forecasts_from_the_same_draws() -> None:
     for text in ("no numbers:load", "a:speed=2", "b:load=0", ":load=2", "c:load=nan"):
         with pytest.raises(LifeError, match="scenario: got"):
             Scenario.parse(text)
-    with pytest.raises(LifeError, match="expected each once"):
+    with pytest.raises(LifeError, match="expected distinct names"):
         forecast(scene, replace(plan, scenarios=(dry, dry)))
 
 

@@ -35,7 +35,7 @@ def test_every_example_is_listed_and_has_a_short_readme() -> None:
             assert (folder / target).exists(), target
 
 
-def test_the_extras_named_for_the_examples_install_what_they_import() -> None:
+def test_the_extras_named_for_the_examples_install_the_imports_of_the_examples() -> None:
     extra_of = {"matplotlib": "study", "rosbags": "record", "rerun": "view"}
     named = re.search(r"pip install '\.\[([\w,]+)\]'", (ROOT / "examples" / "README.md").read_text())
     for script in (ROOT / "examples").glob("*/run.py"):

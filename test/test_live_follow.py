@@ -289,7 +289,7 @@ def _again(journal: Sequence[Entry], scene: Scene, at_once: int = 1) -> Session:
     return session
 
 
-def test_late_samples_and_poses_give_the_same_bits_as_ordered_ones(truth: Truth) -> None:
+def test_late_samples_and_poses_give_the_same_bits_as_ordered_measurements(truth: Truth) -> None:
     entries = [*_in_turn(truth, 0.0, 1.0), _known(truth), *_in_turn(truth, 1.0, 2.0)]
     ordered, late = Live(truth.nominal), Live(truth.nominal)
     ordered.take(entries)

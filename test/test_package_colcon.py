@@ -66,7 +66,7 @@ LINTERS = (
 
 
 @pytest.mark.parametrize("words", LINTERS, ids=[words[0] for words in LINTERS])
-def test_the_linters_of_ament_find_nothing_in_what_ros_sees(words: tuple[str, ...]) -> None:
+def test_the_linters_of_ament_find_nothing_in_the_files_that_ros_sees(words: tuple[str, ...]) -> None:
     if shutil.which(words[0]) is None:
         pytest.skip(f"{words[0]} is not installed")
     run(*words, cwd=ROOT)

@@ -330,7 +330,7 @@ def test_a_sample_that_is_not_finite_is_refused(tmp_path: Path) -> None:
 
 
 @given(st.lists(st.tuples(stamps, st.integers(0, 2**64 - 1)), max_size=5))
-def test_digests_are_read_many_at_a_time_as_one_by_one(given_digests: list[tuple[int, int]]) -> None:
+def test_many_digests_read_together_equal_digests_read_one_by_one(given_digests: list[tuple[int, int]]) -> None:
     messages = [to_message(Digest(stamp_ns, f"{digest:016x}"), "") for stamp_ns, digest in given_digests]
     data = [encode(message) for message in messages]
     lengths = np.array([len(part) for part in data], np.int64)
@@ -360,7 +360,7 @@ def test_a_string_has_the_bytes_that_rosbags_gives_it(text: str) -> None:
     assert encode(Text(text)) == bytes(types.serialize_cdr(types.types[Text.TYPE](text), Text.TYPE))
 
 
-def test_frames_of_lz4_are_read_as_its_library_reads_them() -> None:
+def test_lz4_frames_are_read_as_by_the_library_lz4() -> None:
     noise = np.random.default_rng(5).bytes(70_000)
     contents = (b"", b"x", bytes(range(256)) * 1000, noise, 3 * (noise[:9000] + bytes(90_000)))
     read_directly = 0

@@ -65,7 +65,7 @@ WRITER = """
 """
 
 
-def test_a_tail_ends_when_the_writer_is_killed(tmp_path: Path) -> None:
+def test_reading_a_recording_in_progress_ends_when_the_writer_is_killed(tmp_path: Path) -> None:
     command = [sys.executable, "-c", textwrap.dedent(WRITER), str(tmp_path / "run"), str(Path(__file__).parent)]
     with started(command) as process:
         reader = RunReader(find_run(tmp_path / "run", 60.0), Tail())

@@ -218,7 +218,7 @@ def test_late_samples_at_the_edge_of_the_memory_give_the_same_motion_in_any_orde
     assert all((results[0][name] == results[1][name]).all() for name in ("peak", "impulse"))
 
 
-def test_a_late_speed_at_the_edge_of_the_memory_acts_where_it_did(tmp_path: Path) -> None:
+def test_a_late_speed_at_the_edge_of_the_history_acts_in_a_replay_as_in_the_run(tmp_path: Path) -> None:
     """Whether a speed is too old must not depend on intermediate states, which a replay does not have."""
     live = Mixed(tmp_path, rollback_span=0.1)
     live.send(*map(_swinging, range(300)))

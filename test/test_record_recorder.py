@@ -542,7 +542,7 @@ def test_recorders_that_request_the_same_folder_get_separate_folders(
         assert isinstance(record, EntryRecord) and record.entry == paper_sample(index)
 
 
-def test_a_message_of_another_type_stops_the_recording_with_its_topic(tmp_path: Path) -> None:
+def test_a_message_of_another_type_stops_the_recording_and_its_topic_is_named(tmp_path: Path) -> None:
     from plow_twin.record.messages import Text
 
     recorder = Recorder(tmp_path / "run", HEADER)

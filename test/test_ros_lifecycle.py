@@ -212,7 +212,7 @@ def test_arguments_that_ros_cannot_read_are_reported_without_a_traceback(tmp_pat
     assert "Traceback" not in output and "/src/" not in output
 
 
-def test_a_parameter_file_with_integers_for_doubles_and_a_typing_error(tmp_path: Path) -> None:
+def test_a_parameter_file_may_have_integers_for_doubles_and_a_misspelt_name_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "twin.yaml"
     path.write_text(yaml.safe_dump({"/**": {"ros__parameters": {"excitation_timeout": 2, "hold_polcy": "zero"}}}))
     # YAML 1.1 reads 1e-8 as a text, so the parameter is a text

@@ -185,7 +185,7 @@ def test_bad_input_is_named_and_changes_nothing() -> None:
     with pytest.raises(ValueError, match="speed_m_s: got inf"):
         twins.set_travel_speed(np.inf)
     assert twins.digest() == before
-    with pytest.raises(ValueError, match="scenes: got none"):
+    with pytest.raises(ValueError, match="scenes: got no scene"):
         TwinBatch([])
     with pytest.raises(ValueError, match=r"scenes\[1\].contact: got law .* exponent 1.5, expected the terms of scenes"):
         TwinBatch([scenes[0], preset("bench_hc")])

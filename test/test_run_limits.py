@@ -215,7 +215,7 @@ print(json.dumps(told))
 """
 
 
-def test_slices_of_lanes_stay_bounded_through_many_short_ones() -> None:
+def test_slices_of_lanes_stay_bounded_after_many_short_slices() -> None:
     """A scene at rest leaves its lane repeatedly, so that more than thirty consecutive slices take almost no time."""
     scene = replace(preset("bench_kv"), loads=())
     results = simulate_many([scene], 1e6, 1e6, 1e-6, workers=1)

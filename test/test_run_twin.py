@@ -140,7 +140,7 @@ def test_after_a_failed_advance_the_twin_continues_from_its_last_good_state(wren
 
 @pytest.mark.stress  # this test compiles an additional kernel
 @pytest.mark.parametrize("depth", [0.2, 1.3])
-def test_a_failed_advance_leaves_no_trace_in_later_ones(depth: float) -> None:
+def test_a_failed_advance_leaves_no_trace_in_later_advances(depth: float) -> None:
     """The advance fails after the end of the ramp. The impact continues as if the advance had not been attempted."""
     ramp, idle = 1e-3, (0.0, 0.0, 0.0)
     contact = Contact("ramped_damping", 1e6, exponent=1.5, damping=2e3, ramp_m=ramp)

@@ -78,7 +78,7 @@ def test_presets_state_where_each_number_comes_from(name: str) -> None:
     assert all(mark.source for mark in scene.marks.values())
 
 
-def test_a_number_states_how_well_it_is_known() -> None:
+def test_a_number_can_state_its_standard_deviation() -> None:
     marked = "{horizontal_m: {value: 0.025, mark: assumed, deviation: 0.002}, vertical_m: {value: 0.03, mark: given}}"
     scene = loads_scene(MINIMAL.replace("{horizontal_m: 0.025, vertical_m: 0.030}", marked))
     assert scene.marks["clearance.horizontal_m"] == Provenance(Mark.ASSUMED, "", 0.002)
@@ -240,7 +240,7 @@ def test_a_table_is_read_as_any_other_csv_file(tmp_path: Path) -> None:
         np.testing.assert_array_equal(table.t, [0.0, 0.5])
         np.testing.assert_array_equal(table.wrench, [[1.5, 2.0, 3.0], [1.0, -2.25, 3.0]])
     (tmp_path / "load.csv").write_text("t;fx;fy;fx;m\n")
-    with pytest.raises(SceneError, match="expected a header line with t, fx, fy, m, each once"):
+    with pytest.raises(SceneError, match="expected a header line with t, fx, fy, m, each name once"):
         loads_scene(scene, tmp_path)
 
 

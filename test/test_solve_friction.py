@@ -43,7 +43,7 @@ def test_a_sliding_block_slows_down_as_the_law_says() -> None:
 
 
 @pytest.mark.parametrize("share", [0.5, -0.9])
-def test_a_push_below_the_limit_makes_it_creep(share: float) -> None:
+def test_a_push_below_the_limit_makes_the_block_creep(share: float) -> None:
     """In the steady state, mu N tanh(v / v_s) = F."""
     result = simulate(block(share * MU * MASS * G, 0.0), 1.0, output_dt=0.5)
     assert result.v[-1, 0] == pytest.approx(SPEED * math.atanh(share), rel=1e-9)

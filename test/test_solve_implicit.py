@@ -207,7 +207,7 @@ def test_a_symmetric_drop_stays_symmetric(damping: float) -> None:
     assert abs(result.q[:, [0, 2]]).max() < 1e-17 and len(result.events) >= 2
 
 
-def test_scenes_that_are_not_overdamped_do_not_compile_it() -> None:
+def test_scenes_that_are_not_overdamped_do_not_compile_implicit_steps() -> None:
     for scene in (preset("paper"), preset("bench_kv"), preset("bench_hc"), damped(1e6)):
         assert implicit_of(scene) is None
     assert implicit_of(damped(1e9)) is not None

@@ -96,7 +96,7 @@ def test_a_method_has_the_signatures_of_the_contract(method: Any) -> None:
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_a_method_lays_out_a_step_or_leaves_the_state_to_the_next_one(name: str) -> None:
+def test_a_method_lays_out_a_step_or_leaves_the_state_to_the_next_method(name: str) -> None:
     compiled: CompiledScene = compile_scene(SCENES[name](), TOLERANCE)
     takes = set()
     for method in METHODS:

@@ -126,7 +126,7 @@ def test_advances_and_snapshots_at_rest_do_not_change_the_motion() -> None:
     assert restored.digest() == twin.digest()
 
 
-def test_rest_is_compiled_only_where_it_can_be() -> None:
+def test_rest_is_compiled_only_for_scenes_in_which_it_is_possible() -> None:
     scene = fallen()
     driven = dataclasses.replace(scene, loads=(Harmonic("shake", (1e3, 0.0), 5.0),))
     shaken = fallen_under_a_harmonic(1e-6, 5.0)

@@ -302,9 +302,9 @@ def test_a_scene_without_stick_compiles_no_stick() -> None:
 
 def test_contradictory_friction_is_refused() -> None:
     for friction, problem in (
-        (Friction(0.3, stick_damping_n_s_m=1.0), "stick_damping_n_s_m: got 1.0, expected nothing without"),
+        (Friction(0.3, stick_damping_n_s_m=1.0), "stick_damping_n_s_m: got 1.0, expected no value without"),
         (Friction(0.3, stick_stiffness_n_m=1e8, static_coefficient=0.2), "at least the coefficient 0.3"),
-        (Friction(0.0, stick_stiffness_n_m=1e8, static_coefficient=0.2), "got 0.2, expected nothing or 0 with"),
+        (Friction(0.0, stick_stiffness_n_m=1e8, static_coefficient=0.2), "got 0.2, expected no value, or 0, with"),
         (Friction(0.3, stick_stiffness_n_m=0.0), "stick_stiffness_n_m: got 0.0, expected a finite number > 0"),
     ):
         with pytest.raises(SceneError, match=problem):

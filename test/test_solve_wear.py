@@ -99,7 +99,7 @@ def test_sliding_in_the_plane_and_running_in_under_a_constant_load(contact: Cont
     assert worn[0] > exposure + 1.5e-5
 
 
-def test_sliding_in_the_plane_wears_by_the_distance_of_the_corner() -> None:
+def test_sliding_in_the_plane_wears_the_pad_by_the_sliding_distance_of_its_corner() -> None:
     """The depth of each pad is the integral of its force times its speed over the rows, with fixed steps too."""
     wear = dataclasses.replace(RUBBED, travel_speed_m_s=0.05)
     scene = dataclasses.replace(preset("paper"), wear=wear)

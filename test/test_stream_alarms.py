@@ -100,7 +100,7 @@ def test_the_growth_rate_of_the_clearance_covers_ten_seconds() -> None:
 
 
 @pytest.mark.parametrize("names", [("force",), ("wear_rate",), ("clearance", "clearance_rate"), ()])
-def test_many_publications_together_raise_the_same_alarms_as_single_ones(names: tuple[str, ...]) -> None:
+def test_many_publications_together_raise_the_same_alarms_as_single_publications(names: tuple[str, ...]) -> None:
     rng = np.random.default_rng(len(names))
     run = []
     for index in range(4000):

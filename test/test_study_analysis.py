@@ -79,7 +79,7 @@ def test_csv_files_are_read_by_their_columns(tmp_path: Path) -> None:
     assert signals["x"].lag_s == pytest.approx(LAG_S, abs=0.004)
 
 
-def test_values_of_another_clock_and_impossible_ones_are_counted(tmp_path: Path) -> None:
+def test_values_of_another_clock_and_impossible_values_are_counted(tmp_path: Path) -> None:
     load, pose = tmp_path / "load.csv", tmp_path / "pose.csv"
     rows = [f"{t},{w[0]},{w[1]},{w[2]}\n" for t, w in zip(motion()[0][:500], motion()[1], strict=False)]
     load.write_text("t,fx,fy,m\n" + "".join(rows))

@@ -149,7 +149,7 @@ def sheet(
     return path
 
 
-def test_a_spreadsheet_s_csv_gives_the_numbers_of_a_plain_one(tmp_path: Path) -> None:
+def test_the_csv_of_a_spreadsheet_gives_the_numbers_of_a_plain_csv(tmp_path: Path) -> None:
     def peaks(analysis: Analysis) -> list[float]:
         assert analysis.input == {"samples_in": COUNT, "samples_used": COUNT}
         return list(analysis.predictions[0].loads.largest)

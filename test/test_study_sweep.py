@@ -68,7 +68,7 @@ def test_every_member_has_the_numbers_of_its_single_run(tmp_path: Path) -> None:
     assert np.unique(table.numbers[:, 0]).size == 15
 
 
-def test_parameters_and_statistics_have_words_and_units() -> None:
+def test_axes_of_parameters_and_statistics_have_readable_labels_with_units() -> None:
     for path in parameter_paths(preset("paper")):
         words, factor = parameter_words(path)
         assert not words.endswith(("_m", "_n", "_kg", "_rad")) and factor > 0.0, path

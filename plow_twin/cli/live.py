@@ -281,7 +281,5 @@ def _opcua(access: Access, mapping: Path | None, rate_hz: float) -> Bridge:
     from plow_twin.record.mapping import read_map
 
     if mapping is None:
-        raise BridgeError(
-            "mapping: got none, expected --map with the nodes: excitation: {fx: {node: 'ns=2;s=...'}, ...}"
-        )
+        raise BridgeError("got no mapping, expected --map with the nodes: excitation: {fx: {node: 'ns=2;s=...'}, ...}")
     return OpcUa(access, read_map(mapping, None), rate_hz)

@@ -12,7 +12,7 @@ from plow_twin.record.alarms import alarms_of
 
 
 def facts_of(scene: Scene, parameters: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """Return the facts of a scene. The thresholds of the alarms are taken from the `parameters` of the twin.
+    """Return the facts about a machine that the page shows: the scene, and thresholds of alarms from `parameters`.
 
     `source` is a description of the origin of the samples.
     """

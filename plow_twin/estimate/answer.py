@@ -16,7 +16,7 @@ from plow_twin.estimate.result import Estimate, State
 from plow_twin.estimate.window import Window
 from plow_twin.model.scene import Scene, Table
 
-#: Time before the evaluated span in load periods, derived from the decay of the members' initial states.
+#: Length in load periods of the part before the evaluated span, derived from the decay of the members' initial states.
 _SETTLE_PERIODS: Final = 1.0
 #: Longest interval between two knots of a load as a share of its period, derived from twice `tuning.LOAD_KNOT` for the
 #: paper's machine.

@@ -143,7 +143,8 @@ class ForceEnsemble:
             self._good &= (batch.status == 0).all(axis=1)
             if self._good.sum() < FEWEST:
                 raise ForcesError(
-                    f"t = {t[first]:.3f} s: got {self._good.sum()} members within the model's range, expected {FEWEST}"
+                    f"t = {t[first]:.3f} s: got {self._good.sum()} members within the model's range, expected at least "
+                    f"{FEWEST}"
                 )
             if over_time:
                 force[:, part] = quantiles(batch.force[self._good])

@@ -96,7 +96,7 @@ class Plan:
             raise LifeError(f"stop_h: got {self.stop_h:g} h, expected at most the horizon of {self.horizon_h:g} h")
         names = [scenario.name for scenario in self.scenarios]
         if len(set(names)) < len(names):
-            raise LifeError(f"scenarios: got the names {', '.join(names)}, expected each once")
+            raise LifeError(f"scenarios: got the names {', '.join(names)}, expected distinct names")
 
 
 @dataclass(frozen=True, eq=False)

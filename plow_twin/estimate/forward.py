@@ -176,7 +176,7 @@ class Forward:
                 continue
             run = self.run(motion_start.scene, motion_start.gain, begin, motion_start.state[None], edges, times)
             motions[place] = None if run is None else run.q
-        # a vector ends with its slowest motion, and harder contacts take more steps
+        # motions that share a SIMD vector end with the slowest of them, and harder contacts take more steps
         fitting.sort(key=lambda place: starts[place].scene.contact.stiffness)
         for first in range(0, len(fitting), WIDTH):
             places = fitting[first : first + WIDTH]

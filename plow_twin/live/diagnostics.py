@@ -235,7 +235,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
 
 
 def failures(runtime: Runtime) -> list[str]:
-    """Return a text about the failed advances of the model. If no advance failed, the list is empty."""
+    """Return a list with one text about the failed advances of the model, or an empty list without failures."""
     failed = runtime.driver.failed
     if not failed.count:
         return []

@@ -297,7 +297,7 @@ def roles_of(
         raise BridgeError("excitation_source: got 'tool_forces', expected 'excitation' or 'scene' without ROS")
     topics: Any = bridge.topics()
     if topics is None and mapping is None:
-        raise BridgeError("mapping: got none, expected a mapping that assigns the topics")
+        raise BridgeError("got no mapping, expected a mapping that assigns the topics (--map)")
     roles = {name: role for name, role in read_map(mapping, topics).items() if name in _TAKEN}
     if topics is None and any(role.message_type == OPCUA for role in roles.values()):
         raise BridgeError("mapping: got nodes, expected topics: only opc.tcp://HOST:PORT has nodes")

@@ -245,7 +245,7 @@ SPECS: Final[Mapping[str, Field[Any]]] = {spec.name: spec for spec in fields(Set
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 #: Largest length of a text [characters]. A path on Linux has the same limit.
 _LONGEST: Final = 4096
-#: Number of items of a list up to which each item is checked. The lists of parameters are shorter.
+#: Largest number of items of a list for a separate check of each item. The lists of parameters are shorter.
 _MOST_ITEMS: Final = 20
 #: Pattern of a line without control characters, which could change the state of a terminal.
 _ONE_LINE: Final = r"^[^\x00-\x1f\x7f-\x9f]*\Z"
@@ -360,7 +360,7 @@ def _unknown_services(settings: Settings) -> list[Problem]:
 def _swapped_thresholds(settings: Settings) -> list[Problem]:
     alarms = {name: getattr(settings, name) for name in SPECS if name.startswith("alarm_")}
     return [
-        Problem(name, list(pair), "the warning's threshold, then the larger one of the error")
+        Problem(name, list(pair), "the threshold of the warning, followed by the larger threshold of the error")
         for name, pair in alarms.items()
         if isinstance(pair, tuple) and pair[0] > pair[1] > 0.0
     ]

@@ -121,7 +121,7 @@ class ContactLaw:
             The law has no damping number, or D(e) is not a number >= 0.
         """
         if self.number_of is None:
-            raise ArgumentError(f"{self.title} cannot be given by a restitution")
+            raise ArgumentError(f"law: got {self.title}, expected a law that takes a restitution")
         try:
             number = self.number_of(restitution)
         except ZeroDivisionError:

@@ -630,7 +630,7 @@ def _check_contact(contact: Contact) -> Iterator[Problem]:
         expected = f"at most {MOST_DAMPING_FACTOR:g} s/m for {contact.law}; a restitution gives at most 1e6"
         yield Problem("contact.damping", contact.damping, expected)
     if law.ramped != (contact.ramp_m is not None):
-        expected = "a penetration > 0 [m]" if law.ramped else "nothing"
+        expected = "a penetration > 0 [m]" if law.ramped else "no value"
         yield Problem("contact.ramp_m", contact.ramp_m, f"{expected} for {contact.law}")
 
 
@@ -638,13 +638,13 @@ def _check_fall(contact: Contact) -> Iterator[Problem]:
     if contact.restitution is None:
         for name in FALL_NAMES:
             if getattr(contact, name) is not None:
-                yield Problem(f"contact.{name}", getattr(contact, name), "nothing without contact.restitution")
+                yield Problem(f"contact.{name}", getattr(contact, name), "no value without contact.restitution")
         return
     if (contact.restitution_fall is None) != (contact.restitution_speed_m_s is None):
         values = {name: getattr(contact, name) for name in ("restitution_fall", "restitution_speed_m_s")}
         yield Problem("contact", values, "both or neither")
     if contact.restitution_fall is None and contact.restitution_mass_power is not None:
-        expected = "nothing without contact.restitution_fall"
+        expected = "no value without contact.restitution_fall"
         yield Problem("contact.restitution_mass_power", contact.restitution_mass_power, expected)
 
 
@@ -663,9 +663,9 @@ def _check_friction(friction: Friction) -> Iterator[Problem]:
     if friction.stick_stiffness_n_m is None:
         for name in ("stick_damping_n_s_m", "static_coefficient"):
             if getattr(friction, name) is not None:
-                yield Problem(f"friction.{name}", getattr(friction, name), "nothing without stick_stiffness_n_m")
+                yield Problem(f"friction.{name}", getattr(friction, name), "no value without stick_stiffness_n_m")
     elif static and friction.coefficient == 0.0:
-        expected = "nothing or 0 with a coefficient of 0, which means no friction"
+        expected = "no value, or 0, with a coefficient of 0, which means no friction"
         yield Problem("friction.static_coefficient", static, expected)
     elif static is not None and static < friction.coefficient:
         yield Problem("friction.static_coefficient", static, f"at least the coefficient {friction.coefficient:g} [1]")

@@ -39,7 +39,7 @@ class BagWriter:
     Raises
     ------
     RecordingError
-        The folder cannot be made.
+        The folder cannot be created.
     """
 
     def __init__(self, folder: Path, on_trouble: Callable[[str], object] = lambda text: None) -> None:

@@ -329,7 +329,7 @@ def _role(path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str, 
     topic, kind = _topic(path, role, entry, topics)
     fields = entry.get("fields") or _default_fields(role, kind)
     if not fields:
-        raise map_error(path, f"{role}.fields", "nothing", f"fields: {kind} has no default fields")
+        raise map_error(path, f"{role}.fields", entry.get("fields"), f"a mapping, because {kind} has no default fields")
     if role == "excitation" and (missing := set(ROLES[role]) - set(fields)):
         raise map_error(path, f"{role}.fields", sorted(fields), f"{', '.join(sorted(missing))} too")
     units = entry.get("unit", {})

@@ -404,7 +404,7 @@ class MemoryFile:
         """Do nothing."""
 
     def is_linked(self) -> bool:
-        """Return True."""
+        """Return True, because a file in memory cannot be removed from a folder."""
         return True
 
     def close(self) -> None:

@@ -58,7 +58,7 @@ OLDER_ROWS: Final = "older_rows"
 
 
 class _Rows:
-    """Table of the newest `MOST_ROWS` rows. Older rows are dropped when the table has a quarter more rows."""
+    """Table of the newest `MOST_ROWS` rows. Older rows are dropped when they are more than a quarter of `MOST_ROWS`."""
 
     def __init__(self, columns: int) -> None:
         self._columns, self._values = columns, array("d")

@@ -387,7 +387,7 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RecordingError(f"{folder}: cannot be made: {error.strerror}") from error
+        raise RecordingError(f"{folder}: cannot be created: {error.strerror}") from error
 
 
 def warm_up_writer(header: RunHeader) -> None:

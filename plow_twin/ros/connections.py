@@ -37,13 +37,13 @@ class WithoutEvents(Node):
     """
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **options: Any) -> Service:
-        """Create a service like rclpy. Requests to set parameters are checked first."""
+        """Create a service as rclpy does, but check requests to set parameters."""
         if srv_type in (SetParameters, SetParametersAtomically):
             callback = partial(_set_parameters, callback)
         return super().create_service(srv_type, srv_name, callback, **options)
 
     def create_publisher(self, *arguments: Any, **options: Any) -> Publisher:
-        """Create a publisher like rclpy, but without events."""
+        """Create a publisher as rclpy does, but without events."""
         events = PublisherEventCallbacks(use_default_callbacks=False)
         return super().create_publisher(*arguments, **{"event_callbacks": events, **options})
 

@@ -99,7 +99,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
 
     @property
     def prepared(self) -> bool:
-        """Whether configure would not have to wait for the solver."""
+        """Whether the solver is ready, so that configure does not wait for it."""
         return self._preparation is None or self._preparation.done
 
     def start(self) -> bool:

@@ -105,7 +105,7 @@ class TwinBatch:
     ) -> None:
         check_limits(max_steps, max_wall_s)
         if not scenes:
-            raise ArgumentError("scenes: got none, expected at least one")
+            raise ArgumentError("scenes: got no scene, expected at least one")
         self.scenes = tuple(scenes)
         self.tol = tol
         self._params, self._compiled = compile_scenes(scenes, tol, sampled=True, kind=options(scenes[0]))

@@ -170,7 +170,7 @@ def _read_loads(
 def _samples(raw: Mapping[str, Any], path: str, base: Path | None) -> tuple[Any, Any]:
     if "file" in raw:
         if base is None:
-            raise SceneError([Problem(f"{path}.file", raw["file"], "the rows of the table")])
+            raise SceneError([Problem(f"{path}.file", raw["file"], "the rows of the table instead of a file")])
         return read_table(base / raw["file"], raw.get("columns"), f"{path}.file")
     return sample_table(raw["t"], raw["wrench"], path)
 

@@ -41,7 +41,7 @@ def read_table(path: Path, columns: Sequence[str] | None = None, key: str = "fil
     if columns is None and "t" not in header:
         header = ["t" if name == "time" else name for name in header]
     if any(header.count(name) != 1 for name in names):
-        raise SceneError([Problem(key, header, f"a header line with {', '.join(names)}, each once")])
+        raise SceneError([Problem(key, header, f"a header line with {', '.join(names)}, each name once")])
     return _parse(rows[1:], [header.index(name) for name in names], key)
 
 

@@ -182,7 +182,7 @@ class Outputs:
         self._slow_wear_depth = np.zeros(PAIR_COUNT)
         #: stamp from which the motion was computed again [ns], valid while the field `corrected` of the window is 1
         self._corrected_ns = 0
-        #: the window before the motion was computed again, if it contained an unpublished advance
+        #: if the motion was computed again: the window before that, unless all its advances were published
         self._before: Rows | None = None
         #: shifts by an estimate, in the order of `CLEARANCE_NAMES` [m]; None if all are zero
         self._shift: Array | None = None

@@ -26,7 +26,7 @@ class Steps:
 
     @property
     def waits(self) -> bool:
-        """Whether a sample is being delayed."""
+        """Whether a sample with a jump of the stamp waits for the next sample."""
         return self._jumped is not None
 
     def settle(

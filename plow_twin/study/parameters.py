@@ -37,7 +37,7 @@ _INDEX: Final = re.compile(r"(.+)\[(\d+)\]")
 
 
 class StudyError(PlowTwinError, ValueError):
-    """A study cannot be made or continued as requested."""
+    """A study cannot be run or continued as requested."""
 
 
 def parameter_paths(scene: Scene) -> tuple[str, ...]:

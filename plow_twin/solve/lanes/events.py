@@ -42,8 +42,8 @@ from plow_twin.solve.state import CLIPPED, COS, OFF, ON, RELEASED, SIN, X, Y
 
 #: Largest difference of the times of two simultaneous events, divided by the size of the step that ends with them.
 _AT_ONCE = 1e-12
-#: Conditions for the end of a search for a root. `_FOUND`: relative change of the root, whose cube is negligible.
-#: `_STRAIGHT`: effect of the curvature on the change. `_ROUNDED`: relative change due to rounding.
+#: Conditions for the end of a search for a root. `_FOUND`: relative change of the root; the cube of the change is
+#: negligible. `_STRAIGHT`: effect of the curvature on the change. `_ROUNDED`: relative change due to rounding.
 _FOUND, _STRAIGHT, _ROUNDED = 1e-6, 1e-3, 2e-16
 _MOST_CHANGES = 80
 #: Indices in `lanes.chosen` after the five coefficients of a penetration: factor of d, factor of d', constant.

@@ -84,7 +84,7 @@ _BLOCK_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("taken", "i8", (PAIR_COUNT,)),  # bit mask of the lanes that use the slot
     ("watched", "i8", _LANES_OF),  # bit mask of the guard functions that are always searched
     ("inside", "i8", _LANES_OF),  # bit mask of the pairs that penetrate
-    ("carrying", "i8", _LANES_OF),  # bit mask of the pairs that are ON, or -1 for a lane to note anew
+    ("carrying", "i8", _LANES_OF),  # bit mask of the pairs that are ON, or -1 if it must be determined again
     ("along", "f8", (2, 6, WIDTH)),  # coefficients of c, s, X or Y and of their rates in the forces along X and Y
     # the moment is c Gc + s Gs - X fy + Y fx; coefficients of c, s, X, Y and of their rates in Gc and Gs
     ("turn", "f8", (2, 8, WIDTH)),

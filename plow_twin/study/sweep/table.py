@@ -47,7 +47,7 @@ def parse_axis(text: str, scene: Scene) -> Axis:
     if path in WORDS:
         words = tuple(check_word(path, word.strip()) for word in rest.split(",") if word.strip())
         if not words or len(set(words)) < len(words):
-            raise StudyError(f"axis: got {text!r}, expected {path}=WORD,WORD.., each once")
+            raise StudyError(f"axis: got {text!r}, expected {path}=WORD,WORD.. with distinct words")
         return Axis(path, words)
     try:
         if ":" not in rest:
@@ -67,7 +67,7 @@ def parse_axis(text: str, scene: Scene) -> Axis:
     except ValueError:
         raise StudyError(f"axis: got {text!r}, expected {expected} (log: bounds > 0)") from None
     if not values or not all(math.isfinite(value) for value in values) or len(set(values)) < len(values):
-        raise StudyError(f"axis: got {text!r}, expected {expected}, finite numbers, each once")
+        raise StudyError(f"axis: got {text!r}, expected {expected} with finite, distinct numbers")
     return Axis(path, values, log)
 
 
@@ -89,7 +89,7 @@ class Sweep:
         if self.size > _MOST_MEMBERS:
             raise StudyError(f"axes: got {self.size} members, expected at most {_MOST_MEMBERS}")
         if not self.statistics or len(set(self.statistics)) < len(self.statistics):
-            raise StudyError(f"statistics: got {list(self.statistics)}, expected at least one, each once")
+            raise StudyError(f"statistics: got {list(self.statistics)}, expected one or more distinct statistics")
         for name in self.statistics:
             statistic(scene, name)
 
