@@ -144,7 +144,7 @@ class Worker:
         self._waiting.append(("restart",))
 
     def finish(self) -> None:
-        """Request the estimate of the last window at the end of the input; `ended` stays None until it is finished."""
+        """Request the estimate of the last window after the end of the input; `ended` is None until the result."""
         self._waiting.append(("end",))
 
     @property
