@@ -123,8 +123,8 @@ def table() -> str:
     lines += ["| number | value | where it acts | set on | half of it | twice |", "|---|---|---|---|---|---|"]
     for entry in tuning.entries():
         half, twice = (summary(entry.name, factor, rows) for factor in FACTORS)
-        value = _short(entry.value) if entry.tuned.unit == "1" else f"{_short(entry.value)} {entry.tuned.unit}"
-        cells = (f"`{entry.name}`", value, entry.tuned.meaning, entry.tuned.basis, half, twice)
+        value = _short(entry.value) if entry.unit == "1" else f"{_short(entry.value)} {entry.unit}"
+        cells = (f"`{entry.name}`", value, entry.meaning, entry.basis, half, twice)
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -152,7 +152,7 @@ def main(numbers: tuple[str, ...], cases: tuple[str, ...], out: Path) -> None:
                 continue
             for factor in FACTORS:
                 if (group, entry.name, factor) not in done:
-                    with varied(entry.name, scaled(entry.value, factor, entry.tuned.unit)):
+                    with varied(entry.name, scaled(entry.value, factor, entry.unit)):
                         row = run(truth)
                     write(out, {"group": group, "name": entry.name, "factor": factor, **row})
 

@@ -61,4 +61,4 @@ def test_every_chosen_number_is_used_and_states_its_data() -> None:
     names = {name for name, value in vars(tuning).items() if isinstance(value, (int, float, tuple, np.ndarray))}
     assert names == {entry.name for entry in entries}
     for entry in entries:
-        assert entry.tuned.unit and entry.tuned.meaning and entry.tuned.basis, entry.name
+        assert entry.unit and entry.meaning and entry.basis, entry.name
