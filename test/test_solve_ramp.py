@@ -66,7 +66,7 @@ def test_both_solvers_agree(stiffness: float, exponent: float) -> None:
     assert 2 in events.events["mode_to"]
 
 
-def test_the_ramp_belongs_to_its_law() -> None:
+def test_a_ramp_is_accepted_only_with_the_ramped_law() -> None:
     for contact in (Contact("ramped_damping", 1e7, damping=1e4), Contact("hertz", 1e7, ramp_m=1e-3)):
         with pytest.raises(SceneError, match=r"contact\.ramp_m"):
             replace(preset("paper"), contact=contact)

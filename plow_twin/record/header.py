@@ -38,7 +38,7 @@ class RunHeader:
     topics: Mapping[str, str] = field(default_factory=dict)
     frame_id: str = "slide_frame"
     child_frame_id: str = "head_frame"
-    #: clock of the receive times: `system`, or `ros` if the node used the time from `/clock`
+    #: clock of the receive times: `system`, or `ros` for the time from `/clock` or from the stamps of a file
     clock: str = "system"
     #: first stamp [ns], or None if it was not known at the start
     origin_ns: int | None = None
