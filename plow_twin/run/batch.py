@@ -88,9 +88,9 @@ class TwinBatch:
     have the state before the call.
 
     Each SIMD vector advances eight twins if no scene has a ramp, wear, friction with stick, a support, locks, an offset
-    centre of mass, `carries: corners`, rounded corners, a falling restitution or overdamped contact. The results agree with those of a `Twin` within the tolerance, and do not
-    depend on the other twins of the batch if all have the same terms. In all other batches, the results are
-    bit-identical to a `Twin` with the same terms.
+    centre of mass, `carries: corners`, rounded corners, a falling restitution or overdamped contact. The results agree
+    with those of a `Twin` within the tolerance, and do not depend on the other twins of the batch if all have the same
+    terms. In all other batches, the results are bit-identical to a `Twin` with the same terms.
     """
 
     def __init__(

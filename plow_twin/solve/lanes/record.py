@@ -430,7 +430,7 @@ def read_block(lanes, block) -> None:
 
 @kernel()
 def write_block(block, lanes, new) -> None:
-    """Copy the state of the lanes to their block, also data derived from modes if it changed, and constants if `new`."""
+    """Copy the state of the lanes to their block; also changed data derived from modes, and constants if `new`."""
     copy_part(block, lanes, 0 if new else _STATE, _NOTES if lanes.noted[0] < 0 else _SIZE)
 
 
