@@ -219,7 +219,7 @@ def forces_message(answer: WindowResult, frame_id: str) -> plain.JointState:
 def forecast_message(answer: WindowResult, frame_id: str) -> plain.JointState:
     """Return the message of a forecast.
 
-    It contains the time [s], the distance [m], the passes and the shifts until the wear limit is reached.
+    It contains the time [s], the distance [m], the passes and the shifts until a clearance reaches its limit.
     """
     forecast = answer.also["forecast"] or {}
     names: list[str] = []

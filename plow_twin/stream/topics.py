@@ -167,7 +167,7 @@ TOPICS: Final = (
         "message = the same in words",
         latched=True, depth=1,
     ),
-    Topic("status", STATUS, Cadence.CHANGE, "what the node is doing", latched=True, depth=1),
+    Topic("status", STATUS, Cadence.CHANGE, "state of node, stream and inputs", latched=True, depth=1),
 )  # fmt: skip
 
 
