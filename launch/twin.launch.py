@@ -1,5 +1,6 @@
 """Start the twin: `ros2 launch plow_twin twin.launch.py scene:=paper record_path:=runs/monday`.
 
+The arguments `scene`, `record_path`, `use_sim_time` and `autostart` override the parameter file only if they are given.
 With `autostart:=false` the node waits for lifecycle requests (`ros2 lifecycle set /plow_twin configure`).
 With `view:=true` a separate process shows the recording in a browser while it is written; it prints the address. The
 program may be in another Python environment (`view:=/opt/viewer/bin/plow-twin`): rerun needs numpy 2, ROS 2 Jazzy has
@@ -8,51 +9,63 @@ program may be in another Python environment (`view:=/opt/viewer/bin/plow-twin`)
 
 import shutil
 
-from launch.actions import DeclareLaunchArgument, ExecuteProcess
+from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution, PythonExpression
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-from launch import LaunchDescription
+from launch import LaunchContext, LaunchDescription
 
 ARGUMENTS = {
     "namespace": ("", "namespace of the node and its topics"),
     "params_file": (PathJoinSubstitution([FindPackageShare("plow_twin"), "config", "twin.yaml"]), "parameter file"),
-    "scene": ("paper", "scene file or preset"),
-    "record_path": ("", "folder to make for the recording; empty: none"),
-    "use_sim_time": ("false", "take the time from /clock"),
-    "autostart": ("true", "configure and activate at start"),
-    "view": ("", "true, or the program plow-twin of the environment that has rerun; empty: not shown"),
+    "scene": ("", "scene file or preset; empty: as in params_file"),
+    "record_path": ("", "folder to make for the recording; empty: as in params_file"),
+    "use_sim_time": ("", "take the time from /clock; empty: as in params_file"),
+    "autostart": ("", "configure and activate at start; empty: as in params_file"),
+    "view": (
+        "",
+        "true, or the program plow-twin of the environment that has rerun; needs record_path; empty: not shown",
+    ),
 }
+
+#: Types of the parameters that have arguments of their own.
+OVERRIDES = {"scene": str, "record_path": str, "use_sim_time": bool, "autostart": bool}
 
 #: Prefix that stops a process when `launch` has ended, since `launch` ends at SIGTERM without stopping its processes.
 STOP_WITH_LAUNCH = "setpriv --pdeathsig TERM" if shutil.which("setpriv") else ""
 
 
-def generate_launch_description() -> LaunchDescription:
-    """Return one twin; arguments override the parameter file."""
+def twin(context: LaunchContext) -> list[Node]:
+    """Return the node. Arguments that are not empty override the parameter file."""
     given = {name: LaunchConfiguration(name) for name in ARGUMENTS}
     overrides = {
-        "scene": ParameterValue(given["scene"], value_type=str),
-        "record_path": ParameterValue(given["record_path"], value_type=str),
-        "use_sim_time": ParameterValue(given["use_sim_time"], value_type=bool),
-        "autostart": ParameterValue(given["autostart"], value_type=bool),
+        name: ParameterValue(given[name], value_type=kind)
+        for name, kind in OVERRIDES.items()
+        if given[name].perform(context)
     }
-    twin = Node(
-        package="plow_twin",
-        executable="twin",
-        name="plow_twin",
-        namespace=given["namespace"],
-        parameters=[given["params_file"], overrides],
-        # the node may take up to 5 s to close its recording
-        sigterm_timeout="6",
-        sigkill_timeout="6",
-        prefix=STOP_WITH_LAUNCH,
-        exec_name="twin",
-        output="screen",
-    )
+    return [
+        Node(
+            package="plow_twin",
+            executable="twin",
+            name="plow_twin",
+            namespace=given["namespace"],
+            parameters=[given["params_file"], overrides],
+            # the node may take up to 5 s to close its recording
+            sigterm_timeout="6",
+            sigkill_timeout="6",
+            prefix=STOP_WITH_LAUNCH,
+            exec_name="twin",
+            output="screen",
+        )
+    ]
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Return one twin, and its viewer if the argument `view` is given."""
+    given = {name: LaunchConfiguration(name) for name in ARGUMENTS}
     # the viewer has a Python environment of its own, so the variables that a sourced ROS 2 adds are removed
     apart = [
         "env",
@@ -68,4 +81,4 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(name, default_value=default, description=text)
         for name, (default, text) in ARGUMENTS.items()
     ]
-    return LaunchDescription([*arguments, twin, viewer])
+    return LaunchDescription([*arguments, OpaqueFunction(function=twin), viewer])

@@ -543,9 +543,11 @@ def test_a_stop_under_load_is_clean_and_closes_the_recording(tmp_path: Path, num
     assert report.first_divergence is None
 
 
-def test_a_twin_ends_cleanly_with_its_launch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # `launch` ends at SIGTERM without passing the signal on, so mocks replace it; the tests check the requests of the
-    # launch file
+def launched(monkeypatch: pytest.MonkeyPatch, **given: str) -> dict[str, Any]:
+    """Return what the launch file requests for its node, if these launch arguments are given.
+
+    `launch` is not on PyPI, so mocks replace it.
+    """
     modules = {name: MagicMock() for name in ("launch", "launch_ros")}
     for package, names in (("launch", "actions conditions substitutions"), ("launch_ros", "actions substitutions")):
         for name in ("", *names.split(), *(("parameter_descriptions",) if package == "launch_ros" else ())):
@@ -554,8 +556,25 @@ def test_a_twin_ends_cleanly_with_its_launch(tmp_path: Path, monkeypatch: pytest
                 f"{package}.{name}".rstrip("."),
                 getattr(modules[package], name) if name else modules[package],
             )
+    modules["launch"].substitutions.LaunchConfiguration = lambda name: MagicMock(
+        perform=lambda context: given.get(name, ""), text=given.get(name, "")
+    )
+    modules["launch_ros"].parameter_descriptions.ParameterValue = lambda value, value_type: (value.text, value_type)
     runpy.run_path(str(ROOT / "launch" / "twin.launch.py"))["generate_launch_description"]()
-    prefix = shlex.split(modules["launch_ros"].actions.Node.call_args.kwargs["prefix"])
+    modules["launch"].actions.OpaqueFunction.call_args.kwargs["function"](MagicMock())
+    return dict(modules["launch_ros"].actions.Node.call_args.kwargs)
+
+
+def test_the_launch_overrides_only_the_parameters_that_are_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    file, overrides = launched(monkeypatch, params_file="mine.yaml")["parameters"]
+    assert (file.text, overrides) == ("mine.yaml", {})
+    _, overrides = launched(monkeypatch, scene="paper", autostart="false")["parameters"]
+    assert overrides == {"scene": ("paper", str), "autostart": ("false", bool)}
+
+
+def test_a_twin_ends_cleanly_with_its_launch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # `launch` ends at SIGTERM without passing the signal on
+    prefix = shlex.split(launched(monkeypatch)["prefix"])
     twin = [sys.executable, "-m", "plow_twin.ros.main", "--ros-args", "-p", f"record_path:={tmp_path / 'run'}"]
     launch = subprocess.Popen(
         [sys.executable, "-c", "import subprocess, sys; subprocess.run(sys.argv[1:])", *prefix, *twin],
