@@ -180,7 +180,7 @@ def test_an_address_that_cannot_be_offered_is_refused(
 def test_options_of_a_screen_without_the_screen_are_refused(tmp_path: Path) -> None:
     (tmp_path / "load.csv").write_text("t,fx,fy,m\n0,1,2,3\n0.001,1,2,3\n")
     done = plow_twin_here("live", tmp_path / "load.csv", "--scene", "paper", "--listen", "127.0.0.1:0")
-    assert done.returncode == 2 and "--listen: got no --dashboard" in done.stderr
+    assert done.returncode == 2 and "--listen: expected it only with --dashboard" in done.stderr
 
 
 def test_a_screen_reports_that_it_waits_for_a_file(tmp_path: Path) -> None:

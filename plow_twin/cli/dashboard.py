@@ -54,7 +54,7 @@ def access_if_shown(options: dict[str, Any]) -> PageAccess | None:
     context = click.get_current_context()
     for name in ("listen", "token_file"):
         if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
-            raise click.UsageError(f"--{name.replace('_', '-')}: got no --dashboard, expected both options")
+            raise click.UsageError(f"--{name.replace('_', '-')}: expected it only with --dashboard")
     return None
 
 

@@ -277,7 +277,7 @@ WORK: Final = np.dtype(
         ("grip", "f8", (3, PAIR_COUNT)),  # friction with stick: factors of normal force, position and slip rate
         ("per_pair", "f8", (9, PAIR_COUNT)),  # masks and sums of the eight pairs
         ("moved", "f8", (STATE_SIZE,)),
-        # the following fields have the types of the state's fields, for the same compiled kernels
+        # the following fields have the types of the state's fields, so that the same compiled kernels can be used
         ("saved_y", "f8", (STATE_SIZE,)),  # body coordinates and wear depth at the start of an advance
         ("saved_wear", "f8", (PAIR_COUNT,)),
         ("read_y", "f8", (STATE_SIZE,)),  # body coordinates, rates and wear depths at an output time
