@@ -11,11 +11,11 @@ import math
 import numpy as np
 
 from plow_twin.kernel.compiler import kernel
-from plow_twin.kernel.simd import below, exact_row, exact_splat, fused, set_row
+from plow_twin.kernel.simd import below, choose, equal, exact_row, exact_splat, fused, set_row, square_root
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.lanes.record import WIDTH, linear_at, note_modes, penetration_at
 from plow_twin.solve.lanes.series import expand, expand_loads
-from plow_twin.solve.method.step_size import PARTING_ORDER, PARTING_REACH, parting_of
+from plow_twin.solve.method.step_size import PARTING_REACH
 from plow_twin.solve.method.taylor import TOUCH_REACH
 from plow_twin.solve.modes import SHALLOW
 from plow_twin.solve.state import COS, OMEGA, RELEASED, SIN, VX, VY, X, Y
@@ -55,42 +55,79 @@ def choose_maps(harmonics, extent, waves, second, hysteretic, fraction, slip, se
     if shallow != 0:
         _release(lanes)
         shallow, near = _look_at_pairs(lanes)
-    for lane in range(WIDTH):
-        touches = lanes.touched[lane] != 0
-        near &= ~(1 << lane) if touches or lanes.exponent[lane] != 1.5 else -1
-        lanes.alpha[lane], lanes.beta[lane] = 0.0 if touches else 1.0, 2.0 if touches else 0.0
-        lanes.may_stop[lane] = 1 if lanes.whole[lane] < LONGEST_STEP else 0
-    order = 0
+    live, exponent, half = lanes.live[0], exact_row(lanes.exponent, 0), exact_splat(1.5)
+    one, two, zero = exact_splat(1.0), exact_splat(2.0), exact_splat(0.0)
+    touches = live & ~equal(lanes.touched, 0, 0)
+    rooted = live & ~(touches | below(exponent, half) | below(half, exponent) | equal(lanes.inside, 0, 0))
+    set_row(lanes.alpha, 0, choose(touches, zero, one))
+    set_row(lanes.beta, 0, choose(touches, two, zero))
+    near &= rooted
     if near != 0:
         if waves is not None:
-            expand_loads(harmonics, extent, second, fraction, lanes, w, PARTING_ORDER)
-        order = expand(lanes, w, PARTING_ORDER, waves, second, None, hysteretic, 1, fraction, slip, segments)
-    for lane in range(WIDTH):
-        if lanes.member[lane] >= 0:
-            _choose_map(lanes, w, lane, order, near >> lane & 1 == 1)
+            expand_loads(harmonics, extent, second, fraction, lanes, w, 1)
+        expand(lanes, w, 1, waves, second, None, hysteretic, 1, fraction, slip, segments)
+        near = _find_partings(lanes, near)
+    _use_roots(lanes, touches, near, rooted & ~near)
 
 
 @kernel()
-def _choose_map(lanes, w, lane, order, near) -> None:
-    span = lanes.whole[lane]
-    if lanes.touched[lane] != 0:
-        lanes.whole[lane] = math.sqrt(span)
-        return
-    if lanes.inside[lane] == 0 or lanes.exponent[lane] != 1.5:
-        return
-    parting = _parting(lanes, w, lane, order) if near else 0.0
-    since = lanes.time[lane] - lanes.touch_time[lane]
-    if parting > 0.0:
-        root = math.sqrt(parting)
-        lanes.alpha[lane], lanes.beta[lane] = 2.0 * root, -2.0
-        if parting <= span:
-            lanes.whole[lane], lanes.may_stop[lane] = root, 0
-        else:
-            lanes.whole[lane] = root - math.sqrt(parting - span)
-    elif 0.0 < since < TOUCH_REACH * lanes.before_it[lane]:
-        root = math.sqrt(since)
-        lanes.alpha[lane], lanes.beta[lane] = 2.0 * root, 2.0
-        lanes.whole[lane] = math.sqrt(since + span) - root
+def _find_partings(lanes, near) -> int:
+    """Write the time until the first pair separates to `lanes.root`, and return a bit mask of lanes with such a pair.
+
+    The time is a root of the penetration's series of order 2. The next step corrects its error.
+    """
+    series, zero, first, found = lanes.series, exact_splat(0.0), exact_splat(np.inf), 0
+    om, turning = exact_row(series[OMEGA], 0), exact_row(series[OMEGA], 1)
+    c, s, x, y = exact_row(series[COS], 0), exact_row(series[SIN], 0), exact_row(series[X], 0), exact_row(series[Y], 0)
+    dc, ds, dx, dy = (
+        exact_row(series[COS], 1), exact_row(series[SIN], 1), exact_row(series[X], 1), exact_row(series[Y], 1),
+    )  # fmt: skip
+    # derivatives of c' = -s theta', s' = c theta', X' = VX + Y theta' and Y' = VY - X theta'
+    bent_c, bent_s = fused(turning, s, om * ds) * -1.0, fused(turning, c, om * dc)
+    bent_x = fused(turning, y, fused(om, dy, exact_row(series[VX], 1)))
+    bent_y = exact_row(series[VY], 1) - fused(turning, x, om * dx)
+    for slot in range(PAIR_COUNT):
+        taken, gear = lanes.taken[slot] & near, lanes.gear[slot]
+        if lanes.taken[slot] == 0:
+            break
+        depth, rate = exact_row(lanes.depth[slot], 0), linear_at(gear, dc, ds, dx, dy)
+        bend = linear_at(gear, bent_c, bent_s, bent_x, bent_y)
+        under_root = fused(rate, rate, bend * depth * -2.0)
+        time = depth * 2.0 / (square_root(under_root) - rate)
+        separates = taken & below(rate, zero) & below(depth, rate * _reach(lanes)) & below(zero, under_root)
+        first = choose(separates & below(time, first), time, first)
+        found |= separates
+    set_row(lanes.root, 0, first)
+    return found
+
+
+@kernel(inline="code")
+def _reach(lanes):
+    """Return minus the time within which a separation is searched."""
+    return exact_row(lanes.before_it, 0) * -PARTING_REACH
+
+
+@kernel()
+def _use_roots(lanes, touches, parts, others) -> None:
+    """Choose a root of time where it suits the series, and convert `lanes.whole` to the chosen variable.
+
+    `parts` is a bit mask of the lanes with a separation after the time `lanes.root`, and `others` of the lanes in which
+    a touch may be recent.
+    """
+    span, parting = exact_row(lanes.whole, 0), exact_row(lanes.root, 0)
+    since = exact_row(lanes.time, 0) - exact_row(lanes.touch_time, 0)
+    two, zero = exact_splat(2.0), exact_splat(0.0)
+    recent = others & below(zero, since) & below(since, exact_row(lanes.before_it, 0) * TOUCH_REACH)
+    ends_before = parts & ~below(span, parting)
+    near = square_root(choose(parts, parting, choose(recent, since, zero)))
+    far = square_root(choose(ends_before, zero, choose(parts, parting - span, choose(recent, since + span, span))))
+    changed = parts | recent
+    set_row(lanes.alpha, 0, choose(changed, near * 2.0, exact_row(lanes.alpha, 0)))
+    set_row(lanes.beta, 0, choose(parts, two * -1.0, choose(recent, two, exact_row(lanes.beta, 0))))
+    set_row(lanes.whole, 0, choose(parts, near - far, choose(recent, far - near, choose(touches, far, span))))
+    may_stop = below(span, exact_splat(LONGEST_STEP)) & ~ends_before
+    for lane in range(WIDTH):
+        lanes.may_stop[lane] = may_stop >> lane & 1
 
 
 @kernel()
@@ -113,7 +150,6 @@ def _look_at_pairs(lanes):
     y, zero = lanes.y, exact_splat(0.0)
     c, s, om = exact_row(y, COS), exact_row(y, SIN), exact_row(y, OMEGA)
     dx, dy = fused(om, exact_row(y, Y), exact_row(y, VX)), exact_row(y, VY) - om * exact_row(y, X)
-    reach = exact_row(lanes.before_it, 0) * -PARTING_REACH
     least = exact_row(lanes.release, 0) * SHALLOW
     shallow = near = 0
     for slot in range(PAIR_COUNT):
@@ -123,7 +159,7 @@ def _look_at_pairs(lanes):
         depth = penetration_at(gear, c, s, exact_row(y, X), exact_row(y, Y))
         rate = linear_at(gear, om * s * -1.0, om * c, dx, dy)
         set_row(lanes.depth[slot], 0, depth)
-        near |= taken & below(rate, zero) & below(depth, rate * reach)
+        near |= taken & below(rate, zero) & below(depth, rate * _reach(lanes))
         shallow |= taken & ~lanes.touching[slot] & ~below(least, depth)
     return shallow, near
 
@@ -142,16 +178,3 @@ def _release(lanes) -> None:
                 any_found = True
     if any_found:
         note_modes(lanes)
-
-
-@kernel()
-def _parting(lanes, w, lane, order) -> float:
-    """Return the time until the first pair of a lane separates, or 0 without a near separation."""
-    first, column = np.inf, w.column[0]
-    for slot in range(PAIR_COUNT):
-        if lanes.taken[slot] >> lane & 1 == 0:
-            continue
-        for k in range(order + 1):
-            column[k] = lanes.depth[slot, k, lane]
-        first = min(first, parting_of(column, order, PARTING_REACH * lanes.before_it[lane]))
-    return first if 0.0 < first < np.inf else 0.0
