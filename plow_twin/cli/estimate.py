@@ -289,8 +289,8 @@ def _title(source: Path, scene: Path | None, task: _Task) -> str:
     from plow_twin.view.figures import date_text
 
     date = date_text(task.first_ns) or f"drawn {datetime.now(UTC):%Y-%m-%d}"
-    its = "its own scene" if scene is None else f"scene {scene.name}"
-    return f"Estimate from {source.resolve().name}, {its}, {date}"
+    scene_text = "its own scene" if scene is None else f"scene {scene.name}"
+    return f"Estimate from {source.resolve().name}, {scene_text}, {date}"
 
 
 def _plot(task: _Task, result: Estimate, path: Path, title: str) -> None:

@@ -58,15 +58,15 @@ def compare_forces(run: Path, wider_m: float) -> Comparison | None:
         for name, model in (("nominal", scene), ("true", replace(scene, clearance=clearance)))
     }
     late = times >= times[-1] - COMPARED_S
-    here = np.flatnonzero(late & np.isin(stamps, published_ns))
+    compared = np.flatnonzero(late & np.isin(stamps, published_ns))
     last = dict(zip(published_ns.tolist(), forces[:, -PAIR_COUNT:], strict=True))
-    followed = np.array([last[stamp] for stamp in stamps[here].tolist()])
-    true = motions["true"].force[here]
+    followed = np.array([last[stamp] for stamp in stamps[compared].tolist()])
+    true = motions["true"].force[compared]
     peaks = {name: motion.peak[late].max(axis=0) for name, motion in motions.items()}
     size = float(np.sqrt((true**2).mean()))
     error = {
         name: float(np.sqrt(((force - true) ** 2).mean())) / size
-        for name, force in (("nominal", motions["nominal"].force[here]), ("followed", followed))
+        for name, force in (("nominal", motions["nominal"].force[compared]), ("followed", followed))
     }
     came = [1e-9 * (stamp_ns - int(stamps[0])) for stamp_ns in _estimate_stamps(RunReader(run))]
     return Comparison({**peaks, "followed": followed.max(axis=0)}, error, came, float(times[-1]) - COMPARED_S)

@@ -141,7 +141,7 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, prior_estimate: Estim
         if observed and not fine:
             got = f"a deviation of {1e3 * float(deviation[axis]):.3g} mm, expected at most {1e3 * tuning.OBSERVED:g} mm"
             reasons.append(f"{name}: rough, {counts} leave {got}")
-    restitution = {"restitution": float(np.median([one.restitution for one in met]))} if met else {}
+    restitution = {"restitution": float(np.median([impact.restitution for impact in met]))} if met else {}
     return replace(
         prior_estimate,
         horizontal=clearances[0],

@@ -230,8 +230,8 @@ def _delay(forces: ContactForces, fitted: FittedForces) -> float:
     return float(lags[int(np.argmax(alike))])
 
 
-def correlation(one: Array, other: Array) -> float:
+def correlation(first: Array, second: Array) -> float:
     """Return the correlation coefficient of two series; 0 if a series is constant."""
-    one, other = one - one.mean(), other - other.mean()
-    size = float(np.sqrt((one @ one) * (other @ other)))
-    return float(one @ other) / size if size > 0.0 else 0.0
+    first, second = first - first.mean(), second - second.mean()
+    size = float(np.sqrt((first @ first) * (second @ second)))
+    return float(first @ second) / size if size > 0.0 else 0.0

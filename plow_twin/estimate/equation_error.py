@@ -121,7 +121,7 @@ class EquationError:
         fits = [
             self.fit(q, np.repeat(0.5 * share * span, 2), math.log(depth)) for depth in _DEPTHS for share in _SHARES
         ]
-        return min(fits, key=lambda one: one.loss)
+        return min(fits, key=lambda fit: fit.loss)
 
     def fit(self, q: Array, reach: Array, ln_depth: float) -> Walls:
         """Return the fit to the poses `q`, (n, 3), from starting values of the reaches (4,) [m] and of `ln_depth`."""

@@ -48,8 +48,8 @@ class Harmonics:
         omega = frequency(load)
         if omega is None:
             return None
-        size, none = np.ptp(load.wrench, axis=0) / 2.0, np.zeros((1 + 2 * len(tuning.MULTIPLES), 3))
-        return Harmonics(omega, tuning.MULTIPLES, np.maximum(size, 1e-3 * size.max()), none, none)
+        size, no_amplitude = np.ptp(load.wrench, axis=0) / 2.0, np.zeros((1 + 2 * len(tuning.MULTIPLES), 3))
+        return Harmonics(omega, tuning.MULTIPLES, np.maximum(size, 1e-3 * size.max()), no_amplitude, no_amplitude)
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> Harmonics:

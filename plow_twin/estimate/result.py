@@ -280,10 +280,10 @@ class Estimate:
     def _repr_html_(self) -> str:
         states = {"horizontal": self.horizontal_state, "vertical": self.vertical_state}
         values, rows = self.values(), []
-        for one in (quantity for quantity in QUANTITIES if quantity.name in values):
-            value = values[one.name].times(one.factor)
-            cells = [one.label, *(format(number, one.digits) for number in (value.mean, value.p05, value.p95))]
-            cells.append(states[one.name].value.replace("_", " ") if one.name in states else "")
+        for shown in (quantity for quantity in QUANTITIES if quantity.name in values):
+            value = values[shown.name].times(shown.factor)
+            cells = [shown.label, *(format(number, shown.digits) for number in (value.mean, value.p05, value.p95))]
+            cells.append(states[shown.name].value.replace("_", " ") if shown.name in states else "")
             rows.append("".join(f"<td>{escape(cell)}</td>" for cell in cells))
         title = f"window from {self.t_start:.2f} s to {self.t_end:.2f} s; model {self.model}, sensor {self.sensor}"
         heads = "".join(f"<th>{name}</th>" for name in ("", "mean", "5 %", "95 %", ""))

@@ -63,7 +63,7 @@ def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float)
             fitted = fit(problem, shared, better_states(problem, shared, states), noise, stage.iterations)
             if fitted is None:
                 continue
-            fits = sorted([*fits, fitted], key=lambda one: one.loss)
+            fits = sorted([*fits, fitted], key=lambda fit: fit.loss)
             if _have_met(fits, fitted):
                 del fits[1:]
                 break
@@ -148,7 +148,7 @@ def refine(
     for start in starts:
         states = better_states(near, start, states_at(window, start))
         fits.append(fit(near, start, states, noise, 10, *(() if hard else (tuning.ENOUGH,))))
-    best = min((fit_result for fit_result in fits if fit_result is not None), key=lambda one: one.loss, default=None)
+    best = min((fit_result for fit_result in fits if fit_result is not None), key=lambda fit: fit.loss, default=None)
     if best is None:
         return None
     whole = Problem(forward, unknowns, window, horizon=horizon, differences=differences, drift=None if hard else drift)

@@ -230,7 +230,7 @@ def _find_units(guess: Guess, numbers: Mapping[str, Array], scene: Scene, units:
     # the two forces have the same unit
     both = [name for name in ("fx", "fy") if ("excitation", name) in guess.columns]
     for name in both:
-        other = next((guess.units[one] for one in both if one in guess.units), "")
+        other = next((guess.units[force] for force in both if force in guess.units), "")
         if other and name not in guess.units:
             guess.units[name] = other
             guess.because[name] += f", {other} like the other force"

@@ -85,14 +85,14 @@ def bag_metadata(
             total = totals.setdefault(topic.topic, replace(topic, count=0))
             total.count += topic.count
 
-    def span(some: Sequence[PartFacts]) -> dict[str, Any]:
-        filled = [part for part in some if any(topic.count for topic in part.topics)]
+    def span(counted: Sequence[PartFacts]) -> dict[str, Any]:
+        filled = [part for part in counted if any(topic.count for topic in part.topics)]
         start = min((part.start_ns for part in filled), default=0)
         end = max((part.end_ns for part in filled), default=0)
         return {
             "duration": {"nanoseconds": max(0, end - start)},
             "starting_time": {"nanoseconds_since_epoch": start},
-            "message_count": sum(topic.count for part in some for topic in part.topics),
+            "message_count": sum(topic.count for part in counted for topic in part.topics),
         }
 
     listed = [

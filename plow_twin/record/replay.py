@@ -469,8 +469,8 @@ class _Replay:
             self.sink.write_output(*place, record.message())
             return
         name = self.topics[record.topic]
-        here = (self.next_sequence - 1) & _SEQUENCE_MASK
-        if not self.synced or record.sequence != here or (name in _CUMULATIVE and not self.outputs_synced):
+        expected_sequence = (self.next_sequence - 1) & _SEQUENCE_MASK
+        if not self.synced or record.sequence != expected_sequence or (name in _CUMULATIVE and not self.outputs_synced):
             self.report.not_compared[name] += 1
             return
         if self.messages is None:
@@ -479,7 +479,7 @@ class _Replay:
             else:
                 published = self.session.outputs.pop()
                 if len(published.rows):
-                    self.alarms.published(np.array([here]), np.array([self.report.steps - 1]), published)
+                    self.alarms.published(np.array([expected_sequence]), np.array([self.report.steps - 1]), published)
             self.published = None
             self.messages = publication_messages(published, self.header.frame_id, self.header.child_frame_id)
         computed = self.messages.get(name)
@@ -530,11 +530,13 @@ def _warm_up(scene: Scene, tol: float, templates: Templates, *, rows: bool) -> N
     memory = np.zeros(2, ROW) if rows else None
     done = session.advance(stamps, np.zeros((2, 3)), memory, np.arange(2) if rows else NONE, np.array([1]))
     scan(np.zeros(8, np.uint8), np.empty((6, 2), np.int64), np.empty(2, np.int64))
-    none, buffer, flags = np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros(0, bool)
+    no_indexes, buffer, flags = np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros(0, bool)
     sample = sample_template("")
-    read_numbers(buffer, none, none, sample.data, sample.fixed, sample.places, none, np.zeros((0, 6)), flags)
+    read_numbers(
+        buffer, no_indexes, no_indexes, sample.data, sample.fixed, sample.places, no_indexes, np.zeros((0, 6)), flags
+    )
     if rows:
-        sent = Sent(none, none, np.arange(2), 0, 2)
+        sent = Sent(no_indexes, no_indexes, np.arange(2), 0, 2)
         sent.expect(done.published, templates, ~_IS_CUMULATIVE)
         sent.differing(Messages.none(), slice(0))
 

@@ -42,12 +42,12 @@ class RunTime:
         found, done, missing = [], 0, self._holes.find(entries)
         samples = np.flatnonzero(entries.sample)
         for index in [*sorted({*entries.rest, *missing}), len(entries)]:
-            here = samples[np.searchsorted(samples, done) : np.searchsorted(samples, index)]
-            if len(here):
-                stamps = entries.stamp_ns[here]
+            part = samples[np.searchsorted(samples, done) : np.searchsorted(samples, index)]
+            if len(part):
+                stamps = entries.stamp_ns[part]
                 self._reach(int(stamps[0]))
                 self._reach(int(stamps.max()))
-                found += [(int(here[place]), begin, end) for place, begin, end in self.silences.add(stamps)]
+                found += [(int(part[place]), begin, end) for place, begin, end in self.silences.add(stamps)]
             done = index
             if index in missing:
                 self.silences.restart()

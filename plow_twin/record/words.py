@@ -56,9 +56,9 @@ def _eight_differ(typingctx: Any, data: Any, place: Any, address: Any) -> Any:
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         vector = ir.VectorType(_WORD, 8)
-        here = builder.bitcast(_place(context, builder, signature, arguments), vector.as_pointer())
-        there = builder.inttoptr(arguments[2], vector.as_pointer())
-        differing = builder.xor(builder.load(here, align=1), builder.load(there, align=8))
+        own = builder.bitcast(_place(context, builder, signature, arguments), vector.as_pointer())
+        other = builder.inttoptr(arguments[2], vector.as_pointer())
+        differing = builder.xor(builder.load(own, align=1), builder.load(other, align=8))
         kind = ir.FunctionType(_WORD, [vector])
         reduce: Any = cgutils.get_or_insert_function(  # type: ignore[no-untyped-call]
             builder.module, kind, "llvm.vector.reduce.or.v8i64"

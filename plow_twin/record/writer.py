@@ -169,8 +169,8 @@ class RunWriter:
         numbers = sequence + index + np.searchsorted(sorted(digests), index, "right")
         begin = 0
         for end in sorted({*digests, len(stamp_ns)}):
-            here, begin = slice(begin, end), end
-            self.write_samples(numbers[here], log_time_ns[here], stamp_ns[here], wrench[here])
+            part, begin = slice(begin, end), end
+            self.write_samples(numbers[part], log_time_ns[part], stamp_ns[part], wrench[part])
             if end in digests:
                 entry = Digest(int(stamp_ns[end - 1]), digests[end])
                 self.write_entry(int(numbers[end - 1]) + 1, int(log_time_ns[end - 1]), entry)

@@ -123,7 +123,9 @@ class TwinBatch:
         self._edges = [len(scenes) * index // len(self._workers) for index in range(len(self._workers) + 1)]
         if all(fits_lanes(compiled_scene, sampled=True) for _, compiled_scene in _kinds(self._compiled)):
             spans = [range(*span) for span in pairwise(self._edges)]
-            self._workers = [one.with_lanes(self, terms, span) for one, span in zip(self._workers, spans, strict=True)]
+            self._workers = [
+                worker.with_lanes(self, terms, span) for worker, span in zip(self._workers, spans, strict=True)
+            ]
         self._pool = ThreadPoolExecutor(len(self._workers)) if len(self._workers) > 1 else None
         self.reset(start)
 
@@ -247,24 +249,24 @@ class TwinBatch:
         ArgumentError
             The size of the data is not that of a snapshot. The twins are unchanged.
         """
-        here, sample, speed = read_snapshot(snapshot, self._states.dtype)
+        state, sample, speed = read_snapshot(snapshot, self._states.dtype)
         away = np.broadcast_to(np.asarray(moved, dtype=np.float64), (len(self), 6))
         displaced = away.any(axis=1)
         damping = self._states["damping_factor"].copy()
         damping[displaced] = damping[0]
         if not again:
-            damping[:] = here["damping_factor"]
-        self._states[:], self._wrench = here, np.reshape(sample, (1, 3)).copy()
+            damping[:] = state["damping_factor"]
+        self._states[:], self._wrench = state, np.reshape(sample, (1, 3)).copy()
         self._reload()
         self.set_travel_speed(speed)
         row = self.advance(self.time)
         pose = np.concatenate([row.q[0, 0], row.v[0, 0]])
-        self._states[:] = here
+        self._states[:] = state
         self._states["damping_factor"] = damping
         self._reload()
         for index in np.flatnonzero(displaced):
-            there = pose + away[index]
-            self._states["y"][index] = geometry.state_of(self.scenes[index], there[:3], there[3:])
+            displaced_pose = pose + away[index]
+            self._states["y"][index] = geometry.state_of(self.scenes[index], displaced_pose[:3], displaced_pose[3:])
 
     def move(self, which: ArrayLike, q: ArrayLike, v: ArrayLike) -> None:
         """Set the poses and rates of some twins at the current time. Their wear and counters are unchanged.
@@ -394,7 +396,7 @@ class TwinBatch:
         if not len(times):
             return rows
         before, after, begun = self._states, self._before, list[Future[None]]()
-        if any(one.lanes is None or one.lanes.stale for one in self._workers):
+        if any(worker.lanes is None or worker.lanes.stale for worker in self._workers):
             # numpy copies bytes faster than records
             after.view(np.uint8)[:] = before.view(np.uint8)
         try:

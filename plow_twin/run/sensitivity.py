@@ -341,7 +341,7 @@ def _by_shadows(scene: Scene, t_end: float, tol: float, parameters: Sequence[str
     states = _displaced(compiled, compiled.initial_state(), moved * scale, free, first_states, work)
     matrices, changes, ended = [], [], []
     for end in _ends(t_end).tolist():
-        followed = [_follow(one, state, end, work) for one, state in zip(scenes, states, strict=True)]
+        followed = [_follow(scene, state, end, work) for scene, state in zip(scenes, states, strict=True)]
         states = [motion.state for motion in followed]
         reached = np.array([_pose_and_rate(motion) for motion in followed])
         away = (reached[1:] - reached[0])[:, free] / scale[free]

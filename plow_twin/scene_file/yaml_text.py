@@ -195,9 +195,9 @@ def _repeated_keys(node: yaml.Node, path: str) -> Iterator[Problem]:
         lines: dict[str, int] = {}
         for key, value in node.value:
             name = str(key.value)
-            here = f"{path}.{name}" if path else name
+            key_path = f"{path}.{name}" if path else name
             line = key.start_mark.line + 1
             if name in lines:
-                yield Problem(here, f"the key twice, in lines {lines[name]} and {line}", "each key once")
+                yield Problem(key_path, f"the key twice, in lines {lines[name]} and {line}", "each key once")
             lines[name] = line
-            yield from _repeated_keys(value, here)
+            yield from _repeated_keys(value, key_path)

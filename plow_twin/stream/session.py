@@ -357,11 +357,11 @@ class Session:
             # begin there
             if resumed:
                 end = begin + 1
-            here = slice(begin, end)
+            part = slice(begin, end)
             chosen = taken[(taken >= begin) & (taken < end)] - begin
-            here_after = digest_after[(digest_after > begin) & (digest_after <= end)] - begin
-            out = None if rows is None else rows[here]
-            parts.append(self._advance(stamps[here], wrench[here], out, chosen, here_after, resumed=resumed))
+            part_digest_after = digest_after[(digest_after > begin) & (digest_after <= end)] - begin
+            out = None if rows is None else rows[part]
+            parts.append(self._advance(stamps[part], wrench[part], out, chosen, part_digest_after, resumed=resumed))
             if resumed:
                 self._store_snapshot(resumed=True)
             begin, resumed = end, False

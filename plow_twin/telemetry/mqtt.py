@@ -151,8 +151,8 @@ class MqttOut:
     def __init__(self, prefix: str, **options: Any) -> None:
         online = f"{prefix}/online"
         self._prefix, self._gone = prefix, Message(online, b"false", True)
-        there = Message(online, b"true", True)
-        self._broker = Broker(will=lambda: self._gone, on_connected=lambda: [there], **options)
+        present = Message(online, b"true", True)
+        self._broker = Broker(will=lambda: self._gone, on_connected=lambda: [present], **options)
         self.state = self._broker.state
 
     async def open(self, link: Link, newest: Newest) -> None:

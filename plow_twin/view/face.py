@@ -48,7 +48,7 @@ class FaceChart:
     def travel(self, travel: Travel) -> None:
         """Change the speed from the stamp of `travel` on."""
         if self._reached_ns is not None and travel.stamp_ns > self._reached_ns:
-            insort(self._coming, travel, key=lambda one: one.stamp_ns)
+            insort(self._coming, travel, key=lambda waiting: waiting.stamp_ns)
         else:
             self._set_speed(travel.speed_m_s)
 
@@ -78,14 +78,14 @@ class FaceChart:
         self._place_m, self._reached_ns = float(place[-1]), int(stamps[-1])
         if not self._speed:
             return
-        here = self._passes[-1]
+        newest_pass = self._passes[-1]
         pieces: NDArray[np.int64] = np.floor(place / self._piece_m).astype(np.int64)
         for piece in np.unique(pieces).tolist():
-            here[piece] = max(here.get(piece, 0.0), float(force[pieces == piece].max()))
-        while len(here) > _MOST_PIECES:
+            newest_pass[piece] = max(newest_pass.get(piece, 0.0), float(force[pieces == piece].max()))
+        while len(newest_pass) > _MOST_PIECES:
             self._piece_m *= 2.0
             self._passes = [_halved(forces) for forces in self._passes]
-            here = self._passes[-1]
+            newest_pass = self._passes[-1]
 
     def restart(self) -> None:
         """Continue after a reset. A reset can decrease the stamps, so the waiting speeds are applied at once."""

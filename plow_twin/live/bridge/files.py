@@ -286,8 +286,8 @@ class Files(Bridge):
             begin = 0
             while begin < len(lines):
                 end = begin + (BATCH if tail.rows.columns is not None else 1)
-                here, rows = lines[begin:end], tail.rows
-                table: Messages = Table(tail.topic, here, rows)
+                batch, rows = lines[begin:end], tail.rows
+                table: Messages = Table(tail.topic, batch, rows)
                 if not rows.under_header:
                     table = list(table)
                 if len(table):

@@ -62,15 +62,15 @@ def compare(t: Array, predicted: Array, t_measured: Array, measured: Array) -> C
     return Comparison(len(values), bias, rms, correlation, lag_s, aligned, _coherence(times, here, values))
 
 
-def _correlation(one: Array, other: Array) -> float | None:
-    finite = np.isfinite(one) & np.isfinite(other)
-    one, other = one[finite], other[finite]
-    if len(one) < _FEWEST:
+def _correlation(first: Array, second: Array) -> float | None:
+    finite = np.isfinite(first) & np.isfinite(second)
+    first, second = first[finite], second[finite]
+    if len(first) < _FEWEST:
         return None
-    one, other = one - one.mean(), other - other.mean()
-    size = math.sqrt(float(one @ one) * float(other @ other))
+    first, second = first - first.mean(), second - second.mean()
+    size = math.sqrt(float(first @ first) * float(second @ second))
     # rounding errors could give a magnitude above 1
-    return min(1.0, max(-1.0, float(one @ other) / size)) if size > 1e-300 else None
+    return min(1.0, max(-1.0, float(first @ second) / size)) if size > 1e-300 else None
 
 
 def _at(times: Array, t: Array, predicted: Array) -> Array:

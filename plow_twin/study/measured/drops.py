@@ -40,7 +40,7 @@ class Drops:
             pose = data["pose"] * data["scale"]
         pose[:, :, 2] = np.unwrap(pose[:, :, 2], axis=1)
         flights = np.array([_flight_rows(poses) for poses in pose])
-        return cls(pose, flights, tuple(_bounces(one[:, 1]) for one in pose))
+        return cls(pose, flights, tuple(_bounces(poses[:, 1]) for poses in pose))
 
     def usable(self) -> list[int]:
         """Return the indices of the drops that have at least two bounces and a flight long enough for a fit."""

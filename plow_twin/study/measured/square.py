@@ -196,13 +196,13 @@ def _row_times(rows: Array, gravity: float) -> Array:
 
     A lost row doubles the distance between its neighbours and is counted as an interval.
     """
-    way = np.hypot(*np.diff(rows[:, :2], axis=0).T)
-    steps = np.ones(len(way))
+    distance = np.hypot(*np.diff(rows[:, :2], axis=0).T)
+    steps = np.ones(len(distance))
     for _ in range(3):
         at = np.concatenate([[0.0], np.cumsum(steps)])
         middle = 0.5 * (at[1:] + at[:-1]) * gravity * _DT * _DT
-        expected = np.median(way / steps - middle) + middle
-        steps = np.maximum(np.round(way / np.maximum(expected, 1e-6)), 1.0)
+        expected = np.median(distance / steps - middle) + middle
+        steps = np.maximum(np.round(distance / np.maximum(expected, 1e-6)), 1.0)
     at = np.concatenate([[0.0], np.cumsum(steps)])
     times: Array = (at - at[-1]) * _DT
     return times
