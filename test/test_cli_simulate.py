@@ -28,7 +28,7 @@ from plow_twin.scene_file.presets import scene_path
 RUN = ["simulate", "paper", "--t-end", "2", "--output-dt", "0.01"]
 
 
-def test_csv_and_json_keep_the_contract(tmp_path: Path) -> None:
+def test_csv_and_json_contain_the_documented_columns_and_keys(tmp_path: Path) -> None:
     completed = plow_twin(*RUN, "--tol", "1e-10", "--out", "run.csv", "--json", cwd=tmp_path)
     assert completed.returncode == 0, completed.stderr
     result = simulate(load_scene(scene_path("paper")), 2.0, 0.01, tol=1e-10)

@@ -48,7 +48,7 @@ def test_friction_and_exponent_have_least_values() -> None:
     assert least_change(scene, "head.mass_kg") == -np.inf
 
 
-def test_a_speed_of_friction_differs_only_where_bodies_rub_without_stick() -> None:
+def test_the_speed_of_viscous_friction_can_differ_only_for_friction_without_stick() -> None:
     scene = preset("paper")
     rubbing = moved_scene(moved_scene(scene, FRICTION, 0.1, 1e-3), CREEP, -0.5, 1e-3)
     assert rubbing.friction == Friction(0.1, 0.005)

@@ -64,7 +64,7 @@ def test_a_bag_without_its_metadata_and_with_an_open_log_is_read_to_its_end(tmp_
     assert times == [BASE_NS + index * STEP_NS for index in range(COUNT)]
 
 
-def test_a_bag_compressed_by_message_is_read_and_one_compressed_as_a_whole_is_named(tmp_path: Path) -> None:
+def test_a_bag_compressed_by_message_is_read_and_a_bag_compressed_as_a_whole_is_named(tmp_path: Path) -> None:
     for mode in (CompressionMode.MESSAGE, CompressionMode.FILE):
         bag = BagWriter(tmp_path / mode.name, version=9, storage_plugin=StoragePlugin.SQLITE3)
         bag.set_compression(mode, CompressionFormat.ZSTD)

@@ -301,7 +301,7 @@ def problems(values: Mapping[str, Any]) -> list[Problem]:
 
 
 def _bounded(value: Any) -> Any:
-    """Return a list without the items that no parameter has, because the check of each of them takes time."""
+    """Return the first `_MOST_ITEMS` items of a list, which are more than any parameter has; checks take time."""
     return value[:_MOST_ITEMS] if isinstance(value, Sequence) and not isinstance(value, str) else value
 
 

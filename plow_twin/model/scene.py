@@ -312,7 +312,7 @@ class Table:
     name: str
     t: NDArray[np.float64]
     wrench: NDArray[np.float64]
-    hold: str = _choice("between the samples", ("linear", "zero"), "linear")
+    hold: str = _choice("load between the samples", ("linear", "zero"), "linear")
     at_m: tuple[float, float] = _quantity("m", "point of action from the cavity's centre, world axes", (0.0, 0.0))
 
 

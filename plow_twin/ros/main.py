@@ -1,4 +1,4 @@
-"""The program `twin`, which runs one node in one process and stops cleanly at the signals SIGINT and SIGTERM."""
+"""The program `twin`, which runs one node in one process and stops cleanly at a stop signal (`live.stop`)."""
 
 from __future__ import annotations
 
