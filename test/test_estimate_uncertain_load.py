@@ -11,10 +11,10 @@ from estimate_support import GROUPS, KINDS, draw, known, mismatched
 from plow_twin.estimate import tuning
 from plow_twin.estimate.equation_error import EquationError
 from plow_twin.estimate.estimate import estimate
-from plow_twin.estimate.measurements import Load, Poses
+from plow_twin.estimate.measurements import Load, Poses, filled
 from plow_twin.estimate.result import Estimate, State
 from plow_twin.estimate.screening import thinned
-from plow_twin.estimate.start import filled, range_of_motion
+from plow_twin.estimate.start import range_of_motion
 from plow_twin.estimate.uncertain_load import compare_under_uncertain_load
 from plow_twin.estimate.unknowns import Unknowns
 

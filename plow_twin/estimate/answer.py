@@ -75,7 +75,7 @@ def answer(scene: Scene, window: Window, guess: Guess, requests: Requests) -> An
 
 
 def _forces(scene: Scene, result: Estimate, load: Load, requests: Requests) -> dict[str, Any]:
-    if State.PRIOR in (result.horizontal_state, result.vertical_state):
+    if State.PRIOR in result.states:
         raise ForcesError("estimate: got only the prior, expected an estimated clearance")
     if load.constant:
         raise ForcesError("load: got the same value throughout, expected a measured load")

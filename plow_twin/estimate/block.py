@@ -110,20 +110,18 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, prior_estimate: Estim
             f"poses: got {len(poses.t)} complete poses with noise {level.tolist()}, expected at least "
             f"{2 * _FLIGHT_ROWS[0]} with some noise in each component"
         )
-        return replace(prior_estimate, horizontal_state=unseen, vertical_state=unseen, reasons=(reason,))
+        return prior_estimate.having(prior_estimate.clearances, (unseen, unseen), reasons=(reason,))
     impacts_found, contacts = impacts(scene, load, poses, level)
     reason = _unfit(impacts_found, contacts)
     if reason:
-        return replace(prior_estimate, horizontal_state=unseen, vertical_state=unseen, reasons=(reason,))
+        return prior_estimate.having(prior_estimate.clearances, (unseen, unseen), reasons=(reason,))
     met, reasons = _on_walls(
         scene, [impact for impact in impacts_found if impact.gained < tuning.GAINED], prior_estimate
     )
     value, deviation = _solve(scene, met, prior_estimate, level)
     clearances, states = [], []
     bias: list[Interval | None] = [Interval.normal(*pair) for pair in zip(value[_BIAS], deviation[_BIAS], strict=True)]
-    for axis, (name, before) in enumerate(
-        (("horizontal", prior_estimate.horizontal), ("vertical", prior_estimate.vertical))
-    ):
+    for axis, (name, before) in enumerate(zip(("horizontal", "vertical"), prior_estimate.clearances, strict=True)):
         count = {wall: sum(impact.wall == wall for impact in met) for wall, (its, _) in WALLS.items() if its == axis}
         share = float(deviation[axis]) / max(before.deviation, 1e-300)
         observed = share < tuning.OBSERVED_SHARE
@@ -142,15 +140,10 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, prior_estimate: Estim
             got = f"a deviation of {1e3 * float(deviation[axis]):.3g} mm, expected at most {1e3 * tuning.OBSERVED:g} mm"
             reasons.append(f"{name}: rough, {counts} leave {got}")
     restitution = {"restitution": float(np.median([impact.restitution for impact in met]))} if met else {}
-    return replace(
-        prior_estimate,
-        horizontal=clearances[0],
-        vertical=clearances[1],
-        horizontal_state=states[0],
-        vertical_state=states[1],
-        bias_x=bias[0],
-        bias_y=bias[1],
-        bias_theta=bias[2],
+    return prior_estimate.having(
+        clearances,
+        states,
+        **dict(zip(("bias_x", "bias_y", "bias_theta"), bias, strict=True)),
         noise=(float(level[0]), float(level[1]), float(level[2])),
         reasons=tuple(reasons),
         figures={"impacts": float(len(met)), **restitution},
@@ -173,7 +166,7 @@ def _on_walls(scene: Scene, every: list[Impact], prior_estimate: Estimate) -> tu
     met: list[Impact] = []
     reasons = []
     for wall, (axis, _) in WALLS.items():
-        clearance = (prior_estimate.horizontal, prior_estimate.vertical)[axis]
+        clearance = prior_estimate.clearances[axis]
         expected = 0.5 * ((scene.frame.width_m, scene.frame.height_m)[axis] + clearance.mean)
         most = 0.5 * tuning.OUTLYING * clearance.deviation
         own = [impact for impact in every if impact.wall == wall]
@@ -190,9 +183,9 @@ def _on_walls(scene: Scene, every: list[Impact], prior_estimate: Estimate) -> tu
 
 def _solve(scene: Scene, met: list[Impact], prior_estimate: Estimate, level: Array) -> tuple[Array, Array]:
     mean = np.zeros(_SIZE)
-    mean[_CLEARANCES] = prior_estimate.horizontal.mean, prior_estimate.vertical.mean
+    mean[_CLEARANCES] = [clearance.mean for clearance in prior_estimate.clearances]
     prior = np.zeros(_SIZE)
-    prior[_CLEARANCES] = prior_estimate.horizontal.deviation, prior_estimate.vertical.deviation
+    prior[_CLEARANCES] = [clearance.deviation for clearance in prior_estimate.clearances]
     prior[_BIAS] = np.array([quantity.deviation for quantity in QUANTITIES])[BIAS]
     # the prior was chosen for the size of the paper's machine
     prior[_LEVER] = UNSTATED["lever_x"] * geometry.half_diagonal(scene) / PAPER_LENGTH

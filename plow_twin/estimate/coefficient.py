@@ -16,6 +16,7 @@ from scipy.special import chdtrc, ndtri
 
 from plow_twin.estimate import tuning
 from plow_twin.estimate.life import LifeError, Path, wear_path
+from plow_twin.estimate.measurements import interpolated
 from plow_twin.estimate.result import NORMAL_P95, Interval
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Clearance, Scene
@@ -127,7 +128,7 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
         likely[index] = -0.5 * float((weight * misfit**2).sum() + ((ln_k - middle) / spread) ** 2)
         means[index] = start + grown[-1]
         now = math.exp(float(ln_k)) * float(history.travel[-1]) / wear.pad_area_m2
-        depths[index] = [np.interp(now, path.exposure, pad) for pad in path.depth.T]
+        depths[index] = interpolated(np.array([now]), path.exposure, path.depth)
     share = np.exp(likely - likely.max())
     share /= share.sum()
     ends = np.exp(grid[[0, -1]])
@@ -160,7 +161,7 @@ def _check_fit(history: History, growth: Array) -> None:
 
 def _growth(path: Path, exposure: Array) -> Array:
     growth = path.clearance_growth()
-    out = np.stack([np.interp(exposure, path.exposure, column) for column in growth.T], axis=1)
+    out = interpolated(exposure, path.exposure, growth)
     if len(path.exposure) > 1:
         slope = (growth[-1] - growth[-2]) / (path.exposure[-1] - path.exposure[-2])
         out += np.maximum(exposure - path.exposure[-1], 0.0)[:, None] * slope

@@ -27,8 +27,8 @@ def with_gaps(result: Estimate, by_gaps: GapsFit) -> Estimate:
     values, states = [], []
     for name, value, state, mean, deviation in zip(
         ("horizontal", "vertical"),
-        (result.horizontal, result.vertical),
-        (result.horizontal_state, result.vertical_state),
+        result.clearances,
+        result.states,
         by_gaps.clearance.tolist(),
         by_gaps.deviation.tolist(),
         strict=True,
@@ -47,12 +47,9 @@ def with_gaps(result: Estimate, by_gaps: GapsFit) -> Estimate:
     if found:
         states = [State.WITHDRAWN] * 2
     state = State.WITHDRAWN if found else State.ESTIMATED
-    return replace(
-        result,
-        horizontal=values[0],
-        vertical=values[1],
-        horizontal_state=states[0],
-        vertical_state=states[1],
+    return result.having(
+        values,
+        states,
         groups=result.groups | {name: (value, state) for name, value in by_gaps.groups.items()},
         sensor="suspect" if found else result.sensor,
         reasons=(*result.reasons, *found),
@@ -71,7 +68,7 @@ def with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
         else value
         for value, state, mean, deviation in zip(
             result.in_scene_frame(),
-            (result.horizontal_state, result.vertical_state),
+            result.states,
             bounced.clearance.tolist(),
             bounced.clearance_deviation.tolist(),
             strict=True,
@@ -90,7 +87,7 @@ def with_apparent(result: Estimate, apparent: tuple[Interval, ...]) -> Estimate:
             value.mean + new.mean - old.mean,
             math.hypot(new.deviation, math.sqrt(max(value.deviation**2 - old.deviation**2, 0.0))),
         )
-        for value, old, new in zip((result.horizontal, result.vertical), result.in_scene_frame(), apparent, strict=True)
+        for value, old, new in zip(result.clearances, result.in_scene_frame(), apparent, strict=True)
     )
     return replace(
         result,

@@ -32,13 +32,23 @@ from scipy.special import log_ndtr, ndtr
 
 from plow_twin.estimate import tuning
 from plow_twin.estimate.compliance import by_compliance
-from plow_twin.estimate.fit import DIFFERENCES, FEWEST_OF_SWING, LAG, WALLS, Fit, Point, Problem, freed, huber_weight
+from plow_twin.estimate.fit import (
+    DIFFERENCES,
+    FEWEST_OF_SWING,
+    LAG,
+    WALLS,
+    Fit,
+    Point,
+    Problem,
+    huber_weight,
+    scatter_ratio,
+)
 from plow_twin.estimate.harmonics import COMPONENTS, Harmonics
 from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER
 from plow_twin.estimate.pads import deviations
 from plow_twin.estimate.priors import ROUNDING, UNSTATED, deviation_of
 from plow_twin.estimate.result import NORMAL_P95
-from plow_twin.estimate.unknowns import GX, GY, MOVING, SIZE, SOFTNESS
+from plow_twin.estimate.unknowns import GX, GY, SIZE, SOFTNESS
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import LEAST_EXPONENT, Friction, Scene, largest_exponent
 
@@ -445,13 +455,9 @@ class _Linearised:
 
     def scatter(self) -> float:
         scores = np.stack([score[:SIZE] for _, score in self._blocks])
-        scores = scores - scores.mean(axis=0)
-        count, moving = len(scores), list(MOVING)
-        held = np.diag(self._precision[:SIZE])
-        inverse = np.linalg.inv(np.sum([normal[:SIZE, :SIZE] for normal, _ in self._blocks], axis=0) + held)
-        meat = scores.T @ scores * count / max(count - 1, 1) + held
-        ratio = np.diag(inverse @ meat @ inverse) / np.diag(inverse)
-        return freed(count, len(moving)) * float(ratio[moving].mean())
+        precision, normals = self._precision[:SIZE], [normal[:SIZE, :SIZE] for normal, _ in self._blocks]
+        inverse = np.linalg.inv(np.sum(normals, axis=0) + np.diag(precision))
+        return scatter_ratio(scores, precision, inverse, np.diag(inverse), len(scores))
 
     def surprise(self, mean: Array, often: Array) -> float:
         """Return `Graded.surprise`. The linearisation is inaccurate if the result exceeds 1."""

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
-from plow_twin.estimate.measurements import Load
+from plow_twin.estimate.measurements import Load, interpolated
 from plow_twin.estimate.start import WALLS
 from plow_twin.estimate.unknowns import Unknowns
 from plow_twin.model import geometry
@@ -125,7 +125,7 @@ class EquationError:
 
     def fit(self, q: Array, reach: Array, ln_depth: float) -> Walls:
         """Return the fit to the poses `q`, (n, 3), from starting values of the reaches (4,) [m] and of `ln_depth`."""
-        poses = np.stack([np.interp(self._grid, self._t, column) for column in q.T], axis=1)
+        poses = interpolated(self._grid, self._t, q)
         corners, normals = self._geometry(poses)
         acceleration = self._weighed(poses, self._curve)
         stiffness, weight = self._force / math.exp(ln_depth), np.ones_like(acceleration)
@@ -146,7 +146,7 @@ class EquationError:
 
     def touched(self, q: Array, walls: Walls, deeper: float) -> Array:
         """Return the time in s during which a corner is more than `deeper` m behind each wall, shape (4,)."""
-        poses = np.stack([np.interp(self._grid, self._t, column) for column in q.T], axis=1)
+        poses = interpolated(self._grid, self._t, q)
         beyond = self._geometry(poses)[0] - walls.reach[_WALL] > deeper
         step = self._grid[1] - self._grid[0]
         return np.array([step * beyond[:, wall].any(axis=1).sum() for wall in WALLS])
@@ -156,7 +156,7 @@ class EquationError:
 
         It is averaged over `tuning.LOAD_AVERAGED`, because its values during impacts are wrong.
         """
-        poses = np.stack([np.interp(self._grid, self._t, column) for column in q.T], axis=1)
+        poses = interpolated(self._grid, self._t, q)
         stiffness = self._force / math.exp(ln_depth)
         columns = self._columns(*self._geometry(poses), reach, stiffness)[..., :2]
         contact = columns @ np.array([stiffness, stiffness * damping]) / _UNIT

@@ -180,7 +180,7 @@ def _usable(load: Load, poses: Poses) -> tuple[Load, Poses, int]:
 
 
 def _known(result: Estimate) -> bool:
-    return result.horizontal_state.known or result.vertical_state.known
+    return any(state.known for state in result.states)
 
 
 def _unexplained(result: Estimate) -> bool:
@@ -363,12 +363,9 @@ def under_uncertain_load(
     exponent = unknowns.scene.contact.exponent
     log = Interval.normal(*compared.ln_depth)
     mean, soft, hard = (unknowns.force / math.exp(value) ** exponent for value in (log.mean, log.p95, log.p05))
-    return replace(
-        result,
-        horizontal=values[0],
-        vertical=values[1],
-        horizontal_state=states[0],
-        vertical_state=states[1],
+    return result.having(
+        values,
+        states,
         stiffness=Interval(mean, soft, hard),
         damping=damping_interval(unknowns, Interval.normal(*compared.ln_damping)),
         correlation=None,

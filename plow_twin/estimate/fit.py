@@ -586,18 +586,66 @@ def normal_equations(problem: Problem, point: Point, linear: Linear, variance: A
     ), gradient
 
 
-def freed(swings: int, unknowns: int) -> float:
-    """Return the factor that restores the scatter lost by fitting `unknowns` to few swings, at most `MOST_FREED`."""
-    return swings / max(swings - unknowns, swings / tuning.MOST_FREED)
+@dataclass(frozen=True, eq=False)
+class Eliminated:
+    """Normal equations of a swing for b unknowns, from which its starting state has been eliminated.
+
+    swing : index of the swing
+    normal : (b, b) matrix, the information of the swing
+    score : (b,) right-hand side
+    state : (6,) step of the starting state if the b unknowns do not change
+    gain : (b, 6) derivative of minus this step with respect to the steps of the b unknowns
+    """
+
+    swing: int
+    normal: Array
+    score: Array
+    state: Array
+    gain: Array
 
 
-def joint_step(problem: Problem, result: Fit, columns: Array, precision: Array, pull: Array) -> tuple[Array, Array]:
-    """Return the step and the covariance of `whole_step`."""
-    step, covariance, _ = whole_step(problem, result, columns, precision, pull)
-    return step, covariance
+def eliminated(problem: Problem, result: Fit, columns: Array | None = None) -> Iterator[Eliminated]:
+    """Yield the normal equations of each swing that has enough poses, without links between swings.
+
+    Their unknowns are the shared unknowns and, with `columns` as in `joint_step`, further unknowns.
+    """
+    z = np.abs(np.nan_to_num(result.point.residual)) / np.sqrt(result.variance)
+    weight = np.isfinite(result.point.residual) * huber_weight(z) / result.variance
+    residual, rows = np.nan_to_num(result.point.residual), result.linear.rows
+    border = rows[:, :, :SIZE] if columns is None else np.concatenate([rows[:, :, :SIZE], columns], axis=2)
+    for swing in range(problem.window.swings):
+        inside = result.point.swing == swing
+        if inside.sum() < FEWEST_OF_SWING:
+            continue
+        shared, own = border[inside].reshape(-1, border.shape[2]), rows[inside][:, :, SIZE:].reshape(-1, OWN)
+        weights = weight[inside].reshape(-1, 1)
+        weighted_residual = (weights * residual[inside].reshape(-1, 1)).ravel()
+        cross, held = (weights * shared).T @ own, (weights * own).T @ own
+        held += np.diag(1e-6 + 1e-9 * np.diag(held))
+        gain, score = np.linalg.solve(held, cross.T).T, own.T @ weighted_residual
+        normal = (weights * shared).T @ shared - gain @ cross.T
+        yield Eliminated(swing, normal, shared.T @ weighted_residual - gain @ score, np.linalg.solve(held, score), gain)
 
 
-def whole_step(
+def scatter_ratio(
+    scores: Array, precision: Array, inverse: Array, expected: Array, swings: int, unknowns: int = len(MOVING)
+) -> float:
+    """Return the variance of the shared unknowns from the scatter of k swings, divided by the variance `expected`.
+
+    The ratio is averaged over all unknowns that move the head, because the ratio of a single unknown would be too
+    random. A factor of at most `MOST_FREED` restores the scatter that is lost by fitting `unknowns` to `swings` swings.
+    `scores`, shape (k, b), are right-hand sides of the normal equations, `precision`, shape (b,), the inverse variances
+    of the prior, and `inverse` is that of the normal matrix.
+
+    Reference: White, Econometrica 50 (1982) 1 (maximum likelihood of misspecified models).
+    """
+    scores = scores - scores.mean(axis=0)
+    meat = scores.T @ scores * len(scores) / max(len(scores) - 1, 1) + np.diag(precision)
+    restored = swings / max(swings - unknowns, swings / tuning.MOST_FREED)
+    return restored * float((np.diag(inverse @ meat @ inverse) / expected)[list(MOVING)].mean())
+
+
+def joint_step(
     problem: Problem, result: Fit, columns: Array, precision: Array, pull: Array
 ) -> tuple[Array, Array, Array]:
     """Return the linearised step of the unknowns, its covariance, and the step of the starting states.
@@ -617,31 +665,17 @@ def whole_step(
     tuple of ndarray, shapes (SIZE + k,), (SIZE + k, SIZE + k), (s, 6)
         The step of a starting state is 0 in a swing with few poses.
     """
-    size = SIZE + len(precision)
     normal = np.diag(np.concatenate([1.0 / problem.deviation**2, precision]))
     gradient = np.concatenate([(problem.mean - result.shared) / problem.deviation**2, pull])
-    z = np.abs(np.nan_to_num(result.point.residual)) / np.sqrt(result.variance)
-    weight = np.isfinite(result.point.residual) * huber_weight(z) / result.variance
-    residual = np.nan_to_num(result.point.residual)
-    alone, gains = np.zeros((problem.window.swings, OWN)), np.zeros((problem.window.swings, size, OWN))
-    for swing in range(problem.window.swings):
-        inside = result.point.swing == swing
-        if inside.sum() < FEWEST_OF_SWING:
-            continue
-        shared = np.concatenate([result.linear.rows[inside][:, :, :SIZE], columns[inside]], axis=2).reshape(-1, size)
-        own = result.linear.rows[inside][:, :, SIZE:].reshape(-1, 6)
-        weights = weight[inside].reshape(-1, 1)
-        cross = (weights * shared).T @ own
-        held = (weights * own).T @ own
-        held += np.diag(1e-6 + 1e-9 * np.diag(held))
-        gain = np.linalg.solve(held, cross.T).T
-        weighted_residual = (weights * residual[inside].reshape(-1, 1)).ravel()
-        normal += (weights * shared).T @ shared - gain @ cross.T
-        gradient += shared.T @ weighted_residual - gain @ (own.T @ weighted_residual)
-        alone[swing], gains[swing] = np.linalg.solve(held, own.T @ weighted_residual), gain
+    swings = list(eliminated(problem, result, columns))
+    for swing in swings:
+        normal += swing.normal
+        gradient += swing.score
     covariance: Array = np.linalg.inv(normal)
-    step = covariance @ gradient
-    return step, covariance, alone - step @ gains
+    step, states = covariance @ gradient, np.zeros((problem.window.swings, OWN))
+    for swing in swings:
+        states[swing.swing] = swing.state - step @ swing.gain
+    return step, covariance, states
 
 
 def _descend(

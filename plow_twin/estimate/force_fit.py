@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
 from plow_twin.estimate.contact_forces import Cells, ContactForces, ForcesOfFit, cells_of
-from plow_twin.estimate.fit import Fit, Linear, Point, Problem, freed, huber_loss, pieces
+from plow_twin.estimate.fit import Fit, Linear, Point, Problem, huber_loss, pieces, scatter_ratio
 from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER, FEWEST_IN_CONTACT
 from plow_twin.estimate.result import Cell, ForcesUsed, Interval
 from plow_twin.estimate.unknowns import DAMPING, MOVING, QUANTITIES, SIZE
@@ -296,11 +296,8 @@ class _Joint:
 
     def _scatter(self, blocks: list[_Block], covariance: Array) -> float:
         scores = np.stack([block.score for block in blocks])
-        scores = scores - scores.mean(axis=0)
-        count, unknown, moving = len(blocks), self._border - (SIZE - len(MOVING)), list(MOVING)
-        meat = scores.T @ scores * count / max(count - 1, 1) + np.diag(self._precision)
-        ratio = np.diag(covariance @ meat @ covariance) / np.diag(covariance)
-        return freed(count, unknown) * float(ratio[moving].mean())
+        unknowns = self._border - (SIZE - len(MOVING))
+        return scatter_ratio(scores, self._precision, covariance, np.diag(covariance), len(blocks), unknowns)
 
     def _summary(self, at: _Evaluation, covariance: Array) -> JointFit:
         cells, place = self._cells, at.place

@@ -103,7 +103,7 @@ class ForceEnsemble:
     """
 
     def __init__(self, scene: Scene, estimate: Estimate, members: int = MEMBERS, *, start: float = 0.0) -> None:
-        if State.WITHDRAWN in (estimate.horizontal_state, estimate.vertical_state):
+        if State.WITHDRAWN in estimate.states:
             raise ForcesError(
                 f"estimate: got a withdrawn estimate ({'; '.join(estimate.reasons)}), expected a valid one"
             )

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
-from plow_twin.estimate.fit import Fit, Problem, fit, whole_step
+from plow_twin.estimate.fit import Fit, Problem, fit, joint_step
 from plow_twin.estimate.harmonics import COMPONENTS, Harmonics
 from plow_twin.estimate.measurements import Load
 from plow_twin.estimate.search import better_states, near_horizon
@@ -64,7 +64,7 @@ def _alternated(
         value = harmonics.amplitude.ravel()
         precision = np.full(len(value), tuning.LACKING**-2.0)
         columns = problem.by_harmonics(fitted.point, harmonics)
-        step, covariance, states = whole_step(problem, fitted, columns, precision, -value * precision)
+        step, covariance, states = joint_step(problem, fitted, columns, precision, -value * precision)
         (shared, change), covariance = np.split(step, [SIZE]), covariance[SIZE:, SIZE:]
         size = float(change @ np.linalg.solve(covariance, change))
         # a change within the noise is left to the linearised step of `discrepancy.graded`

@@ -194,7 +194,7 @@ class Load:
 
     def at(self, t: Array) -> Array:
         """Return the linearly interpolated load at the times `t`, shape (n, 3)."""
-        return np.stack([np.interp(t, self.t, column) for column in self.wrench.T], axis=1)
+        return interpolated(t, self.t, self.wrench)
 
     def between(self, start: float, end: float) -> Load:
         """Return the samples that determine the load in the closed interval [start, end]."""
@@ -238,7 +238,7 @@ class Load:
         span = float(self.t[-1] - self.t[0])
         count = int(min(max(64, 4 * len(self.t)), 8192))
         grid = np.linspace(self.t[0], self.t[-1], count)
-        columns = np.stack([np.interp(grid, self.t, column) for column in self.wrench.T])
+        columns = np.ascontiguousarray(self.at(grid).T)
         columns -= columns.mean(axis=1, keepdims=True)
         sizes = columns.std(axis=1)
         if not sizes.any():
@@ -254,8 +254,8 @@ class Load:
         place = int(np.searchsorted(self.t, t))
         if not 0 < place < len(self.t) or self.t[place] == t:
             return self
-        value = [np.interp(t, self.t, column) for column in self.wrench.T]
-        return Load(np.insert(self.t, place, t), np.insert(self.wrench, place, value, axis=0), self.deviation)
+        wrench = np.insert(self.wrench, place, self.at(np.array([t])), axis=0)
+        return Load(np.insert(self.t, place, t), wrench, self.deviation)
 
     def smooth(self, step: float) -> Load:
         """Return values of a cubic spline through the samples at intervals of about `step` in s.
@@ -382,6 +382,11 @@ def _from_lines(t: Array, value: Array) -> Array:
     off = np.diff(slope, axis=0) * (step[:-1] * step[1:] / (step[:-1] + step[1:]))[:, None]
     mean: Array = (off**2).mean(axis=0)
     return mean
+
+
+def interpolated(t: Array, times: Array, rows: Array) -> Array:
+    """Return the rows at the times `times`, linearly interpolated at the times `t`."""
+    return np.stack([np.interp(t, times, column) for column in rows.T], axis=1)
 
 
 def filled(poses: Poses) -> Array:

@@ -91,7 +91,7 @@ def with_differences(problem: Problem, fitted: Fit) -> tuple[Problem, Fit] | Non
 
 def of_differences(problem: Problem, fitted: Fit) -> Array:
     """Return the covariance of the shared unknowns due to uncertain differences, shape (SIZE, SIZE)."""
-    _, covariance = _joint_step(problem, fitted)
+    covariance = _joint_step(problem, fitted)[1]
     held = np.linalg.inv(covariance)[:SIZE, :SIZE]
     added: Array = covariance[:SIZE, :SIZE] - np.linalg.inv(held)
     return added
@@ -99,6 +99,5 @@ def of_differences(problem: Problem, fitted: Fit) -> Array:
 
 def _joint_step(problem: Problem, fitted: Fit) -> tuple[Array, Array]:
     precision = deviations() ** -2.0
-    return joint_step(
-        problem, fitted, problem.by_differences(fitted.point), precision, -problem.differences * precision
-    )
+    columns, pull = problem.by_differences(fitted.point), -problem.differences * precision
+    return joint_step(problem, fitted, columns, precision, pull)[:2]

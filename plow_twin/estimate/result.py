@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
 from html import escape
-from statistics import NormalDist
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
+from scipy.special import erfcx, log_ndtr, ndtri, ndtri_exp
 
 from plow_twin.estimate.harmonics import Harmonics
 from plow_twin.estimate.unknowns import CORRELATED, QUANTITIES
@@ -21,9 +20,6 @@ Array = NDArray[np.float64]
 
 #: 95 % quantile of the standard normal distribution, from which the ends of a 90 % interval are derived.
 NORMAL_P95: Final = float(ndtri(0.95))
-#: Lower bound in standard deviations of the tail of the normal distribution that is treated as exponential.
-_FAR = 30.0
-_STANDARD: Final = NormalDist()
 
 
 class State(Enum):
@@ -82,11 +78,8 @@ def _tail(least: float) -> tuple[float, float, float]:
 
     The import of `scipy.stats.truncnorm` would take half a second.
     """
-    if least > _FAR:  # the tail is nearly exponential
-        return least + 1.0 / least, least - math.log(0.95) / least, least - math.log(0.05) / least
-    share = 0.5 * math.erfc(least / math.sqrt(2.0))
-    mean = math.exp(-0.5 * least * least) / (math.sqrt(2.0 * math.pi) * share)
-    return mean, -_STANDARD.inv_cdf(0.95 * share), -_STANDARD.inv_cdf(0.05 * share)
+    p05, p95 = (-float(ndtri_exp(math.log(share) + log_ndtr(-least))) for share in (0.95, 0.05))
+    return math.sqrt(2.0 / math.pi) / float(erfcx(least / math.sqrt(2.0))), p05, p95
 
 
 @dataclass(frozen=True)
@@ -291,9 +284,26 @@ class Estimate:
         reasons = "".join(f"<p>{escape(reason)}</p>" for reason in self.reasons)
         return f"<table><caption>{title}</caption><tr>{heads}</tr>{body}</table>{reasons}"
 
+    @property
+    def clearances(self) -> tuple[Interval, Interval]:
+        """Horizontal and vertical clearance in m."""
+        return self.horizontal, self.vertical
+
+    @property
+    def states(self) -> tuple[State, State]:
+        """States of the horizontal and the vertical clearance."""
+        return self.horizontal_state, self.vertical_state
+
+    def having(self, clearances: Sequence[Interval], states: Sequence[State], **others: Any) -> Estimate:
+        """Return the estimate with other clearances, states of clearances, and fields `others`."""
+        (horizontal, vertical), (first, second) = clearances, states
+        return replace(
+            self, horizontal=horizontal, vertical=vertical, horizontal_state=first, vertical_state=second, **others
+        )
+
     def in_scene_frame(self) -> tuple[Interval, Interval]:
         """Return the clearances for a frame of exactly the scene's size: `apparent` if present, else the clearances."""
-        return self.apparent or (self.horizontal, self.vertical)
+        return self.apparent or self.clearances
 
     def values(self) -> dict[str, Interval]:
         """Return all estimated values, by the names of `QUANTITIES`."""

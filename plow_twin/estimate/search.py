@@ -6,7 +6,6 @@ is fitted, and the number of candidates decreases.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -23,26 +22,13 @@ from plow_twin.estimate.unknowns import BIAS, DELAY, GAIN, GX, GY, SOFTNESS, Unk
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Stage:
-    """A stage of the search.
-
-    horizon : horizon as a share of the period
-    iterations : number of iterations of each fit
-    keep : number of candidates for the next stage
-    """
-
-    horizon: float
-    iterations: int
-    keep: int
-
-
 #: Smallest numbers of rows in a horizon and in a swing, derived from the six unknowns of a starting state.
 _FEWEST_ROWS = (8, 12)
 #: Differences from the model with only a low pass of the sensor, with the time constant of the prior.
 LOW_PASS: Final = np.array([0.0] * LAG + [UNSTATED["filter"]])
-#: Stages with horizons, and upper bounds on the numbers of iterations and candidates.
-STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
+#: Stages of the search: horizon as a share of the period, and upper bounds on the number of iterations of each fit and
+#: on the number of candidates for the next stage.
+_STAGES: Final = ((0.1, 4, 5), (0.2, 3, 2))
 #: Upper bound on the number of swings.
 _MOST_SWINGS = 350
 
@@ -52,23 +38,22 @@ def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float)
     interval = poses.interval()
     first = poses.between(float(poses.t[0]), float(poses.t[0]) + tuning.FIRST_PERIODS * period)
     window = cut(unknowns.scene, first, period, max(0.2 * period, _FEWEST_ROWS[1] * interval))
-    horizons = [max(stage.horizon * period, _FEWEST_ROWS[0] * interval) for stage in STAGES]
-    problem = Problem(forward, unknowns, window, horizon=horizons[0])
-    vectors = first_vectors(problem, 6)
+    horizons = [max(share * period, _FEWEST_ROWS[0] * interval) for share, *_ in _STAGES]
+    vectors = first_vectors(Problem(forward, unknowns, window, horizon=horizons[0]), 6)
     points = [(vector, states_at(window, vector), tuning.FIRST_NOISE) for vector in vectors]
     fits: list[Fit] = []
-    for stage, horizon in zip(STAGES, horizons, strict=True):
+    for (_, iterations, most), horizon in zip(_STAGES, horizons, strict=True):
         problem, fits = Problem(forward, unknowns, window, horizon=horizon), []
         for shared, states, noise in points:
-            fitted = fit(problem, shared, better_states(problem, shared, states), noise, stage.iterations)
+            fitted = fit(problem, shared, better_states(problem, shared, states), noise, iterations)
             if fitted is None:
                 continue
             fits = sorted([*fits, fitted], key=lambda fit: fit.loss)
             if _have_met(fits, fitted):
                 del fits[1:]
                 break
-        fits = fits[: stage.keep]
-        points = [(fitted_motion.shared, fitted_motion.point.states, fitted_motion.noise) for fitted_motion in fits]
+        fits = fits[:most]
+        points = [(one.shared, one.point.states, one.noise) for one in fits]
     return (problem, fits[0]) if fits else None
 
 
@@ -95,7 +80,7 @@ def behind_low_pass(problem: Problem, fitted: Fit) -> Fit | None:
     other = Problem(
         problem.forward.renewed(), problem.unknowns, problem.window, horizon=problem.horizon, differences=LOW_PASS
     )
-    again = fit(other, fitted.shared, fitted.point.states, fitted.noise, STAGES[-1].iterations)
+    again = fit(other, fitted.shared, fitted.point.states, fitted.noise, _STAGES[-1][1])
     return again if again is not None and again.loss < fitted.loss - tuning.OUTLYING**2 else None
 
 

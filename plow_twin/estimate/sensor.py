@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.estimate.measurements import Poses, filled
+from plow_twin.estimate.measurements import Poses, filled, interpolated
 
 Array = NDArray[np.float64]
 
@@ -49,4 +49,4 @@ class Memory:
 
     def at(self, t: Array) -> Array:
         """Return the smoothed pose at k stamps in s, shape (k, 3)."""
-        return np.stack([np.interp(t, self._t, column) for column in self._q.T], axis=1)
+        return interpolated(t, self._t, self._q)

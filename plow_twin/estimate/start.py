@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from plow_twin.estimate import tuning
 from plow_twin.estimate.fit import Problem, Window
 from plow_twin.estimate.measurements import Poses, filled
-from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GX, GY, SOFTNESS, Unknowns
+from plow_twin.estimate.unknowns import BIAS, DAMPING, GX, GY, SOFTNESS
 from plow_twin.model import geometry
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y
 from plow_twin.model.scene import Scene
@@ -168,6 +168,3 @@ def _matched(problem: Problem, vector: Array, measured: Array) -> list[tuple[flo
         vector = vector.copy()
         vector[[GX, GY]] += 0.8 * (measured - clearance)
     return sorted(matches, key=lambda pair: pair[0])[:1]
-
-
-__all__ = ["DELAY", "Unknowns", "cut", "filled", "first_vectors", "range_of_motion"]

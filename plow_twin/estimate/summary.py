@@ -14,7 +14,7 @@ from plow_twin.estimate import tuning
 from plow_twin.estimate.bouncing import Bounced
 from plow_twin.estimate.combined import with_apparent
 from plow_twin.estimate.discrepancy import Graded, graded
-from plow_twin.estimate.fit import Fit, Problem, freed
+from plow_twin.estimate.fit import Fit, Problem, eliminated, scatter_ratio
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.pads import by_group, of_differences
 from plow_twin.estimate.priors import UNSTATED
@@ -32,7 +32,7 @@ from plow_twin.estimate.unknowns import (
     SOFTNESS,
     Unknowns,
 )
-from plow_twin.estimate.verdict import COMPONENTS, Verdict, judge_sensor, predicted, sandwich
+from plow_twin.estimate.verdict import COMPONENTS, Verdict, judge_sensor, predicted
 from plow_twin.model.scene import Scene
 
 if TYPE_CHECKING:
@@ -149,10 +149,9 @@ def _with_forces(result: Estimate, problem: Problem, fit: Fit, forces: ContactFo
     joint = fit_jointly(problem, fit, forces, widened)
     result = replace(result, forces_measured=joint.used)
     if joint.model or joint.sensor:
-        return replace(
-            result,
-            horizontal_state=State.WITHDRAWN,
-            vertical_state=State.WITHDRAWN,
+        return result.having(
+            result.clearances,
+            (State.WITHDRAWN, State.WITHDRAWN),
             model="suspect" if joint.model else "ok",
             sensor="suspect" if joint.sensor else "ok",
             reasons=(*result.reasons, *joint.model, *joint.sensor),
@@ -163,10 +162,9 @@ def _with_forces(result: Estimate, problem: Problem, fit: Fit, forces: ContactFo
     covariance[[GX, GY], [GX, GY]] += _between_optima(problem, joint.shared) ** 2
     deviation = np.sqrt(np.diag(covariance))
     normal = [Interval.normal(value, spread) for value, spread in zip(joint.shared, deviation, strict=True)]
-    states = result.horizontal_state, result.vertical_state
     apparent = tuple(
         new if state is State.ESTIMATED else old
-        for state, old, new in zip(states, result.in_scene_frame(), (normal[GX], normal[GY]), strict=True)
+        for state, old, new in zip(result.states, result.in_scene_frame(), (normal[GX], normal[GY]), strict=True)
     )
     return replace(
         with_apparent(result, apparent),
@@ -217,9 +215,7 @@ def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> A
 def _widened(problem: Problem, fit: Fit, verdict: Verdict) -> float:
     """Return the factor on the variance of the noise from the scatter of the swings and the colour of the residuals.
 
-    The ratio of observed to expected variance is averaged over all unknowns that move the head, because the ratio of a
-    single unknown would be too random. The colour multiplies the deviation, because coloured residuals stay correlated
-    for long.
+    The colour multiplies the deviation, because coloured residuals stay correlated for long.
     """
     ratio = 1.0 if len(problem.link) else max(1.0, _scatter(problem, fit, np.diag(fit.covariance)))
     colour = max(verdict.figures.get(f"colour_{name}", 1.0) for name in COMPONENTS)
@@ -241,9 +237,11 @@ def _between_optima(problem: Problem, shared: Array) -> float:
 
 
 def _scatter(problem: Problem, fit: Fit, variance: Array) -> float:
-    scattered = np.diag(sandwich(problem, fit, 1.0 / problem.deviation**2))
-    swings, moving = problem.window.swings, list(MOVING)
-    return freed(swings, len(moving)) * float((scattered / variance)[moving].mean())
+    precision, swings = 1.0 / problem.deviation**2, list(eliminated(problem, fit))
+    normal: Array = sum((swing.normal for swing in swings), np.diag(precision))
+    inverse = np.asarray(np.linalg.inv(normal), np.float64)
+    scores = np.stack([swing.score for swing in swings]) if swings else np.zeros((1, SIZE))
+    return scatter_ratio(scores, precision, inverse, variance, problem.window.swings)
 
 
 def _touched(fit: Fit) -> Array:
@@ -489,20 +487,15 @@ def prior_of(unknowns: Unknowns, span: tuple[float, float], lost: int) -> Estima
 def not_observable(unknowns: Unknowns, poses: Poses, lost: int, reasons: tuple[str, ...]) -> Estimate:
     """Return the prior as an estimate whose clearances are not observable."""
     nothing, unseen = prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost), State.NOT_OBSERVABLE
-    return replace(nothing, horizontal_state=unseen, vertical_state=unseen, reasons=reasons)
+    return nothing.having(nothing.clearances, (unseen, unseen), reasons=reasons)
 
 
 def without_fit(
     unknowns: Unknowns, poses: Poses, lost: int, reason: str = "no motion of the model is near the measured motion"
 ) -> Estimate:
     """Return the prior as a withdrawn estimate."""
-    return replace(
-        prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost),
-        horizontal_state=State.WITHDRAWN,
-        vertical_state=State.WITHDRAWN,
-        model="suspect",
-        reasons=(reason,),
-    )
+    nothing, withdrawn = prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost), State.WITHDRAWN
+    return nothing.having(nothing.clearances, (withdrawn, withdrawn), model="suspect", reasons=(reason,))
 
 
 def fails(fitted: Fit, verdict: Verdict) -> bool:

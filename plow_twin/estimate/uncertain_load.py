@@ -22,7 +22,7 @@ from plow_twin.estimate import tuning
 from plow_twin.estimate.bouncing import MotionFeatures, regress_near
 from plow_twin.estimate.equation_error import DEPTHS, EquationError
 from plow_twin.estimate.forward import Forward
-from plow_twin.estimate.measurements import Load, Poses
+from plow_twin.estimate.measurements import Load, Poses, interpolated
 from plow_twin.estimate.start import noise_level, range_of_motion
 from plow_twin.estimate.unknowns import DAMPING, LEAST_CLEARANCE, Unknowns
 from plow_twin.model import geometry
@@ -299,5 +299,5 @@ def _with_error(load: Load, share: float, rng: np.random.Generator) -> Load:
     missed = rng.standard_normal((len(within), 3)) * np.sqrt(rng.random() * np.array(load.unknown) / _KNOT)
     t = np.unique(np.concatenate([load.t, grid, within]))
     parts = ((load.t, load.wrench), (grid, amplitude * error), (within, missed))
-    wrench = sum(np.stack([np.interp(t, its, column) for column in part.T], axis=1) for its, part in parts)
+    wrench = sum(interpolated(t, its, part) for its, part in parts)
     return Load(t, np.asarray(wrench))

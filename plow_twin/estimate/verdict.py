@@ -16,7 +16,6 @@ from plow_twin.estimate import tuning
 from plow_twin.estimate.arrow import OWN
 from plow_twin.estimate.fit import NO_PRIOR, Fit, Problem, joint_step, pieces
 from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER, FEWEST_POSES, Poses
-from plow_twin.estimate.scales import scales_of
 from plow_twin.estimate.start import noise_level
 from plow_twin.estimate.unknowns import BIAS, DAMPING, GAIN, GX, GY, SIZE, SOFTNESS, with_other_law
 from plow_twin.model import geometry
@@ -166,7 +165,7 @@ def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
     if point is None:
         return
     change = np.nan_to_num(fit.point.residual - point.residual)[:, :, None]
-    step, covariance = joint_step(problem, fit, change, np.full(1, NO_PRIOR), np.zeros(1))
+    step, covariance, _ = joint_step(problem, fit, change, np.full(1, NO_PRIOR), np.zeros(1))
     moved = float(step[-1] / math.sqrt(covariance[-1, -1]))
     verdict.figures["law"] = moved
     if abs(moved) > tuning.OUTLYING and not verdict.sensor:
@@ -176,15 +175,20 @@ def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
 
 
 def _scale(problem: Problem, fit: Fit, verdict: Verdict) -> None:
+    """Test the sensor's scale factors, which show in the acceleration in flight and in contacts of a rotated head."""
     if not fit.finished:
         return
-    scales = scales_of(problem, fit)
-    verdict.figures["scale"] = scales.chi2
-    if scales.chi2 > tuning.MOST_SCALE and not (verdict.sensor or verdict.model):
+    motion = np.nan_to_num(problem.window.poses.q - fit.point.residual - fit.shared[BIAS])
+    columns = motion[:, :, None] * np.eye(3)
+    step, covariance, _ = joint_step(problem, fit, columns, np.full(3, NO_PRIOR), np.zeros(3))
+    scale = step[SIZE:]
+    chi2 = float(scale @ np.linalg.solve(covariance[SIZE:, SIZE:], scale))
+    verdict.figures["scale"] = chi2
+    if chi2 > tuning.MOST_SCALE and not (verdict.sensor or verdict.model):
         verdict.by_scale = True
-        x, y, theta = scales.scale.tolist()
+        x, y, theta = (1.0 + scale).tolist()
         verdict.sensor.append(
-            f"scale factors of x, y, theta: got {x:.3f}, {y:.3f}, {theta:.3f} with chi^2 {scales.chi2:.0f}, "
+            f"scale factors of x, y, theta: got {x:.3f}, {y:.3f}, {theta:.3f} with chi^2 {chi2:.0f}, "
             f"expected at most {tuning.MOST_SCALE:g}"
         )
 
@@ -309,45 +313,3 @@ def _changes(problem: Problem, fit: Fit, columns: NDArray[np.intp]) -> Iterator[
             score += changed.T @ piece.residual
         if index <= len(swings) - end and index % apart == 0:
             yield own - cross.T @ fit.factor.solve(cross), score.copy()
-
-
-@dataclass(frozen=True, eq=False)
-class Block:
-    """Normal equations of one swing for the unknowns of the whole window, without its starting state.
-
-    normal : (SIZE, SIZE) matrix, the information of the swing
-    score : (SIZE,) right-hand side
-    """
-
-    normal: Array
-    score: Array
-
-
-def swing_blocks(problem: Problem, fit: Fit) -> list[Block]:
-    """Return the normal equations of each swing with at least four poses, without links between swings."""
-    out = []
-    for measured, *_ in pieces(problem, fit.point, fit.linear, fit.variance):
-        if len(measured.residual) < 12:  # fewer than four poses
-            continue
-        normal, score = measured.weighted.T @ measured.rows, measured.weighted.T @ measured.residual
-        own = normal[SIZE:, SIZE:] + np.diag(1e-6 + 1e-9 * np.diag(normal[SIZE:, SIZE:]))
-        gain = np.linalg.solve(own, normal[SIZE:, :SIZE]).T
-        out.append(Block(normal[:SIZE, :SIZE] - gain @ normal[SIZE:, :SIZE], score[:SIZE] - gain @ score[SIZE:]))
-    return out
-
-
-def sandwich(problem: Problem, fit: Fit, precision: Array) -> Array:
-    """Return the sandwich covariance (SIZE, SIZE) of the shared unknowns, from the scatter of the scores of the swings.
-
-    `precision`, shape (SIZE,), contains the inverse variances of the prior.
-
-    Reference: White, Econometrica 50 (1982) 1 (maximum likelihood of misspecified models).
-    """
-    blocks = swing_blocks(problem, fit)
-    normal = sum((block.normal for block in blocks), np.diag(precision))
-    scores = np.stack([block.score for block in blocks]) if blocks else np.zeros((1, SIZE))
-    scores = scores - scores.mean(axis=0)
-    meat = scores.T @ scores * len(scores) / max(len(scores) - 1, 1) + np.diag(precision)
-    inverse = np.linalg.inv(normal)
-    covariance: Array = inverse @ meat @ inverse
-    return covariance
