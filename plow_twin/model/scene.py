@@ -175,18 +175,21 @@ class Contact:
     impact_speed_floor_m_s: float = _quantity(
         "m/s", "least impact speed v0 in lambda = D(e)/v0, which bounds the damping of a slow touch", 1e-3, gt=0.0
     )
-    ramp_m: float | None = _quantity("m", "ramped_damping: penetration over which C grows to its value", None, gt=0.0)
+    ramp_m: float | None = _quantity("m", "ramped_damping: penetration at which C has its full value", None, gt=0.0)
     restitution_fall: float | None = _quantity(
-        "1", "power by which the restitution falls with impacts above restitution_speed_m_s", None, ge=0.0, le=1.0
+        "1", "exponent q of the decrease of the restitution above restitution_speed_m_s", None, ge=0.0, le=1.0
     )
     restitution_speed_m_s: float | None = _quantity(
-        "m/s", "impact up to which the restitution is constant", None, gt=0.0
+        "m/s", "impact speed v1 up to which the restitution is constant", None, gt=0.0
     )
     restitution_mass_power: float | None = _quantity(
-        "1", "power of the effective mass over the head's mass in the impact, 0 unless given", None, ge=0.0, le=4.0
+        "1", "exponent p of the ratio of masses in the impact speed w, 0 unless given", None, ge=0.0, le=4.0
     )
     restitution_fall_along_s_m: float | None = _quantity(
-        "s/m", "fall of the restitution per speed of the centre of mass along the wall, 0 unless given", None, ge=0.0
+        "s/m",
+        "decrease of the restitution per speed of the centre of mass along the wall, 0 unless given",
+        None,
+        ge=0.0,
     )
 
 
@@ -243,9 +246,9 @@ class Support:
     inertia_kg_m2: float = _quantity(
         "kg m^2", "moment of inertia of the frame and these parts about the frame's centre", gt=0.0
     )
-    horizontal_stiffness_n_m: float = _quantity("N/m", "horizontal spring, 0 for none", ge=0.0)
-    vertical_stiffness_n_m: float = _quantity("N/m", "vertical spring, 0 for none", ge=0.0)
-    rotational_stiffness_n_m_rad: float = _quantity("N m/rad", "spring against rotation, 0 for none", ge=0.0)
+    horizontal_stiffness_n_m: float = _quantity("N/m", "horizontal spring, 0 for no spring", ge=0.0)
+    vertical_stiffness_n_m: float = _quantity("N/m", "vertical spring, 0 for no spring", ge=0.0)
+    rotational_stiffness_n_m_rad: float = _quantity("N m/rad", "spring against rotation, 0 for no spring", ge=0.0)
     horizontal_damping_n_s_m: float = _quantity("N s/m", "horizontal damper", 0.0, ge=0.0)
     vertical_damping_n_s_m: float = _quantity("N s/m", "vertical damper", 0.0, ge=0.0)
     rotational_damping_n_m_s_rad: float = _quantity("N m s/rad", "damper of the rotation", 0.0, ge=0.0)
@@ -348,10 +351,14 @@ class Wear:
         "m^2/N", "5 % and 95 % points of the prior of k_s", (1e-15, 1e-13), gt=0.0
     )
     pad_length_m: float | None = _quantity(
-        "m", "length of a pad along the face, by which the slide wears", None, gt=0.0
+        "m", "length of a pad along the face, from which the wear of the slide is computed", None, gt=0.0
     )
-    sliding: str = _choice("motion that wears: travel, or in-plane sliding too", ("travel", "total"), "travel")
-    running_in_ratio: float = _quantity("1", "coefficient of a new pad over k_s", 1.0, ge=1.0)
+    sliding: str = _choice(
+        "motion that causes wear: travel alone, or total, which includes sliding in the plane",
+        ("travel", "total"),
+        "travel",
+    )
+    running_in_ratio: float = _quantity("1", "wear coefficient of a new pad, divided by k_s", 1.0, ge=1.0)
     running_in_depth_m: float | None = _quantity(
         "m", "wear depth over which the excess of this ratio over 1 falls by a factor e", None, gt=0.0
     )
@@ -394,7 +401,7 @@ class Scene:
     gravity: Gravity = Gravity()
     loads: tuple[Load, ...] = ()
     initial: Initial = Initial()
-    locked: tuple[str, ...] = field(default=(), metadata={"doc": "degrees of freedom held", "choices": DOF_NAMES})
+    locked: tuple[str, ...] = field(default=(), metadata={"doc": "locked degrees of freedom", "choices": DOF_NAMES})
     pairs: tuple[str, ...] = field(
         default=PAIR_NAMES, metadata={"doc": "the pairs that can touch", "choices": PAIR_NAMES}
     )

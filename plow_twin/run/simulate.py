@@ -153,9 +153,8 @@ def simulate(
         errors grow too much, a `ToleranceWarning` is issued. A sequence of parameter paths (`sensitivity_parameters`)
         selects derivatives with respect to these parameters.
 
-        The computation takes some five times as long as the run. It takes a hundred times as long, or longer, for
-        scenes with friction, wear, a ramp, a table, a locked degree of freedom, overdamped contact or a restitution
-        that falls.
+        The computation takes some five times as long as the run. For scenes that the linearised equations do not
+        support (docs/solver.md), it takes a hundred times as long, or longer.
 
     Returns
     -------
