@@ -54,5 +54,5 @@ def read_secret(path: Path) -> str:
 
 
 def key_format(data: bytes) -> str:
-    """Return the format of a certificate or key, `pem` or `der`. A name such as `twin.key` does not tell it."""
+    """Return the format of a certificate or key, `pem` or `der`. The name, such as `twin.key`, does not show it."""
     return "pem" if b"-----BEGIN" in data else "der"

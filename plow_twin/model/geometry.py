@@ -110,7 +110,7 @@ def penetration_rows(scene: Scene) -> NDArray[np.float64]:
 
 
 def position_rows(scene: Scene) -> NDArray[np.float64]:
-    """Return the first four rows of `penetration_rows`, which depend only on the frame and on what the head carries."""
+    """Return the first four rows of `penetration_rows`, which depend only on the frame and on `Head.carries`."""
     return _of_places(scene, _along_normal(scene))
 
 

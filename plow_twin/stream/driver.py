@@ -101,8 +101,8 @@ class Driver:
         #: stamp of the last advance that `real_time` has counted [ns]
         self._counted_ns: int | None = None
         self._zeroed = False
-        #: time that the node has been inactive [ns]; under the scene's own loads, the model lags behind the node's
-        #: clock by it
+        #: time that the node has been inactive [ns], by which the model lags behind the node's clock under the scene's
+        #: own loads
         self._behind_ns = 0
         self._resumed = False
 

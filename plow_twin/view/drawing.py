@@ -421,7 +421,7 @@ class Drawing:
             part.flush()
 
     def finish(self, reader: RunReader) -> None:
-        """Write how the recording ended and what is missing, and send the buffered rows."""
+        """Write the status of the recording and its losses, and send the buffered rows."""
         self._write_statuses()
         self.face.draw(self.stamp_ns, max(self.step, 0))
         self.contact_sets.finish()
