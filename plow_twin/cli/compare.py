@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @click.command(
     short_help="Compare the contacts of runs, and find whether the load or the machine changed.",
-    epilog="Exit codes: 0 done; 1 failed; 2 wrong usage; 3 done, but a run was left out.",
+    epilog="Exit codes: 0 done; 1 failed; 2 wrong usage; 3 done, but a run was left out or has losses.",
 )
 @click.argument("recordings", metavar="RUN...", type=PLACE, nargs=-1, required=True)
 @click.option(

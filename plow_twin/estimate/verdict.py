@@ -110,7 +110,9 @@ def _colour(fit: Fit, verdict: Verdict) -> None:
         limit = 1.0 + (tuning.MOST_RATIO - 1.0) + 4.0 * 2.5 / np.sqrt(len(rows))
         verdict.figures[f"colour_{name}"] = ratio
         if ratio > limit and not verdict.sensor:
-            verdict.model.append(f"residual of {name}: {ratio:.2f} times its noise, expected at most {limit:.2f}")
+            verdict.model.append(
+                f"variance of the residual of {name}: {ratio:.2f} times that of its noise, expected at most {limit:.2f}"
+            )
 
 
 def _repeated(problem: Problem, fit: Fit, period: float, verdict: Verdict) -> None:
