@@ -48,7 +48,7 @@ class Gaps:
 
     t : (n,) strictly increasing stamps in s
     gap : (n, 8) gap of each pair in m, NaN without a measurement
-    deviation : stated standard deviation of a sensor in m, 0 if not stated
+    deviation : stated standard deviation of the constant error of a sensor in m, 0 if not stated
     """
 
     t: Array

@@ -69,7 +69,7 @@ class Windows:
     load : tuple of 3 float
         Standard deviation of the load until `set_load_deviation` is called.
     gaps : float
-        Standard deviation of a gap sensor in m.
+        Standard deviation of the constant error of a gap sensor in m, 0 if unknown.
     early : bool
         Whether shorter windows are formed at the beginning, the first with the share `tuning.WINDOW_SHARES[1]` of the
         full length, each with at least the share `tuning.NEW_MOTION` of new motion.

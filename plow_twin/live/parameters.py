@@ -204,7 +204,8 @@ class Settings:
         "type of the messages on head_pose: PoseStamped, or PoseWithCovarianceStamped with variances of x, y and theta")
     head_pose_deviation: tuple[float, ...] = _number((0.0, 0.0, 0.0), "m, m, rad", 0.0, 1.0,
         "standard deviations of x, y and theta on head_pose; 0 means unknown")
-    gaps_deviation: float = _number(0.0, "m", 0.0, 1.0, "standard deviation of the measured gaps; 0 means unknown")
+    gaps_deviation: float = _number(0.0, "m", 0.0, 1.0,
+        "standard deviation of the constant error of a gap sensor; with 0, 0.1 mm")
     excitation_deviation: tuple[float, ...] = _number((0.0, 0.0, 0.0), "N, N, N m", 0.0, 1e12,
         "standard deviations of Fx, Fy and M on excitation; 0 means unknown")
     alarm_force: tuple[float, ...] = _alarm("N", 1e12, "contact forces")
