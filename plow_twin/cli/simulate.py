@@ -68,7 +68,7 @@ def simulate(
     max_wall: float,
     quiet: bool,
 ) -> int:
-    """Simulate SCENE, a file or one of the presets paper, bench_kv, bench_hc.
+    """Simulate SCENE, a file or one of the presets paper, bench_kv, bench_hc, measured_square, measured_ellipse.
 
     After Ctrl-C or at a limit, files and JSON contain the results up to this time, and the exit code is 1.
     """

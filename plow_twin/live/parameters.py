@@ -90,7 +90,7 @@ class Settings:
         "warning", Effect.START)
     lock_memory: bool = _plain(False,
         "lock all memory, so that it is not paged out; a refusal by the system is a warning", Effect.START)
-    scene: str = _plain("paper", "scene file, or the name of a preset: paper, bench_kv, bench_hc")
+    scene: str = _plain("paper", f"scene file, or the name of a preset: {', '.join(PRESETS)}")
     tolerance: float = _number(1e-9, "1", 1e-13, 1e-3, "relative tolerance of the solver")
     excitation_source: str = _choice("excitation", ("excitation", "tool_forces", "scene"),
         "source of the load: a topic, or the loads in the scene at the time of the node's clock; samples on the other "

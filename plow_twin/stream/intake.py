@@ -43,8 +43,9 @@ class Verdict(Enum):
     NON_FINITE = "non_finite"
     UNSTAMPED = "unstamped"
     DUPLICATE = "duplicate"
+    #: older than the newest sample and all stored states of the model, so the sample cannot be inserted
     OUT_OF_ORDER = "out_of_order"
-    #: older than all stored states of the model, so the sample cannot be inserted
+    #: newer than the newest sample, but older than all stored states of a model that has moved ahead of the stamps
     LATE = "late"
     #: older than the time reached by the model, and inserted into the motion at its stamp
     WORKED_IN = "worked_in"
