@@ -129,10 +129,10 @@ class Bounced:
     ln_penetration: tuple[float, float]
     ln_damping: tuple[float, float]
     noise: Array
-    distance: float
-    path: float
-    law: float
-    odds: float
+    distance: float = 0.0
+    path: float = 0.0
+    law: float = 0.0
+    odds: float = -math.inf
     unseen: Array = field(default_factory=lambda: np.zeros(2))
     rounded: Array = field(default_factory=lambda: np.zeros(2))
     follows: Array = field(default_factory=lambda: np.ones(2))
@@ -314,6 +314,7 @@ def by_range(unknowns: Unknowns, poses: Poses) -> Bounced:
     motion_features = MotionFeatures(unknowns, poses, span)
     yielding = tuning.FITTED / math.sqrt(6.0)
     middle, softness, damping, _ = tuning.HARD_DRAWN
+    unseen, rounded = hidden_by_geometry(unknowns, poses, span, motion_features.features(motion_features.q)[:2])
     return Bounced(
         range_of_motion(unknowns.scene, poses)[0] - tuning.OVERRATED,
         np.full(2, yielding),
@@ -322,11 +323,8 @@ def by_range(unknowns: Unknowns, poses: Poses) -> Bounced:
         (math.log(middle), softness),
         (float(unknowns.nominal()[DAMPING]), damping),
         motion_features.noise,
-        0.0,
-        0.0,
-        0.0,
-        -math.inf,
-        *hidden_by_geometry(unknowns, poses, span, motion_features.features(motion_features.q)[:2]),
+        unseen=unseen,
+        rounded=rounded,
     )
 
 
@@ -351,10 +349,8 @@ def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: A
     turned = np.array(
         [[UNSTATED[f"turn_{wall}"] for wall in walls] for walls in (("left", "right"), ("top", "bottom"))]
     )
-    scaled = [moved(scale=scale) for scale in np.diag(priors.SCALES)]
-    unseen = np.sqrt(
-        np.square([moved(width), moved(0.0, height), *scaled]).sum(axis=0) + (0.25 * turned**2).sum(axis=1)
-    )
+    off = [moved(width), moved(0.0, height), *(moved(scale=scale) for scale in np.diag(priors.SCALES))]
+    unseen = np.sqrt(np.square(off).sum(axis=0) + (0.25 * turned**2).sum(axis=1))
     # a stated radius or deviation of a side includes the effect of rounded corners
     stated = scene.frame.corner_radius_m is not None or any(is_stated(scene, path) for path in _SIDES)
     # the sides stay positive
@@ -444,11 +440,9 @@ class _Drawn:
 
     def of_other_law(self) -> _Drawn | None:
         other = with_other_law(self.unknowns)
-        return (
-            None
-            if other is None
-            else _Drawn(self.forward.of(other.scene), other, self.motion_features, self.spread, self.rng)
-        )
+        if other is None:
+            return None
+        return _Drawn(self.forward.of(other.scene), other, self.motion_features, self.spread, self.rng)
 
     def like(self) -> Array:
         return np.concatenate([np.array(self.features)[:, 5:], np.array(self.changes)], axis=1)
@@ -511,10 +505,9 @@ def _of_other_law(
     if other is None:
         return nothing
     motion_features, half = drawn.motion_features, tuning.DRAWS[4] // 2
-    measured = np.concatenate(
-        [motion_features.features(motion_features.q)[5:], motion_features.changes(motion_features.q)]
-    )
-    by_phase = np.concatenate([measured, motion_features.changes_by_phase(motion_features.q)])
+    q = motion_features.q
+    measured = np.concatenate([motion_features.features(q)[5:], motion_features.changes(q)])
+    by_phase = np.concatenate([measured, motion_features.changes_by_phase(q)])
     found = nothing
     for count in (half, tuning.DRAWS[4] - half):
         other.add(count, centre, tuning.DRAWN_CLEARANCE[2], delay, most_work)
@@ -557,10 +550,8 @@ def path_deviate(measured_path: Array, features: Array, drawn: list[Array], meas
     finite = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(measured_path).all(axis=0)
     if finite.sum() < tuning.PATH_PHASES:
         return 0.0
-    paths, off = (
-        paths[:, :, finite],
-        _distance_of_paths(features, paths[:, :, finite], measured, measured_path[:, finite]),
-    )
+    paths = paths[:, :, finite]
+    off = _distance_of_paths(features, paths, measured, measured_path[:, finite])
     distance = (((features - measured) / (features.std(axis=0) + 1e-12)) ** 2).mean(axis=1)
     others = []
     for index in np.argsort(distance, kind="stable")[:FEWEST_FOR_SCATTER]:

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate.contact_forces import forces_at
-from plow_twin.estimate.fit import DIFFERENCES, TURNS, Point, Problem, Window, depth_of
-from plow_twin.estimate.measurements import Load, Poses
+from plow_twin.estimate.fit import TURNS, Point, Problem, depth_of
+from plow_twin.estimate.measurements import Load
 from plow_twin.estimate.unknowns import BIAS, DELAY, GAIN
 from plow_twin.model.geometry import arm_rows, body_states
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y
@@ -55,13 +55,9 @@ def _change_of_load(problem: Problem, point: Point) -> Load | None:
     """Return the load g before the gains are applied, in N, N, N m for a compliance of 1 m/N."""
     starts, turns = problem.window.starts, problem.differences[TURNS]
     t = np.arange(starts[0], starts[-1], _INTERVAL)
-    fine = Problem(
-        problem.forward, problem.unknowns, Window(Poses(t, np.zeros((len(t), 3))), starts, problem.window.states),
-        horizon=problem.horizon, differences=np.concatenate([turns, np.zeros(len(DIFFERENCES) - len(turns))]),
-    )  # fmt: skip
     shared = point.shared.copy()
     shared[BIAS], shared[DELAY] = 0.0, 0.0
-    motion = fine.evaluate(shared, point.states)
+    motion = problem.at_times(t).evaluate(shared, point.states)
     if motion is None:
         return None
     scene, depth, inside = problem.unknowns.scene_of(shared), depth_of(turns), (motion.swing >= 0)[:, None]
@@ -74,9 +70,7 @@ def _change_of_load(problem: Problem, point: Point) -> Load | None:
 
 
 def _wrench(scene: Scene, q: Array, v: Array, depth: Array | None) -> Array:
-    """Return the sum of the contact forces on the head and their moment, shape (n, 3), for poses and rates of shape (n,
-    3).
-    """
+    """Return the sum of the contact forces on the head and their moment, (n, 3), for poses and rates (n, 3)."""
     _, force = forces_at(scene, q, v, depth)
     x, y, _, _, _, c, s, _ = body_states(np.hstack((q, v)), scene.head.com_offset_m).T
     arms = np.stack([c, s, x, y], axis=1) @ arm_rows(scene)

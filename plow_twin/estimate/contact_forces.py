@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.errors import PlowTwinError
 from plow_twin.estimate import tuning
-from plow_twin.estimate.fit import DIFFERENCES, TURNS, Fit, Problem, Window, depth_of
-from plow_twin.estimate.measurements import FEWEST_IN_CONTACT, FEWEST_POSES, Poses, usable_rows
+from plow_twin.estimate.fit import TURNS, Fit, Problem, depth_of
+from plow_twin.estimate.measurements import FEWEST_IN_CONTACT, FEWEST_POSES, usable_rows
 from plow_twin.estimate.unknowns import BIAS, DELAY
 from plow_twin.model.contact import free_force
 from plow_twin.model.geometry import body_states, penetration_rows
@@ -109,13 +109,7 @@ class ForcesOfFit:
     """Contact forces from the motion of a fit, at the times of the measured forces."""
 
     def __init__(self, problem: Problem, t: Array) -> None:
-        window = Window(Poses(t, np.zeros((len(t), 3))), problem.window.starts, problem.window.states)
-        turns = problem.differences[TURNS]
-        differences = np.concatenate([turns, np.zeros(len(DIFFERENCES) - len(turns))])
-        self._problem = Problem(
-            problem.forward, problem.unknowns, window, horizon=problem.horizon, differences=differences
-        )  # fmt: skip
-        self._depth = depth_of(turns)
+        self._problem, self._depth = problem.at_times(t), depth_of(problem.differences[TURNS])
 
     def at(self, shared: Array, states: Array, delay: float) -> FittedForces | None:
         """Return penetrations and forces for given unknowns and a delay [s]; None if the motion cannot be simulated."""
@@ -195,9 +189,8 @@ def _contradiction(measured: Array, fitted: Array, pair: int, largest: float, no
     own = fitted[:, pair]
     if (own > 0.0).sum() < FEWEST_IN_CONTACT:
         most = float(np.abs(measured[:, pair]).max())
-        return (
-            f"{most:.3g} N where the motion gives no contact" if most > tuning.CELL_SHARE * largest + 6 * noise else ""
-        )
+        silent = most <= tuning.CELL_SHARE * largest + 6 * noise
+        return "" if silent else f"{most:.3g} N where the motion gives no contact"
     value = measured[:, pair]
     ends = np.flatnonzero(np.append(np.diff(value) != 0.0, True))
     for first, end in zip(np.append(0, ends[:-1] + 1), ends + 1, strict=True):

@@ -38,16 +38,7 @@ from plow_twin.estimate.summary import (
     without_fit,
 )
 from plow_twin.estimate.uncertain_load import compare_under_uncertain_load
-from plow_twin.estimate.unknowns import (
-    BIAS,
-    DAMPING,
-    GX,
-    GY,
-    SIZE,
-    SOFTNESS,
-    Unknowns,
-    with_other_law,
-)
+from plow_twin.estimate.unknowns import BIAS, DAMPING, GX, GY, SIZE, SOFTNESS, Unknowns, with_other_law
 from plow_twin.estimate.unmeasured import fit_some_components
 from plow_twin.estimate.verdict import Verdict, judge
 from plow_twin.kernel.low_pass import lagged
@@ -69,12 +60,7 @@ _LONGEST_S = 600.0
 
 
 def estimate(
-    scene: Scene,
-    load: Load,
-    poses: Poses,
-    lost: int = 0,
-    gaps: Gaps | None = None,
-    forces: ContactForces | None = None,
+    scene: Scene, load: Load, poses: Poses, lost: int = 0, gaps: Gaps | None = None, forces: ContactForces | None = None
 ) -> Estimate:
     """Return the estimate of clearances, contact, load gains, and the sensor's bias and delay from a window.
 
@@ -129,13 +115,7 @@ def estimate_window(
 
 
 def _estimate(
-    scene: Scene,
-    load: Load,
-    poses: Poses,
-    lost: int,
-    guess: Guess,
-    gaps: Gaps | None,
-    forces: ContactForces | None,
+    scene: Scene, load: Load, poses: Poses, lost: int, guess: Guess, gaps: Gaps | None, forces: ContactForces | None
 ) -> tuple[Estimate, Guess]:
     """Return the result of `estimate_window`, with all numbers in the units of the arguments."""
     load, poses, unusable = _usable(load, poses)
@@ -403,11 +383,10 @@ def _with_differences(
 
 def _moved_back(result: Estimate, bias: Array) -> Estimate:
     x, y, theta = (
-        None if interval is None else Interval(interval.mean + by, interval.p05 + by, interval.p95 + by)
+        interval and Interval(interval.mean + by, interval.p05 + by, interval.p95 + by)
         for interval, by in zip((result.bias_x, result.bias_y, result.bias_theta), bias.tolist(), strict=True)
     )
-    motion = None if result.motion is None else result.motion.moved(bias)
-    return replace(result, bias_x=x, bias_y=y, bias_theta=theta, motion=motion)
+    return replace(result, bias_x=x, bias_y=y, bias_theta=theta, motion=result.motion and result.motion.moved(bias))
 
 
 def _next_guess(problem: Problem, fit: Fit) -> Guess:
@@ -421,13 +400,7 @@ def warm_up(scene: Scene) -> None:
     load = Load.unmeasured(1.0)
     other = with_other_law(Unknowns(scene))
     for variant in (scene, *variants(scene), *(() if other is None else (other.scene,))):
-        Forward(variant, load).run(
-            replace(variant, loads=(), wear=None),
-            np.ones(3),
-            np.zeros(1),
-            np.zeros((1, 6)),
-            np.array([0, 1]),
-            np.array([1e-3]),
-        )
+        bare, edges, times = replace(variant, loads=(), wear=None), np.array([0, 1]), np.array([1e-3])
+        Forward(variant, load).run(bare, np.ones(3), np.zeros(1), np.zeros((1, 6)), edges, times)
     row = np.zeros((1, 3))
     lagged(1.0, np.array([0, 1]), np.zeros(1), row, row, row, np.ones(1), row, row)

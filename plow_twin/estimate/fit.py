@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import chain, pairwise
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -286,10 +286,20 @@ class Problem:
         fine.steps, fine._columns, fine._waves = _FINE, (None, np.zeros(0)), (None, np.zeros(0))
         return fine
 
+    def having(self, **changes: Any) -> Problem:
+        """Return a problem with other parts, which have the names of the parameters; the prior is that of the scene."""
+        parts: dict[str, Any] = {name: getattr(self, name) for name in ("forward", "unknowns", "window", "horizon")}
+        return Problem(**(parts | {"differences": self.differences} | changes))
+
+    def at_times(self, t: Array) -> Problem:
+        """Return the problem without measurements at the times `t`, (n,), with a sensor of no lever arm or low pass."""
+        turns = self.differences[TURNS]
+        window = Window(Poses(t, np.zeros((len(t), 3))), self.window.starts, self.window.states)
+        return self.having(window=window, differences=np.append(turns, np.zeros(len(DIFFERENCES) - len(turns))))
+
     def evaluate(
-        self, shared: Array, states: Array, differences: Array | None = None, push: Array | None = None,
-        stiffness: Array | None = None, change: Callable[[Scene], Scene] | None = None, load: Load | None = None,
-        damping: Array | None = None,
+        self, shared: Array, states: Array, differences: Array | None = None,
+        change: Callable[[Scene], Scene] | None = None, load: Load | None = None, **acting: Array,
     ) -> Point | None:  # fmt: skip
         """Return the motion with the given unknowns; None if the motion leaves the range of the model.
 
@@ -299,20 +309,19 @@ class Problem:
             The unknowns.
         differences : ndarray, shape (7,), optional
             Values that replace the differences of the problem.
-        push, stiffness, damping : ndarray, optional
-            As in `Forward.run`.
         change : callable, optional
             Function that returns a changed scene, which may need other compiled terms.
         load : Load, optional
             Load that replaces the load of the forward model.
+        **acting : ndarray
+            The arguments `push`, `stiffness` and `damping` of `Forward.run`.
         """
-        motion = self._evaluate(shared, states[None], differences, push, stiffness, change, load, damping)
-        return None if motion is None else motion[0]
+        motions = self._evaluate(shared, states[None], differences, change, load, **acting)
+        return None if motions is None else motions[0]
 
     def _evaluate(
-        self, shared: Array, several: Array, differences: Array | None = None, push: Array | None = None,
-        stiffness: Array | None = None, change: Callable[[Scene], Scene] | None = None, load: Load | None = None,
-        damping: Array | None = None,
+        self, shared: Array, several: Array, differences: Array | None = None,
+        change: Callable[[Scene], Scene] | None = None, load: Load | None = None, **acting: Array,
     ) -> list[Point] | None:  # fmt: skip
         """Return the motions for k sets of starting states `several`, shape (k, s, 6), as `evaluate` does."""
         window, differences = self.window, self.differences if differences is None else differences
@@ -326,8 +335,7 @@ class Problem:
         edges = (size * np.arange(count)[:, None] + rows.edges[:-1]).ravel()
         motions = forward.run(
             scene, shared[GAIN], np.tile(window.starts[:-1], count), several.reshape(-1, 6),
-            np.append(edges, size * count), np.tile(rows.asked, count), depth_of(differences[TURNS]), push, stiffness,
-            damping,
+            np.append(edges, size * count), np.tile(rows.asked, count), depth_of(differences[TURNS]), **acting,
         )  # fmt: skip
         if motions is None:
             return None
@@ -667,15 +675,14 @@ def joint_step(
     """
     normal = np.diag(np.concatenate([1.0 / problem.deviation**2, precision]))
     gradient = np.concatenate([(problem.mean - result.shared) / problem.deviation**2, pull])
-    swings = list(eliminated(problem, result, columns))
-    for swing in swings:
+    states, gains = np.zeros((problem.window.swings, OWN)), np.zeros((problem.window.swings, len(gradient), OWN))
+    for swing in eliminated(problem, result, columns):
         normal += swing.normal
         gradient += swing.score
+        states[swing.swing], gains[swing.swing] = swing.state, swing.gain
     covariance: Array = np.linalg.inv(normal)
-    step, states = covariance @ gradient, np.zeros((problem.window.swings, OWN))
-    for swing in swings:
-        states[swing.swing] = swing.state - step @ swing.gain
-    return step, covariance, states
+    step = covariance @ gradient
+    return step, covariance, states - step @ gains
 
 
 def _descend(

@@ -9,6 +9,7 @@ scatter of the scores of the swings (White 1982).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,13 +133,8 @@ class _Joint:
         self._problem, self._fit, self._forces_of_fit, self._cells = problem, fitted, forces_of_fit, cells
         self._variance = fitted.variance * widened
         self._border = SIZE + 1 + len(cells.pairs)
-        self._precision = np.concatenate(
-            [
-                1.0 / problem.deviation**2,
-                [tuning.CELL_PRIOR[1] ** -2],
-                np.full(len(cells.pairs), tuning.CELL_PRIOR[0] ** -2),
-            ]
-        )
+        gain, delay = (deviation**-2 for deviation in tuning.CELL_PRIOR)
+        self._precision = np.concatenate([1.0 / problem.deviation**2, [delay], np.full(len(cells.pairs), gain)])
 
     def solve(self) -> JointFit:
         found, cells = self._fit, self._cells
@@ -182,11 +178,10 @@ class _Joint:
 
     def _force(self, place: _Place) -> Array | None:
         measured_force = self._forces_of_fit.at(place.shared, place.states, place.delay)
-        return (
-            None
-            if measured_force is None
-            else np.exp(place.gain[self._cell]) * measured_force.force[self._row, self._pair]
-        )
+        if measured_force is None:
+            return None
+        force: Array = np.exp(place.gain[self._cell]) * measured_force.force[self._row, self._pair]
+        return force
 
     def _evaluated(self, place: _Place) -> _Evaluation | None:
         point, force = self._problem.evaluate(place.shared, place.states), self._force(place)
@@ -212,21 +207,20 @@ class _Joint:
             step = QUANTITIES[j].fine_step
             if step is not None and (j != DAMPING or self._problem.unknowns.damped):
                 by = step * (np.arange(SIZE) == j)
-                out[:, j] = self._quotient(
-                    replace(place, shared=place.shared - by), replace(place, shared=place.shared + by), step
-                )
-        late, early = (replace(place, delay=place.delay + by) for by in (_DELAY_STEP, -_DELAY_STEP))
-        out[:, SIZE] = self._quotient(early, late, _DELAY_STEP)
+                out[:, j] = self._quotient(place, step, shared=by)
+        out[:, SIZE] = self._quotient(place, _DELAY_STEP, delay=_DELAY_STEP)
         out[np.arange(len(out)), SIZE + 1 + self._cell] = np.nan_to_num(at.force)
         for j, step in enumerate(_STATE_STEPS):
             by = step * (np.arange(6) == j)
-            out[:, border + j] = self._quotient(
-                replace(place, states=place.states - by), replace(place, states=place.states + by), step
-            )
+            out[:, border + j] = self._quotient(place, step, states=by)
         return self._problem.linearise(at.point), out
 
-    def _quotient(self, below: _Place, above: _Place, step: float) -> Array:
-        """Return the central difference quotient of the forces; 0 if a motion cannot be simulated."""
+    def _quotient(self, place: _Place, step: float, **by: Any) -> Array:
+        """Return the central difference quotient of the forces for changes `by`; 0 if a motion cannot be simulated."""
+        below, above = (
+            replace(place, **{name: getattr(place, name) + sign * value for name, value in by.items()})
+            for sign in (-1.0, 1.0)
+        )
         one, other = self._force(below), self._force(above)
         if one is None or other is None:
             return np.zeros(len(self._row))
@@ -237,9 +231,8 @@ class _Joint:
         border, out = self._border, []
         places = np.r_[0:SIZE, border : border + 6]
         residual = np.nan_to_num(self._measured - at.force)
-        weight = (
-            np.minimum(1.0, tuning.HUBER * np.sqrt(self._spread) / np.maximum(np.abs(residual), 1e-12)) / self._spread
-        )
+        scale = np.sqrt(self._spread)
+        weight = np.minimum(1.0, tuning.HUBER * scale / np.maximum(np.abs(residual), 1e-12)) / self._spread
         for piece, *_ in pieces(self._problem, at.point, linear, self._variance):
             inside = self._swing == piece.swing
             rows = jacobian[inside]
@@ -306,9 +299,8 @@ class _Joint:
         for k, pair in enumerate(cells.pairs.tolist()):
             gain = Interval.normal(np.exp(place.gain[k]), np.exp(place.gain[k]) * deviation[SIZE + 1 + k])
             rows, share = int((self._cell == k).sum()), float(np.median(left_over[k])) if left_over[k] else 0.0
-            cell_of_pair[PAIR_NAMES[pair]] = Cell(
-                rows, gain, float(cells.offset[pair]), float(cells.noise[pair]), share
-            )
+            offset, noise = float(cells.offset[pair]), float(cells.noise[pair])
+            cell_of_pair[PAIR_NAMES[pair]] = Cell(rows, gain, offset, noise, share)
         used = ForcesUsed(cell_of_pair, Interval.normal(place.delay, deviation[SIZE]))
         all_shares = [share for shares in left_over for share in shares]
         together = float(np.median(all_shares)) if all_shares else 0.0

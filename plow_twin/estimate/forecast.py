@@ -80,17 +80,10 @@ class Plan:
 
     def __post_init__(self) -> None:
         """Raise `LifeError` for an impossible plan."""
-        numbers = {
-            "limit_horizontal_m": self.limit_horizontal_m,
-            "limit_vertical_m": self.limit_vertical_m,
-            "horizon_h": self.horizon_h,
-            "stop_h": self.stop_h or 0.0,
-            "face_length_m": self.face_length_m,
-            "shift_h": self.shift_h,
-            "load_deviation": self.load_deviation,
-        }
-        for name, value in numbers.items():
-            if not 0.0 <= value < math.inf:
+        settings = ("limit_horizontal_m", "limit_vertical_m", "horizon_h", "stop_h", "face_length_m", "shift_h")
+        for name in (*settings, "load_deviation"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 <= value < math.inf:
                 raise LifeError(f"{name}: got {value}, expected a finite number >= 0")
         if self.stop_h is not None and self.stop_h > self.horizon_h:
             raise LifeError(f"stop_h: got {self.stop_h:g} h, expected at most the horizon of {self.horizon_h:g} h")
@@ -177,10 +170,7 @@ class Forecast:
 
 
 def forecast(
-    scene: Scene,
-    plan: Plan,
-    deviation_m: tuple[float, float] = (0.0, 0.0),
-    known: Coefficient | None = None,
+    scene: Scene, plan: Plan, deviation_m: tuple[float, float] = (0.0, 0.0), known: Coefficient | None = None
 ) -> Forecast:
     """Return the forecast of the time at which a clearance of the scene reaches its limit.
 
@@ -227,10 +217,8 @@ def _forecast(
     coefficient = np.exp(rng.normal(0.5 * (low + high), (high - low) / (2.0 * NORMAL_P95), plan.draws))
     load = np.maximum(1.0 + plan.load_deviation * rng.standard_normal(plan.draws), 0.1)
     if coefficient_known is not None:
-        coefficient, load = (
-            coefficient_known.draw(plan.draws, rng),
-            1.0 + tuning.PATH_DEVIATION * rng.standard_normal(plan.draws),
-        )
+        coefficient = coefficient_known.draw(plan.draws, rng)
+        load = 1.0 + tuning.PATH_DEVIATION * rng.standard_normal(plan.draws)
     coefficient = coefficient * multiple
     size = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
     # a drawn clearance must stay above zero
@@ -241,12 +229,10 @@ def _forecast(
     limit = (plan.limit_horizontal_m + spare[0], plan.limit_vertical_m + spare[1])
     path = wear_path(scene, limit, most)
     clearance = size + path.clearance_growth()
-    needed = np.stack(
-        [
-            _exposure_at(path.exposure, clearance[:, axis], limit_m - now[:, axis])
-            for axis, limit_m in enumerate((plan.limit_horizontal_m, plan.limit_vertical_m))
-        ]
-    ).min(axis=0)
+    limits = np.array([plan.limit_horizontal_m, plan.limit_vertical_m])
+    needed = np.minimum(
+        *(_exposure_at(path.exposure, *pair) for pair in zip(clearance.T, (limits - now).T, strict=True))
+    )
     rate = coefficient * load * wear.travel_speed_m_s * HOUR_S / wear.pad_area_m2
     hours = needed / rate
     reached = np.where(hours <= plan.horizon_h, hours, np.inf)

@@ -146,9 +146,7 @@ class Forward:
         spans = np.where(edges[1:] > edges[:-1], times[np.maximum(edges[1:], 1) - 1] - starts, 0.0)
         budgets = (_STEPS_PER_SECOND * spans).astype(np.int64) + _STEPS
         parts = Parts(self._terms, None, segments, self._implicit)
-        code = run_restarts(
-            params, parts, records, self._work, totals, self._log, edges, budgets, times, q, v
-        )  # fmt: skip
+        code = run_restarts(params, parts, records, self._work, totals, self._log, edges, budgets, times, q, v)
         self.work += int(records["steps"].sum()) + _IMPLICIT_WORK * int(records["implicit_steps"].sum())
         if code != Status.OK or not np.isfinite(q).all():
             return None
@@ -188,13 +186,8 @@ class Forward:
         knots = self._knots
         t = np.union1d(knots[(knots > start) & (knots < times[-1])], times)
         at_times, out = np.isin(t, times), []
-        states, gains = (
-            np.array([motion_start.state for motion_start in starts]),
-            np.array([motion_start.gain for motion_start in starts])[:, None],
-        )
-        batch = TwinBatch(
-            [motion_start.scene for motion_start in starts], tol=tuning.TOLERANCE, start=start, max_steps=_STEPS
-        )
+        states, gains = np.array([one.state for one in starts]), np.array([one.gain for one in starts])[:, None]
+        batch = TwinBatch([one.scene for one in starts], tol=tuning.TOLERANCE, start=start, max_steps=_STEPS)
         batch.move(range(len(starts)), states[:, :3], states[:, 3:])
         batch.set_wrench((self.load.at(np.array([start])) * gains)[:, 0])
         good = np.ones(len(starts), np.bool_)

@@ -71,10 +71,7 @@ def _alternated(
         if in_vain == _IN_VAIN or (index and size < tuning.SETTLED * len(COMPONENTS)):
             break
         harmonics = harmonics.moved(np.clip(change, -tuning.LACKING, tuning.LACKING), np.diag(covariance))
-        problem = Problem(
-            problem.forward.under(harmonics.added(measured_load)), problem.unknowns, problem.window,
-            horizon=problem.horizon, differences=problem.differences, harmonics=harmonics,
-        )  # fmt: skip
+        problem = problem.having(forward=problem.forward.under(harmonics.added(measured_load)), harmonics=harmonics)
         most = problem.deviation, problem.start_spread
         shared, states = (np.clip(one, -bound, bound) for one, bound in zip((shared, states), most, strict=True))
         shared = problem.unknowns.within(fitted.shared + shared)
@@ -93,10 +90,6 @@ def _named(harmonics: Harmonics) -> str:
     clear[1::2] += clear[2::2]
     clear[2::2] = 0.0
     term, component = divmod(int(clear.argmax()), len(COMPONENTS))
-    size = (
-        float(np.hypot(*harmonics.amplitude[term : term + 2, component]))
-        if term
-        else abs(harmonics.amplitude[0, component])
-    )
+    size = float(np.linalg.norm(harmonics.amplitude[term : term + 2 if term else 1, component]))
     place = f"at {harmonics.multiples[term // 2]} times its frequency" if term else "at rest"
     return f"load: {COMPONENTS[component]} lacks {size:.1%} of its amplitude {place}"

@@ -78,10 +78,7 @@ def with_differences(problem: Problem, fitted: Fit) -> tuple[Problem, Fit] | Non
         # a change within the noise is left to the linearised step of `discrepancy.graded`
         if index and size < tuning.SETTLED:
             break
-        problem = Problem(
-            forward, problem.unknowns, problem.window, horizon=problem.horizon, differences=differences,
-            drift=problem.drift,
-        )  # fmt: skip
+        problem = problem.having(forward=forward, differences=differences, drift=problem.drift)
         again = fit(problem, fitted.shared, fitted.point.states, fitted.noise, _ITERATIONS)
         if again is None:
             return None

@@ -35,10 +35,7 @@ def with_other_law_numbers(problem: Problem, fitted: Fit, period: float) -> tupl
         if beside is None or not changes:
             break
         unknowns = _changed(first, changes, first.penetration_of(float(fitted.shared[SOFTNESS])))
-        other = Problem(
-            forward.of(unknowns.scene), unknowns, problem.window, horizon=problem.horizon,
-            differences=problem.differences,
-        )  # fmt: skip
+        other = problem.having(forward=forward.of(unknowns.scene), unknowns=unknowns)
         again = fit(other, unknowns.within(beside.shared), fitted.point.states, fitted.noise, _ITERATIONS)
         if again is None or again.loss > fitted.loss - tuning.OUTLYING**2:
             break

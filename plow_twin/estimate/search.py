@@ -77,9 +77,7 @@ def behind_low_pass(problem: Problem, fitted: Fit) -> Fit | None:
     """
     if problem.window.poses.interval() > RESOLVING:
         return None
-    other = Problem(
-        problem.forward.renewed(), problem.unknowns, problem.window, horizon=problem.horizon, differences=LOW_PASS
-    )
+    other = problem.having(forward=problem.forward.renewed(), differences=LOW_PASS)
     again = fit(other, fitted.shared, fitted.point.states, fitted.noise, _STAGES[-1][1])
     return again if again is not None and again.loss < fitted.loss - tuning.OUTLYING**2 else None
 
@@ -136,7 +134,7 @@ def refine(
     best = min((fit_result for fit_result in fits if fit_result is not None), key=lambda fit: fit.loss, default=None)
     if best is None:
         return None
-    whole = Problem(forward, unknowns, window, horizon=horizon, differences=differences, drift=None if hard else drift)
+    whole = near.having(horizon=horizon, drift=None if hard else drift)
     states = better_states(whole, best.shared, best.point.states)
     best = fit(whole, best.shared, states, best.noise, 20 if not hard and drift is None else 12)
     return None if best is None else (whole, best)
@@ -167,8 +165,7 @@ def states_at(window: Window, shared: Array) -> Array:
 def better_states(problem: Problem, shared: Array, states: Array) -> Array:
     """Return starting states, replaced by the end of the previous swing where it fits the poses better."""
     window, scene = problem.window, problem.unknowns.scene_of(shared)
-    gain = shared[GAIN]
-    poses = window.poses
+    gain, poses = shared[GAIN], window.poses
     scale = np.maximum(np.nanstd(np.where(poses.measured, poses.q, filled(poses)), axis=0), 1e-6)
     out = states.copy()
     times = window.poses.t - shared[DELAY]

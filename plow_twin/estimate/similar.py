@@ -56,13 +56,17 @@ class Units:
         """Unit of force in N."""
         return self.mass * self.length / self.time**2
 
+    @property
+    def speed(self) -> float:
+        """Unit of speed in m/s."""
+        return self.length / self.time
+
     def scene(self, scene: Scene) -> Scene:
         """Return a scene, without loads and wear, in these units."""
         length, mass, time = self.length, self.mass, self.time
         head, frame, clearance, gravity = scene.head, scene.frame, scene.clearance, scene.gravity
         x, y = head.com_offset_m
-        (qx, qy, theta), (vx, vy, omega) = scene.initial.q, scene.initial.v
-        speed = length / time
+        (qx, qy, theta), (vx, vy, omega), speed = scene.initial.q, scene.initial.v, self.speed
         its = replace(
             scene,
             head=replace(
@@ -75,14 +79,12 @@ class Units:
                 frame,
                 width_m=frame.width_m / length,
                 height_m=frame.height_m / length,
-                corner_radius_m=None if frame.corner_radius_m is None else frame.corner_radius_m / length,
+                corner_radius_m=_over(frame.corner_radius_m, length),
             ),
             clearance=Clearance(clearance.horizontal_m / length, clearance.vertical_m / length),
             contact=self._contact(scene.contact),
             gravity=replace(
-                gravity,
-                acceleration_m_s2=gravity.acceleration_m_s2 * time**2 / length,
-                arm_m=gravity.arm_m / length,
+                gravity, acceleration_m_s2=gravity.acceleration_m_s2 * time**2 / length, arm_m=gravity.arm_m / length
             ),
             initial=Initial((qx / length, qy / length, theta), (vx / speed, vy / speed, omega * time)),
             friction=None if scene.friction is None else self._friction(scene.friction),
@@ -118,13 +120,10 @@ class Units:
 
     def in_si(self, estimate: Estimate, scene: Scene) -> Estimate:
         """Return an estimate converted from these units to SI; `scene` is the scene in SI units."""
-        contact = scene.contact
-        length, time = self.length, self.time
-        unit = {
-            quantity.name: length ** quantity.dimension[0]
-            * self.mass ** quantity.dimension[1]
-            * time ** quantity.dimension[2]
-            for quantity in QUANTITIES
+        length, mass, time = self.length, self.mass, self.time
+        contact, noise, apparent = scene.contact, estimate.noise, estimate.apparent
+        unit: dict[str, float] = {
+            one.name: math.prod(map(pow, (length, mass, time), one.dimension)) for one in QUANTITIES
         }
         unit["stiffness"] = self.force / length**contact.exponent
         unit["damping"] = 1.0 if contact.damping is None else self._damping(contact)
@@ -146,23 +145,17 @@ class Units:
             t_start=estimate.t_start * time,
             t_end=estimate.t_end * time,
             **converted,
-            noise=None
-            if estimate.noise is None
-            else (estimate.noise[0] * length, estimate.noise[1] * length, estimate.noise[2]),
+            noise=noise and (noise[0] * length, noise[1] * length, noise[2]),
             differs={
                 name: (share, by * unit_of(name), deviation * unit_of(name))
                 for name, (share, by, deviation) in estimate.differs.items()
             },
             groups={name: (value.times(length), state) for name, (value, state) in estimate.groups.items()},
-            forces_measured=None
-            if estimate.forces_measured is None
-            else estimate.forces_measured.in_units(self.force, self.time),
+            forces_measured=estimate.forces_measured and estimate.forces_measured.in_units(self.force, self.time),
             reasons=estimate.reasons + scale if estimate.reasons else (),
             load_harmonics=estimate.load_harmonics and estimate.load_harmonics.in_units(self.force, length, time),
-            apparent=None
-            if estimate.apparent is None
-            else (estimate.apparent[0].times(length), estimate.apparent[1].times(length)),
-            motion=None if estimate.motion is None else estimate.motion.in_units(length, time),
+            apparent=apparent and (apparent[0].times(length), apparent[1].times(length)),
+            motion=estimate.motion and estimate.motion.in_units(length, time),
         )
 
     def _damping(self, contact: Contact) -> float:
@@ -170,26 +163,27 @@ class Units:
         return self.mass / self.time if LAWS[contact.law].additive else self.time / self.length
 
     def _contact(self, contact: Contact) -> Contact:
-        damping, ramp, speed = contact.damping, contact.ramp_m, self.length / self.time
-        fastest, along = contact.restitution_speed_m_s, contact.restitution_fall_along_s_m
         return replace(
             contact,
             stiffness=contact.stiffness * self.length**contact.exponent / self.force,
-            damping=None if damping is None else damping / self._damping(contact),
-            impact_speed_floor_m_s=contact.impact_speed_floor_m_s * self.time / self.length,
-            restitution_speed_m_s=None if fastest is None else fastest / speed,
-            restitution_fall_along_s_m=None if along is None else along * speed,
-            ramp_m=None if ramp is None else ramp / self.length,
+            damping=_over(contact.damping, self._damping(contact)),
+            impact_speed_floor_m_s=contact.impact_speed_floor_m_s / self.speed,
+            restitution_speed_m_s=_over(contact.restitution_speed_m_s, self.speed),
+            restitution_fall_along_s_m=_over(contact.restitution_fall_along_s_m, 1.0 / self.speed),
+            ramp_m=_over(contact.ramp_m, self.length),
         )
 
     def _friction(self, friction: Friction) -> Friction:
-        stiffness, damping = friction.stick_stiffness_n_m, friction.stick_damping_n_s_m
         return replace(
             friction,
-            regularisation_speed_m_s=friction.regularisation_speed_m_s * self.time / self.length,
-            stick_stiffness_n_m=None if stiffness is None else stiffness * self.time**2 / self.mass,
-            stick_damping_n_s_m=None if damping is None else damping * self.time / self.mass,
+            regularisation_speed_m_s=friction.regularisation_speed_m_s / self.speed,
+            stick_stiffness_n_m=_over(friction.stick_stiffness_n_m, self.mass / self.time**2),
+            stick_damping_n_s_m=_over(friction.stick_damping_n_s_m, self.mass / self.time),
         )
+
+
+def _over(value: float | None, unit: float) -> float | None:
+    return None if value is None else value / unit
 
 
 def _converted(scene: Scene, its: Scene) -> dict[str, Provenance]:

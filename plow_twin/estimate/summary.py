@@ -167,9 +167,7 @@ def _with_forces(result: Estimate, problem: Problem, fit: Fit, forces: ContactFo
         for state, old, new in zip(result.states, result.in_scene_frame(), (normal[GX], normal[GY]), strict=True)
     )
     return replace(
-        with_apparent(result, apparent),
-        **_numbers(problem.unknowns, normal),
-        correlation=_correlation(covariance),
+        with_apparent(result, apparent), **_numbers(problem.unknowns, normal), correlation=_correlation(covariance)
     )
 
 
@@ -290,18 +288,9 @@ def _groups(
 ) -> dict[str, tuple[Interval, State]]:
     """Return clearance and state of each group of facing pads, for a frame of exactly the scene's size.
 
-    Parameters
-    ----------
-    problem, fit : Problem, Fit
-        The fit.
-    widened : float
-        Factor on the standard deviations of the fit.
-    states : list of State
-        States of the horizontal and the vertical clearance.
-    untested : dict
-        Clearances that no predicted motion tests, by the index of the axis. They replace the clearances between pads.
-    shared, added : ndarray
-        The unknowns of a machine that may differ from the model, and their covariance minus that of the fit.
+    `widened` is a factor on the standard deviations of the fit. The clearances `untested`, by the index of the axis,
+    replace those between pads if no predicted motion tests them. `shared` are the unknowns of a machine that may differ
+    from the model, and `added` is their covariance minus that of the fit.
     """
     out = {}
     for name, (value, deviation) in by_group(problem, fit, widened).items():

@@ -93,11 +93,8 @@ class _Simulation:
     def _better(
         self, vector: Array, here: Array, rows: int, scale: Array, damping: float
     ) -> tuple[tuple[Array, Array] | None, float]:
-        free, spread, normal, gradient = (
-            self.free,
-            self.deviation[self.free],
-            *self._equations(vector, here, rows, scale),
-        )
+        free, spread = self.free, self.deviation[self.free]
+        normal, gradient = self._equations(vector, here, rows, scale)
         for _ in range(_SHORTER):
             step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
             trial = vector.copy()

@@ -123,16 +123,13 @@ def _repeated(problem: Problem, fit: Fit, period: float, verdict: Verdict) -> No
     t, is_predicted = problem.window.poses.t, predicted(fit)
     turns = np.floor((t - t[0]) / period).astype(int)
     phase = np.minimum(((t - t[0]) / period % 1.0 * tuning.PHASES).astype(int), tuning.PHASES - 1)
-    between, within, cells = 0.0, 0.0, 0
-    freedom = 0
+    between, within, cells, freedom = 0.0, 0.0, 0, 0
     for i in range(3):
         scale = fit.noise[i]
         for k in range(tuning.PHASES):
             inside = is_predicted[:, i] & (phase == k)
-            means = (
-                np.array([fit.point.residual[inside & (turns == turn), i].mean() for turn in np.unique(turns[inside])])
-                / scale
-            )
+            parts = [fit.point.residual[inside & (turns == turn), i] for turn in np.unique(turns[inside])]
+            means = np.array([part.mean() for part in parts]) / scale
             if len(means) < 3:
                 continue
             between += len(means) * float(means.mean()) ** 2
@@ -159,9 +156,8 @@ def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
     shared = fit.shared.copy()
     stiffness = unknowns.stiffness_of(float(shared[SOFTNESS]))
     shared[DAMPING] = math.log(tuning.LAW_DAMPING[0] * unknowns.critical_damping(stiffness))
-    prior = problem.mean, problem.deviation
-    forward, window = problem.forward.of(unknowns.scene), problem.window
-    other = Problem(forward, unknowns, window, prior, problem.horizon, problem.differences, problem.drift)
+    forward, prior = problem.forward.of(unknowns.scene), (problem.mean, problem.deviation)
+    other = problem.having(forward=forward, unknowns=unknowns, prior=prior, drift=problem.drift)
     point = other.evaluate(shared, fit.point.states)
     problem.forward.work += forward.work
     if point is None:
@@ -218,10 +214,8 @@ def _stuck(problem: Problem, fit: Fit, verdict: Verdict) -> None:
         for end, length in zip(ends[lengths >= tuning.STUCK[0]], lengths[lengths >= tuning.STUCK[0]], strict=True):
             span = predicted[end - length + 1 : end + 1]
             moved = float(np.nanmax(span) - np.nanmin(span)) if np.isfinite(span).any() else 0.0
-            if (
-                moved > tuning.STUCK[1] * max(noise_level(column[finite][:, None])[0], 1e-5)
-                or length > FEWEST_FOR_SCATTER
-            ):
+            least = tuning.STUCK[1] * max(noise_level(value[:, None])[0], 1e-5)
+            if moved > least or length > FEWEST_FOR_SCATTER:
                 verdict.sensor.append(f"{name}: the same value {length} times in a row")
                 verdict.broken = True
                 break
@@ -246,18 +240,17 @@ def _noise_change(fit: Fit, verdict: Verdict) -> None:
 def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
     if problem.window.swings < 6:
         return
-    best: dict[str, tuple[float, Array]] = {}
+    best: list[tuple[float, Array]] = []
     for name, columns in (("bias", np.arange(SIZE)[BIAS]), ("clearance", np.array([GX, GY]))):
-        best[name] = (-np.inf, np.zeros(len(columns)))
-        for information, score in _changes(problem, fit, columns):
-            held = information + np.diag(1.0 / problem.deviation[columns] ** 2)
-            change = np.asarray(np.linalg.solve(held, score), np.float64)
-            gained = float(change @ score)
-            if gained > best[name][0]:
-                best[name] = (gained, change)
-    for name, (gained, _) in best.items():
-        verdict.figures[f"change_{name}"] = gained
-    (bias, shift), (clearance, growth) = best["bias"], best["clearance"]
+        held = np.diag(1.0 / problem.deviation[columns] ** 2)
+        changes = [
+            (np.asarray(np.linalg.solve(information + held, score), np.float64), score)
+            for information, score in _changes(problem, fit, columns)
+        ]
+        gains = [(float(change @ score), change) for change, score in changes]
+        best.append(max(gains, key=lambda pair: pair[0], default=(-np.inf, np.zeros(len(columns)))))
+        verdict.figures[f"change_{name}"] = best[-1][0]
+    (bias, shift), (clearance, growth) = best
     share = max(bias, clearance) / max(_excess(fit), 1e-9)
     verdict.figures["change_share"] = share
     if max(bias, clearance) < tuning.CHANGE_CHI2:

@@ -16,15 +16,7 @@ from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
 from plow_twin.estimate.gaps import Gaps
-from plow_twin.estimate.measurements import (
-    FEWEST_POSES,
-    UNSTATED,
-    Deviation,
-    Load,
-    Poses,
-    believed,
-    own_deviations,
-)
+from plow_twin.estimate.measurements import FEWEST_POSES, UNSTATED, Deviation, Load, Poses, believed, own_deviations
 from plow_twin.model.pairs import PAIR_COUNT
 
 Array = NDArray[np.float64]
