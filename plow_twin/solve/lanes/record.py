@@ -169,6 +169,7 @@ LANES: Final = np.dtype(
         # base of the power: d, or d / sigma^2 for a pair that touches at the start of the step; d^2 if n is an integer
         ("base", "f8", (PAIR_COUNT, _ROWS, WIDTH)),
         ("rate", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d' of the pair in each slot
+        ("swept", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # d^n d' of the pair in each slot
         ("per_base", "f8", _PAIRS),  # 1 / base at the start of the step
         # the following fields are used only for friction, for the pair in each slot; r = s' / v_s
         ("slip", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # k r_k, and r_0 in row 0

@@ -2,8 +2,8 @@
 
 If the contact force is linear in penetration and rate, the sum over a scene's acting pairs is one affine map of the
 state, and an order needs twelve Cauchy products. For each slot of acting pairs (`record`), the force K d (1 + lambda
-d') = K (d + lambda / 2 (d^2)') adds half a product, the force K d^n (1 + lambda d') adds three, and friction three
-more.
+d') = K (d + lambda / 2 (d^2)') adds half a product, the force K d^n (1 + lambda d') adds two or three, and friction
+three more.
 """
 
 from __future__ import annotations
@@ -112,6 +112,9 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction,
         start_x, start_y, turned_at = exact_row(lanes.held, 0), exact_row(lanes.held, 1), exact_row(lanes.held, 2)
         active, lanes.vanished[0] = lanes.live[0], 0
     m, i = exact_row(lanes.inverse_mass, 0), exact_row(lanes.inverse_inertia, 0)
+    if power is not None:
+        # `_push_by_power` returns forces divided by K
+        m, i = m * exact_row(lanes.stiffness, 0), i * exact_row(lanes.stiffness, 0)
     along, turn, load, direction = lanes.along, lanes.turn, lanes.load, lanes.direction
     order = limit
     for k in range(limit):
@@ -301,9 +304,8 @@ def _add_ends(load, k, c0, s0, c, s, share, wc, ws):
 
 
 @kernel(inline="code")
-def _add_force(lanes, gear, push, fx, fy, gc, gs):
-    """Return the forces along X and Y and the factors of c and s in the moment, plus those of a slot's F = K `push`."""
-    force = exact_row(lanes.stiffness, 0) * push
+def _add_force(gear, force, fx, fy, gc, gs):
+    """Return the forces along X and Y and the factors of c and s in the moment, plus those of a slot's force."""
     return (
         fused(exact_row(gear, 2) * -1.0, force, fx), fused(exact_row(gear, 3) * -1.0, force, fy),
         fused(exact_row(gear, 5), force, gc), fused(exact_row(gear, 6), force, gs),
@@ -339,16 +341,19 @@ def _push(lanes, w, k, acts, viscous, hysteretic, slip, c, s, x, y, dc, ds, dx, 
             push = fused(exact_row(lanes.damped, 0), rate, push)
         push = choose(taken, push, exact_splat(0.0))
         set_row(lanes.push[slot], k, push)
-        fx, fy, gc, gs = _add_force(lanes, gear, push, fx, fy, gc, gs)
+        fx, fy, gc, gs = _add_force(gear, exact_row(lanes.stiffness, 0) * push, fx, fy, gc, gs)
         if slip is not None:
-            fx, fy, gc, gs = _add_friction(lanes, w, slot, k, taken, push, dc, ds, dx, dy, fx, fy, gc, gs)
+            sliding = exact_row(lanes.friction, 0) * exact_row(lanes.stiffness, 0)
+            fx, fy, gc, gs = _add_friction(lanes, w, slot, k, taken, sliding, push, dc, ds, dx, dy, fx, fy, gc, gs)
     return fx, fy, gc, gs
 
 
 @kernel(inline="code")
 def _push_by_power(lanes, w, k, acts, hysteretic, fraction, slip, c, s, x, y, dc, ds, dx, dy, alpha, beta):
-    """Return the results of `_push` for F = K d^n (1 + lambda d') with exponents n other than 1."""
+    """Return the results of `_push`, divided by K, for F = K d^n (1 + lambda d') with exponents n other than 1."""
     fx = fy = gc = gs = zero = exact_splat(0.0)
+    per_order = (exact_row(lanes.exponent, 0) + 1.0) * w.inverse[max(k, 1)]
+    steady, bent = alpha * per_order, beta * per_order
     for slot in range(PAIR_COUNT):
         gear, depth = lanes.gear[slot], lanes.depth[slot]
         if lanes.taken[slot] == 0:
@@ -366,7 +371,7 @@ def _push_by_power(lanes, w, k, acts, hysteretic, fraction, slip, c, s, x, y, dc
             deeper = choose(acts, deeper, zero)
         set_row(depth, k + 1, deeper)
         if fraction is not None:
-            power, damped = _raise(lanes, w, slot, k, hysteretic)
+            power, damped = _raise(lanes, w, slot, k, steady, bent)
         else:
             power, damped = _multiply(lanes, slot, k, hysteretic)
             power = choose(lanes.taken[slot], power, zero)
@@ -374,20 +379,26 @@ def _push_by_power(lanes, w, k, acts, hysteretic, fraction, slip, c, s, x, y, dc
             power, damped = choose(acts, power, zero), choose(acts, damped, zero)
         set_row(lanes.power[slot], k, power)
         push = power
-        if hysteretic is not None:
+        if hysteretic is not None or fraction is not None:
             damped = fused(power, exact_row(lanes.rate[slot], 0), damped)
-            push = fused(exact_row(gear, 7), damped, push)
+            if fraction is not None:
+                set_row(lanes.swept[slot], k, damped)
+            if hysteretic is not None:
+                push = fused(exact_row(gear, 7), damped, push)
         set_row(lanes.push[slot], k, push)
-        fx, fy, gc, gs = _add_force(lanes, gear, push, fx, fy, gc, gs)
+        fx, fy, gc, gs = _add_force(gear, push, fx, fy, gc, gs)
         if slip is not None:
             taken = lanes.taken[slot] & acts
-            fx, fy, gc, gs = _add_friction(lanes, w, slot, k, taken, push, dc, ds, dx, dy, fx, fy, gc, gs)
+            sliding = exact_row(lanes.friction, 0)
+            fx, fy, gc, gs = _add_friction(lanes, w, slot, k, taken, sliding, push, dc, ds, dx, dy, fx, fy, gc, gs)
     return fx, fy, gc, gs
 
 
 @kernel(inline="code")
-def _add_friction(lanes, w, slot, k, taken, push, dc, ds, dx, dy, fx, fy, gc, gs):
+def _add_friction(lanes, w, slot, k, taken, sliding, push, dc, ds, dx, dy, fx, fy, gc, gs):
     """Return forces and factors after adding coefficient k of a slot's friction T = mu F tanh r (`method.series`).
+
+    `sliding` is the friction T of a pair with `push` 1 and tanh r = 1.
 
     For a head that carries walls, the position of a corner along its wall has the coefficients of the arm of F with the
     opposite sign, and the arm of T has the coefficients of the penetration (`model.geometry`).
@@ -414,7 +425,7 @@ def _add_friction(lanes, w, slot, k, taken, push, dc, ds, dx, dy, fx, fy, gc, gs
         square = fused(first * 2.0, newest, square)
         set_row(tau, k, newest)
     set_row(rest, k, square * -1.0)
-    force = choose(taken, exact_row(lanes.friction, 0) * exact_row(lanes.stiffness, 0) * drag, exact_splat(0.0))
+    force = choose(taken, sliding * drag, exact_splat(0.0))
     return (
         fused(exact_row(gear, 3), force, fx), fused(exact_row(gear, 2) * -1.0, force, fy),
         fused(exact_row(gear, 0), force, gc), fused(exact_row(gear, 1), force, gs),
@@ -451,39 +462,42 @@ def _product(a, b, k):
 
 
 @kernel(inline="code")
-def _raise(lanes, w, slot, k, hysteretic):
-    """Return the results of `_multiply` for exponents n that are not integers, by `model.contact.power_term`.
+def _raise(lanes, w, slot, k, steady, bent):
+    """Return the results of `_multiply` for exponents n that are not integers.
 
+    The series P of d^n follows from (n + 1) P d' = (P d)'. Since P d' and P d are products with d^n, an order takes two
+    Cauchy products. P d' is a series of the rate in time; `steady` and `bent` are (n + 1) / k times alpha and beta.
     The base is d. If the pair of a lane touches at the start of the step, it is d / sigma^2, and the power begins with
     sigma^3 (n = 1.5).
     """
-    power, base, rate = lanes.power[slot], lanes.base[slot], lanes.rate[slot]
-    touching, zero, above = lanes.touching[slot], exact_splat(0.0), exact_row(lanes.exponent, 0) + 1.0
-    here, weight, per = exact_row(lanes.depth[slot], k), exact_splat(-1.0 * k), exact_splat(w.inverse[max(k, 1)])
+    power, base, rate, swept = lanes.power[slot], lanes.base[slot], lanes.rate[slot], lanes.swept[slot]
+    touching, zero, here = lanes.touching[slot], exact_splat(0.0), exact_row(lanes.depth[slot], k)
     if touching != 0:
         if k > 1:
             set_row(base, k - 2, choose(touching, here, exact_row(base, k - 2)))
         if k == 2:
             _invert(lanes, slot, here, touching)
         here = choose(touching, zero, here)
-        weight = choose(touching, exact_splat(3.0 - k), weight)
-        per = choose(touching, exact_splat(w.inverse[max(k - 3, 1)]), per)
     set_row(base, k, here)
     if k == 0:
         _invert(lanes, slot, here, ~touching)
         # the powers of lanes without a pair in the slot remain zero
         return choose(lanes.taken[slot] & ~touching, _first_power(lanes, here), zero), zero
-    result = damped = zero
+    lower = damped = zero
     for j in range(1, k):
-        lower = exact_row(power, k - j)
-        weight = weight + above
-        result = fused(lower, exact_row(base, j) * weight, result)
-        if hysteretic is not None:
-            damped = fused(lower, exact_row(rate, j), damped)
+        term = exact_row(power, k - j)
+        lower, damped = fused(term, exact_row(base, j), lower), fused(term, exact_row(rate, j), damped)
     first = exact_row(power, 0)
-    result = fused(first, here * (weight + above), result)
-    damped = fused(first, exact_row(rate, k), damped)
-    result = result * (per * exact_row(lanes.per_base, slot))
+    lower, damped = fused(first, here, lower), fused(first, exact_row(rate, k), damped)
+    older = zero
+    if k > 1:
+        older = exact_row(swept, k - 2) * bent
+    result = fused(exact_row(swept, k - 1), steady, older - lower)
+    if touching != 0:
+        # here (k - 3) d_2 P_k = 2 (n + 1) (P d')_k - (k + 2) (P d)_(k + 2), both without their terms with P_k
+        rising = (exact_row(lanes.exponent, 0) + 1.0) * 2.0 * damped - lower * (k + 2.0)
+        result = choose(touching, rising * w.inverse[max(k - 3, 1)], result)
+    result = result * exact_row(lanes.per_base, slot)
     if touching != 0 and k <= 3:
         result = choose(touching, zero, result)
         if k == 3:
