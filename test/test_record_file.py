@@ -29,7 +29,7 @@ from rosbags.highlevel import AnyReader
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import decode, encode, typestore
-from plow_twin.record.compression import decompress, independent_blocks
+from plow_twin.record.compression import decompress
 from plow_twin.record.entries import EntryRecord, OutputRecord
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped, from_message, read_digests, to_message
@@ -360,22 +360,9 @@ def test_a_string_has_the_bytes_that_rosbags_gives_it(text: str) -> None:
     assert encode(Text(text)) == bytes(types.serialize_cdr(types.types[Text.TYPE](text), Text.TYPE))
 
 
-def test_lz4_frames_are_read_as_by_the_library_lz4() -> None:
+def test_frames_of_lz4_of_every_kind_are_read() -> None:
     noise = np.random.default_rng(5).bytes(70_000)
     contents = (b"", b"x", bytes(range(256)) * 1000, noise, 3 * (noise[:9000] + bytes(90_000)))
-    read_directly = 0
     for content, linked, checksum, size in product(contents, (False, True), (False, True), (False, True)):
         frame = lz4.frame.compress(content, block_linked=linked, content_checksum=checksum, store_size=size)
         assert bytes(decompress("lz4", memoryview(frame), len(content))) == content
-        direct = independent_blocks(memoryview(frame), len(content))
-        assert direct is None or direct.tobytes() == content
-        read_directly += direct is not None
-    assert read_directly >= 6  # at least the kinds of records that the recorder writes are read directly
-    whole = np.frombuffer(lz4.frame.compress(contents[4][:5000], block_linked=False), np.uint8)
-    for place in range(len(whole)):
-        assert independent_blocks(whole[:place].data, 5000) is None
-        for bit in range(8):
-            flipped = whole.copy()
-            flipped[place] ^= 1 << bit
-            blocks = independent_blocks(flipped.data, 5000)
-            assert blocks is None or len(blocks) == 5000

@@ -3,9 +3,8 @@
 A truncated file is read up to its last whole record. Damaged chunks are skipped and counted. For speed, the messages of
 a chunk are stored as arrays of offsets into its bytes.
 
-A *head* is the opcode and the length at the start of a record. A *channel mask* is an integer with one bit for each
-channel of a chunk. The mask is computed before the chunk is read, so that a chunk without wanted channels can be
-skipped.
+A *head* is the opcode and the length at the start of a record. The index records behind a chunk name its channels, so
+that a chunk without wanted channels can be skipped.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 import numpy as np
-from numba.core import types
 
 from plow_twin.errors import ExcessError, ForeignRecordingError, RecordingError
 from plow_twin.record.compression import RECORD_LIMIT, decompress
@@ -39,17 +37,12 @@ _ATTACHMENT: Final = 0x09
 _TABLES: Final = (".csv", ".parquet")
 _HEAD: Final = struct.Struct("<BQ")
 _HEAD_SIZE: Final = _HEAD.size
-#: Size [B] of the start of an index record: a head and a channel number of two bytes.
-_INDEX_HEAD: Final = _HEAD.size + 2
+#: Start of an index record: a head and a channel number.
+_INDEX_HEAD: Final = struct.Struct("<BQH")
 #: Largest decompressed size of all chunks, as a multiple of the size of the file; `RECORD_LIMIT` is added.
 UNPACKED_RATIO: Final = 200
 #: Largest number of schemas and channels that a file may declare.
 _MOST_DECLARED: Final = 10_000
-#: Number of bits in a channel mask. A chunk with a channel number of 63 or more has the mask -1.
-_CHANNEL_BITS: Final = 63
-_AHEAD: Final = 64
-#: The function `pread` of the C library. Compiled code calls it, because a call from Python for each head is slow.
-_pread: Final[Any] = types.ExternalFunction("pread", types.intp(types.int32, types.uintp, types.uintp, types.int64))
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 #: Number of bytes before the data of a message: opcode, length, channel, sequence, log time and publish time.
 MESSAGE_HEAD: Final = 31
@@ -131,28 +124,31 @@ class ChunkReader:
     damaged: int = 0
     left_out: int = 0
     position: int = 0
-    #: result of `wanted` for each channel mask
-    _answers: dict[int, bool] = field(default_factory=dict, init=False)
+    #: result of `wanted` for each set of channels
+    _answers: dict[frozenset[int], bool] = field(default_factory=dict, init=False)
     #: number of messages for which the next table has space
     _room: int = field(default=256, init=False)
     #: decompressed size of all chunks read so far [B]
     _unpacked: int = field(default=0, init=False)
     #: declared schemas and channels by opcode and number, in order to skip repeated declarations
     _declared: dict[tuple[int, bytes], bytes] = field(default_factory=dict, init=False)
+    #: name and text of each schema
+    _schemas: dict[int, tuple[str, bytes]] = field(default_factory=dict, init=False)
+    #: chunks and single messages to scan in one call, because each call of `scan` has a fixed cost
+    _waiting: list[Bytes] = field(default_factory=list, init=False)
+    _waiting_bytes: int = field(default=0, init=False)
     _others: Indexes = field(default_factory=lambda: np.empty(256, np.int64), init=False)
 
     def __iter__(self) -> Iterator[Messages]:
         self.finished, self.damaged, self.left_out, self.position = False, 0, 0, 0
-        self._unpacked, self._declared = 0, {}
-        schemas: dict[int, tuple[str, bytes]] = {}
-        waiting = _Waiting()
+        self._unpacked, self._declared, self._schemas = 0, {}, {}
+        self._waiting, self._waiting_bytes = [], 0
         small = _SMALL if self.wanted is None else _SMALL_ALONE
         with open_mcap(self.path) as stream:
             descriptor = stream.fileno()
-            size = os.fstat(descriptor).st_size
-            heads, place = _Heads(descriptor, size), len(MAGIC)
+            size, place = os.fstat(descriptor).st_size, len(MAGIC)
             while True:
-                opcode, length = heads.at(place)
+                opcode, length = _head(descriptor, place)
                 begin = place + _HEAD_SIZE
                 if length > RECORD_LIMIT and opcode != _ATTACHMENT:
                     break
@@ -161,49 +157,46 @@ class ChunkReader:
                 if begin + length + behind > size:
                     if self.more is None:
                         break
-                    yield from self._scan(waiting.pop_all(), schemas)
+                    yield from self._scan_waiting()
                     yield Messages.none()
                     if not self.more(stream, size):
                         break
                     size = os.fstat(descriptor).st_size
-                    heads = _Heads(descriptor, size)
                     continue
                 place = self.position = begin + length
                 if opcode == _MESSAGE:
-                    waiting.add(np.frombuffer(os.pread(descriptor, _HEAD_SIZE + length, begin - _HEAD_SIZE), np.uint8))
-                if waiting.size > small:
-                    yield from self._scan(waiting.pop_all(), schemas)
+                    record = os.pread(descriptor, _HEAD_SIZE + length, begin - _HEAD_SIZE)
+                    self._wait(np.frombuffer(record, np.uint8))
+                if self._waiting_bytes > small:
+                    yield from self._scan_waiting()
                 if opcode == _CHUNK:
-                    channels, place = heads.index()
+                    channels, place = _indexed(descriptor, place, size)
                     if not self._is_wanted(channels):
                         continue
                     content = self._open(os.pread(descriptor, length, begin))
                     if content is None or len(content) > small:
-                        yield from self._scan(waiting.pop_all(), schemas)
+                        yield from self._scan_waiting()
                     if content is not None:
                         self._count_unpacked(len(content), size)
-                        waiting.add(content)
+                        self._wait(content)
                     else:
-                        self._note_damage(schemas)
+                        self._note_damage()
                 elif opcode in (_SCHEMA, _CHANNEL):
-                    self._declare(opcode, os.pread(descriptor, length, begin), schemas)
+                    self._declare(opcode, os.pread(descriptor, length, begin))
                 elif opcode == _METADATA:
                     # the messages before the damage are yielded first, then the damage is counted
-                    yield from self._scan(waiting.pop_all(), schemas)
+                    yield from self._scan_waiting()
                     self._metadata(os.pread(descriptor, length, begin))
                 elif opcode == _FOOTER:
                     self.finished = os.pread(descriptor, len(MAGIC), place) == MAGIC
                     break
-            yield from self._scan(waiting.pop_all(), schemas)
+            yield from self._scan_waiting()
 
-    def _is_wanted(self, channels: int) -> bool:
-        if self.wanted is None or channels <= 0:
+    def _is_wanted(self, channels: frozenset[int]) -> bool:
+        if self.wanted is None or not channels or not channels <= self.channels.keys():
             return True
         if channels not in self._answers:
-            numbers = {number for number in range(channels.bit_length()) if channels >> number & 1}
-            if not numbers <= self.channels.keys():
-                return True
-            self._answers[channels] = self.wanted(numbers)
+            self._answers[channels] = self.wanted({*channels})
         return self._answers[channels]
 
     def _open(self, record: bytes) -> Bytes | None:
@@ -232,10 +225,17 @@ class ChunkReader:
                 f"{self.path}: unpacks to more than {most >> 20} MiB, expected at most {UNPACKED_RATIO} times its size"
             )
 
-    def _scan(self, contents: list[Bytes], schemas: dict[int, tuple[str, bytes]]) -> Iterator[Messages]:
+    def _wait(self, content: Bytes) -> None:
+        self._waiting.append(content)
+        self._waiting_bytes += len(content)
+
+    def _scan_waiting(self) -> Iterator[Messages]:
+        contents, self._waiting, self._waiting_bytes = self._waiting, [], 0
+        if contents:
+            yield from self._scan(contents)
+
+    def _scan(self, contents: list[Bytes]) -> Iterator[Messages]:
         """Yield the messages of several chunks as one batch; if a chunk is damaged, yield one batch for each chunk."""
-        if not contents:
-            return
         content = contents[0] if len(contents) == 1 else np.concatenate(contents)
         others, table = self._others, np.empty((_COLUMNS, self._room), np.int64)
         count, other_count, whole = scan(content, table, others)
@@ -246,16 +246,16 @@ class ChunkReader:
             self._room = count + count // 8
         if not whole and len(contents) > 1:
             for part in contents:
-                yield from self._scan([part], schemas)
+                yield from self._scan([part])
             return
         for place in others[: min(other_count, len(others))]:
             opcode, length = _HEAD.unpack_from(content.data, int(place))
             start = int(place) + _HEAD.size
-            self._declare(opcode, content[start : start + length].tobytes(), schemas)
+            self._declare(opcode, content[start : start + length].tobytes())
         self.damaged += 0 if whole else 1
         yield Messages(content, *table[:, :count])
 
-    def _declare(self, opcode: int, record: bytes, schemas: dict[int, tuple[str, bytes]]) -> None:
+    def _declare(self, opcode: int, record: bytes) -> None:
         from mcap import records
         from mcap.data_stream import ReadDataStream
 
@@ -269,15 +269,16 @@ class ChunkReader:
         try:
             if opcode == _SCHEMA:
                 schema = records.Schema.read(stream)
-                schemas[schema.id] = (schema.name, schema.data)
+                self._schemas[schema.id] = (schema.name, schema.data)
             else:
                 channel = records.Channel.read(stream)
-                name, text = schemas.get(channel.schema_id, ("", b""))
-                self.channels[channel.id] = Channel(
-                    channel.topic, name, channel.message_encoding, text, channel.metadata
-                )
+                self.channels[channel.id] = self._channel(channel)
         except Exception:  # the messages of a damaged channel are skipped
             self.damaged += 1
+
+    def _channel(self, record: Any) -> Channel:
+        name, text = self._schemas.get(record.schema_id, ("", b""))
+        return Channel(record.topic, name, record.message_encoding, text, record.metadata)
 
     def _metadata(self, record: bytes) -> None:
         from mcap.data_stream import ReadDataStream
@@ -292,41 +293,26 @@ class ChunkReader:
             self.damaged, self.left_out = self.damaged + 1, self.left_out + 1
         self.on_metadata(metadata.name, dict(metadata.metadata))
 
-    def _note_damage(self, schemas: dict[int, tuple[str, bytes]]) -> None:
+    def _note_damage(self) -> None:
         """Count a damaged chunk, and read the channels that the chunk may have declared from the end of the file."""
-        from mcap.reader import make_reader
-
         self.damaged += 1
-        try:
-            with self.path.open("rb") as stream:
-                summary = make_reader(stream).get_summary()
-        except Exception:
-            return
-        if summary is None:
-            return
-        for schema in summary.schemas.values():
-            schemas.setdefault(schema.id, (schema.name, schema.data))
-        for channel in summary.channels.values():
-            name, text = schemas.get(channel.schema_id, ("", b""))
-            self.channels.setdefault(
-                channel.id, Channel(channel.topic, name, channel.message_encoding, text, channel.metadata)
-            )
+        summary = read_summary(self.path)
+        if summary is not None:
+            for schema in summary.schemas.values():
+                self._schemas.setdefault(schema.id, (schema.name, schema.data))
+            for channel in summary.channels.values():
+                self.channels.setdefault(channel.id, self._channel(channel))
 
 
-class _Waiting:
-    """Chunks and single messages to scan in one call, because each call of `scan` has a fixed cost."""
+def read_summary(path: Path) -> Any | None:
+    """Return the summary at the end of an MCAP file, or None if it is missing or damaged."""
+    from mcap.reader import make_reader
 
-    def __init__(self) -> None:
-        self._contents: list[Bytes] = []
-        self.size = 0
-
-    def add(self, content: Bytes) -> None:
-        self._contents.append(content)
-        self.size += len(content)
-
-    def pop_all(self) -> list[Bytes]:
-        contents, self._contents, self.size = self._contents, [], 0
-        return contents
+    try:
+        with path.open("rb") as stream:
+            return make_reader(stream).get_summary()
+    except Exception:  # the type of the error depends on the damage
+        return None
 
 
 def is_mcap(path: Path) -> bool | None:
@@ -357,63 +343,23 @@ def metadata_records(path: Path) -> list[tuple[str, dict[str, str]]]:
     return records
 
 
-class _Heads:
-    """Reader of record heads, which reads many heads in one compiled call."""
-
-    def __init__(self, descriptor: int, size: int) -> None:
-        self._descriptor, self._size = descriptor, size
-        self._table = np.empty((_AHEAD, 5), np.int64)
-        self._rows: list[tuple[int, int, int, int, int]] = []
-        self._next = 0
-        self._index = [0, 0]  # end of the last record, including its index records, and its channel mask
-
-    def at(self, place: int) -> tuple[int, int]:
-        """Return the opcode and the length of the record at offset `place`, or zeros at the end of the file."""
-        if self._next >= len(self._rows) or self._rows[self._next][0] != place:
-            count = look_ahead(self._descriptor, self._size, place, self._table)
-            self._rows, self._next = self._table[:count].tolist(), 0
-            if not self._rows:
-                # if the file cannot be read, this call raises the error
-                os.pread(self._descriptor, 1, place)
-                return 0, 0
-        _, opcode, length, *self._index = self._rows[self._next]
-        self._next += 1
-        return opcode, length & (1 << 64) - 1
-
-    def index(self) -> tuple[int, int]:
-        """Return the channel mask of the chunk from the last call of `at`, and the end of its index records [B]."""
-        end, channels = self._index
-        return channels, end
+def _head(descriptor: int, place: int) -> tuple[int, int]:
+    """Return the opcode and the length of the record at offset `place`, or zeros at the end of the file."""
+    head = os.pread(descriptor, _HEAD_SIZE, place)
+    opcode, length = _HEAD.unpack(head) if len(head) == _HEAD_SIZE else (0, 0)
+    return opcode, length
 
 
-@compiled
-def look_ahead(descriptor, size, place, table):  # type: ignore[no-untyped-def]
-    """Read record heads, beginning at offset `place`, into the rows of `table`; return the number of rows.
-
-    The columns are offset, opcode, length, end and channel mask. An index record has no row. The channel of an index
-    record is added to the mask of the preceding chunk, and the end of this chunk is moved behind the index record.
-    """
-    head, count = np.zeros(_INDEX_HEAD, np.uint8), 0
-    while True:
-        read = _pread(descriptor, head.ctypes.data, head.size, place)
-        if read < _HEAD_SIZE:
+def _indexed(descriptor: int, place: int, size: int) -> tuple[frozenset[int], int]:
+    """Return the channels in the index records from offset `place` on, and the end of these records [B]."""
+    numbers = set[int]()
+    while len(head := os.pread(descriptor, _INDEX_HEAD.size, place)) == _INDEX_HEAD.size:
+        opcode, length, number = _INDEX_HEAD.unpack(head)
+        if opcode != _MESSAGE_INDEX or place + _HEAD_SIZE + length > size:
             break
-        length, end = word(head, 1), place + _HEAD_SIZE + word(head, 1)
-        whole = length >= 0 and place < end <= size
-        if whole and head[0] == _MESSAGE_INDEX and read == _INDEX_HEAD and count > 0 and table[count - 1, 1] == _CHUNK:
-            number = np.int64(head[9]) | np.int64(head[10]) << 8
-            table[count - 1, 3] = end
-            table[count - 1, 4] = -1 if number >= _CHANNEL_BITS else table[count - 1, 4] | np.int64(1) << number
-        elif count == len(table):
-            break
-        else:
-            table[count, 0], table[count, 1], table[count, 2] = place, head[0], length
-            table[count, 3], table[count, 4] = end, 0
-            count += 1
-        if length < 0 or end < 0:
-            break
-        place = end
-    return count
+        numbers.add(number)
+        place += _HEAD_SIZE + length
+    return frozenset(numbers), place
 
 
 @compiled

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from plow_twin.errors import ForeignRecordingError, RecordingError
 from plow_twin.record.cdr import decode
-from plow_twin.record.chunks import ChunkReader, Messages, is_mcap, metadata_records
+from plow_twin.record.chunks import ChunkReader, Messages, is_mcap, metadata_records, read_summary
 from plow_twin.record.entries import NO_ENTRIES, Batch, Entries, Outputs, parted_at, unwrap
 from plow_twin.record.follow import Tail
 from plow_twin.record.header import HEADER_RECORD, JOURNAL, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
@@ -268,15 +268,9 @@ class RunReader:
         return first_ns if has_messages else None
 
     def _received_ns(self) -> tuple[int, int, bool]:
-        from mcap.reader import make_reader
-
         first, last = [], []
         for part in self.parts:
-            try:
-                with part.open("rb") as stream:
-                    summary = make_reader(stream).get_summary()
-            except Exception:  # a truncated part has no summary
-                continue
+            summary = read_summary(part)
             if summary is not None and summary.statistics is not None and summary.statistics.message_count:
                 first.append(summary.statistics.message_start_time)
                 last.append(summary.statistics.message_end_time)
