@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 import signal
 import threading
@@ -154,6 +155,14 @@ def show_facts(console: Console, facts: Mapping[Any, Any]) -> None:
     for name, value in lines:
         text = f"{name:{width}} {value}" if value else name
         console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def print_facts(facts: Mapping[str, Any], *, as_json: bool, quiet: bool = False) -> None:
+    """Print a result as JSON, or as lines of text unless `quiet` is true."""
+    if as_json:
+        click.echo(json.dumps(facts, indent=2, allow_nan=False))
+    elif not quiet:
+        show_facts(output_console(), facts)
 
 
 def _lines(facts: Mapping[Any, Any], indent: int = 0) -> Iterator[tuple[str, str]]:

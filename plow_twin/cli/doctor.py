@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, output_console, show_facts
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, print_facts
 from plow_twin.cli.options import EXISTING, json_option
 
 
@@ -30,10 +29,7 @@ def doctor(recording: Path, repair: bool, as_json: bool) -> int:
     facts = {**report.facts(), "repaired": [path.name for path in rewritten]}
     if rewritten:
         facts["problems_before"] = before.problems
-    if as_json:
-        click.echo(json.dumps(facts, indent=2))
-    else:
-        show_facts(output_console(), _shown(facts))
+    print_facts(facts if as_json else _shown(facts), as_json=as_json)
     return DONE_WITH_LOSS if before.problems else DONE
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
 import click
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, output_console, say_error, show_facts
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, print_facts, say_error
 from plow_twin.cli.options import FOLDER, find_ros_wheels, json_option, quiet_option, wait_option
 
 
@@ -65,10 +64,7 @@ def record(
             on_started=say,
             on_trouble=lambda text: say_error(f"plow-twin: {text}"),
         )
-    if as_json:
-        click.echo(json.dumps(facts, indent=2, allow_nan=False))
-    elif not quiet:
-        show_facts(output_console(), facts)
+    print_facts(facts, as_json=as_json, quiet=quiet)
     for name, reason in facts["skipped_topics"].items():
         say_error(f"plow-twin: {name}: not recorded: {reason}")
     for name in facts["without_publisher"]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from plow_twin.cli.console import output_console, progress, say_end, say_error, show_facts
+from plow_twin.cli.console import print_facts, progress, say_end, say_error
 from plow_twin.cli.options import EXISTING, FOLDER, json_option, quiet_option
 
 if TYPE_CHECKING:
@@ -37,10 +36,7 @@ def replay(recording: Path, digests_only: bool, write: Path | None, as_json: boo
     facts = _facts(report)
     if report.nothing:
         say_error("plow-twin: nothing could be compared")
-    if as_json:
-        click.echo(json.dumps(facts, indent=2, allow_nan=False))
-    elif not quiet:
-        show_facts(output_console(), facts)
+    print_facts(facts, as_json=as_json, quiet=quiet)
     say_end(recording, report.status.value)
     if report.build_differences:
         other = ", ".join(
@@ -61,28 +57,15 @@ def replay(recording: Path, digests_only: bool, write: Path | None, as_json: boo
 
 def _facts(report: ReplayReport) -> dict[str, Any]:
     diverged = report.first_divergence
-    return {
+    facts = {
         "file": str(report.path),
         "result": "diverged" if diverged else "the same, but with losses" if report.loss else "the same",
         "file_status": report.status.value,
-        "stop_reason": report.stop_reason,
-        "entries": report.entries,
-        "samples": report.samples,
-        "steps": report.steps,
-        "refused": report.refused,
-        "repeated": report.repeated,
-        "digests_compared": report.digests_compared,
-        "snapshots_compared": report.snapshots_compared,
-        "messages_compared": dict(report.compared),
-        "messages_not_compared": dict(report.not_compared),
-        "divergences": report.divergences,
+        **vars(report),
+        "messages_compared": report.compared,
+        "messages_not_compared": report.not_compared,
         "first_divergence": None if diverged is None else vars(diverged),
-        "inputs": report.inputs,
-        "lost": report.lost,
-        "damaged_chunks": report.damaged_chunks,
-        "repeated_parts": report.repeated_parts,
-        "foreign_parts": report.foreign_parts,
-        "build_differences": {key: list(pair) for key, pair in report.build_differences.items()},
-        "span_s": report.span_s,
-        "wall_s": report.wall_s,
     }
+    for name in ("path", "status", "compared", "not_compared"):
+        del facts[name]
+    return facts

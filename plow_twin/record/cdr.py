@@ -65,8 +65,9 @@ def encode(message: Message) -> bytes:
     """Return the CDR bytes of a message."""
     if isinstance(message, Text):
         return _encode_short_text(message)
-    wire = _ENCODERS[type(message)](typestore().types, message)
-    return bytes(typestore().serialize_cdr(wire, message.TYPE))
+    types = typestore().types
+    encoded, _ = _CODECS[type(message)]
+    return bytes(typestore().serialize_cdr(types[message.TYPE](*encoded(types, message)), message.TYPE))
 
 
 def decode(data: bytes, message_type: str) -> Message:
@@ -83,18 +84,21 @@ def decode(data: bytes, message_type: str) -> Message:
     if kind is Text:
         return _decode_short_text(data)
     try:
-        return _DECODERS[kind](typestore().deserialize_cdr(data, message_type))
+        _, decoded = _CODECS[kind]
+        return kind(*decoded(typestore().deserialize_cdr(data, message_type)))
     except Exception as error:  # for damaged bytes, rosbags may raise index, struct and assertion errors
         raise RecordingError(f"{message_type}: got {len(data)} bytes, expected one message ({error!r})") from error
 
 
-def _header(types: Any, stamp_ns: int, frame_id: str) -> Any:
-    seconds, nanoseconds = divmod(stamp_ns, _SECOND_NS)
-    return types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](seconds, nanoseconds), frame_id)
+def _header(types: Any, message: Any) -> Any:
+    time = types["builtin_interfaces/msg/Time"](*divmod(message.stamp_ns, _SECOND_NS))
+    return types["std_msgs/msg/Header"](time, message.frame_id)
 
 
-def _stamp_ns(header: Any) -> int:
-    return int(header.stamp.sec) * _SECOND_NS + int(header.stamp.nanosec)
+def _stamped(wire: Any) -> tuple[int, str]:
+    """Return the stamp [ns] and the frame in the header of a rosbags message."""
+    stamp = wire.header.stamp
+    return int(stamp.sec) * _SECOND_NS + int(stamp.nanosec), wire.header.frame_id
 
 
 def _vector(types: Any, xyz: tuple[float, float, float]) -> Any:
@@ -105,78 +109,23 @@ def _xyz(vector: Any) -> tuple[float, float, float]:
     return (vector.x, vector.y, vector.z)
 
 
-def _encode_joint_state(types: Any, message: JointState) -> Any:
-    return types[JointState.TYPE](
-        _header(types, message.stamp_ns, message.frame_id),
-        message.name,
-        message.position,
-        message.velocity,
-        message.effort,
-    )
-
-
-def _decode_joint_state(wire: Any) -> JointState:
-    stamp, frame_id = _stamp_ns(wire.header), wire.header.frame_id
-    return JointState(stamp, frame_id, tuple(wire.name), wire.position, wire.velocity, wire.effort)
-
-
-def _encode_odometry(types: Any, message: Odometry) -> Any:
-    pose = types["geometry_msgs/msg/Pose"](
-        types["geometry_msgs/msg/Point"](*message.position),
-        types["geometry_msgs/msg/Quaternion"](*message.orientation),
-    )
+def _odometry(types: Any, message: Odometry) -> tuple[Any, ...]:
+    position = types["geometry_msgs/msg/Point"](*message.position)
+    pose = types["geometry_msgs/msg/Pose"](position, types["geometry_msgs/msg/Quaternion"](*message.orientation))
     twist = types["geometry_msgs/msg/Twist"](_vector(types, message.linear), _vector(types, message.angular))
-    return types[Odometry.TYPE](
-        _header(types, message.stamp_ns, message.frame_id),
+    return (
+        _header(types, message),
         message.child_frame_id,
         types["geometry_msgs/msg/PoseWithCovariance"](pose, message.pose_covariance),
         types["geometry_msgs/msg/TwistWithCovariance"](twist, message.twist_covariance),
     )
 
 
-def _decode_odometry(wire: Any) -> Odometry:
+def _odometry_fields(wire: Any) -> tuple[Any, ...]:
     pose, twist = wire.pose.pose, wire.twist.twist
-    return Odometry(
-        _stamp_ns(wire.header),
-        wire.header.frame_id,
-        wire.child_frame_id,
-        _xyz(pose.position),
-        (*_xyz(pose.orientation), pose.orientation.w),
-        _xyz(twist.linear),
-        _xyz(twist.angular),
-        wire.pose.covariance,
-        wire.twist.covariance,
-    )
-
-
-def _encode_status(types: Any, message: DiagnosticStatus) -> Any:
-    key_value = types["diagnostic_msgs/msg/KeyValue"]
-    values = [key_value(key, value) for key, value in message.values]
-    return types[DiagnosticStatus.TYPE](message.level, message.name, message.message, message.hardware_id, values)
-
-
-def _decode_status(wire: Any) -> DiagnosticStatus:
-    values = tuple((item.key, item.value) for item in wire.values)
-    return DiagnosticStatus(wire.level, wire.name, wire.message, wire.hardware_id, values)
-
-
-def _encode_wrench(types: Any, message: WrenchStamped) -> Any:
-    wrench = types["geometry_msgs/msg/Wrench"](_vector(types, message.force), _vector(types, message.torque))
-    return types[WrenchStamped.TYPE](_header(types, message.stamp_ns, message.frame_id), wrench)
-
-
-def _decode_wrench(wire: Any) -> WrenchStamped:
-    wrench = wire.wrench
-    return WrenchStamped(_stamp_ns(wire.header), wire.header.frame_id, _xyz(wrench.force), _xyz(wrench.torque))
-
-
-def _encode_integers(types: Any, message: Integers) -> Any:
-    layout = types["std_msgs/msg/MultiArrayLayout"]([], 0)
-    return types[Integers.TYPE](layout, np.array(message.data, np.uint64))
-
-
-def _decode_integers(wire: Any) -> Integers:
-    return Integers(tuple(wire.data.tolist()))
+    quaternion = (*_xyz(pose.orientation), pose.orientation.w)
+    place = (*_stamped(wire), wire.child_frame_id, _xyz(pose.position), quaternion)
+    return (*place, _xyz(twist.linear), _xyz(twist.angular), wire.pose.covariance, wire.twist.covariance)
 
 
 def _decode_short_text(data: bytes) -> Text:
@@ -195,17 +144,35 @@ def _encode_short_text(message: Text) -> bytes:
     return b"\x00\x01\x00\x00" + struct.pack("<I", len(text) + 1) + text + b"\x00"
 
 
-_ENCODERS: dict[type[Message], Callable[[Any, Any], Any]] = {
-    JointState: _encode_joint_state,
-    Odometry: _encode_odometry,
-    DiagnosticStatus: _encode_status,
-    WrenchStamped: _encode_wrench,
-    Integers: _encode_integers,
-}
-_DECODERS: dict[type[Message], Callable[[Any], Message]] = {
-    JointState: _decode_joint_state,
-    Odometry: _decode_odometry,
-    DiagnosticStatus: _decode_status,
-    WrenchStamped: _decode_wrench,
-    Integers: _decode_integers,
-}
+#: For each message, the function that returns the fields of the rosbags message, and the function that returns the
+#: fields of the message.
+_CODECS: dict[type[Message], tuple[Callable[[Any, Any], tuple[Any, ...]], Callable[[Any], tuple[Any, ...]]]] = {
+    JointState: (
+        lambda types, message: (
+            _header(types, message), message.name, message.position, message.velocity, message.effort,
+        ),
+        lambda wire: (*_stamped(wire), tuple(wire.name), wire.position, wire.velocity, wire.effort),
+    ),
+    Odometry: (_odometry, _odometry_fields),
+    DiagnosticStatus: (
+        lambda types, message: (
+            message.level, message.name, message.message, message.hardware_id,
+            [types["diagnostic_msgs/msg/KeyValue"](*item) for item in message.values],
+        ),
+        lambda wire: (
+            wire.level, wire.name, wire.message, wire.hardware_id,
+            tuple((item.key, item.value) for item in wire.values),
+        ),
+    ),
+    WrenchStamped: (
+        lambda types, message: (
+            _header(types, message),
+            types["geometry_msgs/msg/Wrench"](_vector(types, message.force), _vector(types, message.torque)),
+        ),
+        lambda wire: (*_stamped(wire), _xyz(wire.wrench.force), _xyz(wire.wrench.torque)),
+    ),
+    Integers: (
+        lambda types, message: (types["std_msgs/msg/MultiArrayLayout"]([], 0), np.array(message.data, np.uint64)),
+        lambda wire: (tuple(wire.data.tolist()),),
+    ),
+}  # fmt: skip

@@ -70,49 +70,28 @@ class RunReport:
     """The state of a recording: parts, journal entries, losses and problems."""
 
     path: Path
-    parts: list[PartReport] = field(default_factory=list)
-    metadata_yaml: bool = False
     status: str = ""
+    problems: list[str] = field(default_factory=list)
     layout_version: str = str(LAYOUT_VERSION)
+    metadata_yaml: bool = False
+    #: time from the first advance to the last [s]
+    span_s: float = 0.0
     entries: Counter[str] = field(default_factory=Counter)
-    gaps: int = 0
-    repeated: int = 0
+    missing_entries: int = 0
+    repeated_entries: int = 0
     lost: dict[str, int] = field(default_factory=dict)
     inputs: dict[str, dict[str, int]] = field(default_factory=dict)
     #: number of samples to which the twin could not advance, so that they have no computed forces
     failed_advances: int = 0
-    #: time from the first advance to the last [s]
-    span_s: float = 0.0
-    problems: list[str] = field(default_factory=list)
+    parts: list[PartReport] = field(default_factory=list)
 
     def facts(self) -> dict[str, Any]:
         """Return the report as a dictionary for JSON."""
-        parts = [
-            {
-                "file": part.path.name,
-                "bytes": part.bytes,
-                "finished": part.finished,
-                "damaged_chunks": part.damaged_chunks,
-                "messages": part.messages,
-            }
-            for part in self.parts
-        ]
-        return {
-            "run": str(self.path),
-            "status": self.status,
-            "healthy": not self.problems,
-            "problems": self.problems,
-            "layout_version": self.layout_version,
-            "metadata_yaml": self.metadata_yaml,
-            "span_s": self.span_s,
-            "entries": dict(self.entries),
-            "missing_entries": self.gaps,
-            "repeated_entries": self.repeated,
-            "lost": self.lost,
-            "inputs": self.inputs,
-            "failed_advances": self.failed_advances,
-            "parts": parts,
-        }
+        shown = ("bytes", "finished", "damaged_chunks", "messages")
+        parts = [{"file": part.path.name} | {key: getattr(part, key) for key in shown} for part in self.parts]
+        facts = {"run": str(self.path), "healthy": not self.problems, **vars(self), "parts": parts}
+        del facts["path"]
+        return facts
 
 
 def examine(path: Path) -> RunReport:
@@ -138,10 +117,10 @@ def examine(path: Path) -> RunReport:
         report.failed_advances += sum(entry.advances for entry in entries.rest.values() if isinstance(entry, Failed))
         for index, sequence in enumerate(entries.sequence.tolist()):
             if expected is not None and 0 < expected - sequence <= in_a_row:
-                report.repeated += 1
+                report.repeated_entries += 1
                 continue
             if expected is not None and sequence > expected:
-                report.gaps += sequence - expected
+                report.missing_entries += sequence - expected
             in_a_row = in_a_row + 1 if sequence == expected else 1
             expected = sequence + 1
             entry = None if entries.sample[index] else entries.others[index]
@@ -188,10 +167,10 @@ def _name_problems(report: RunReport, reader: RunReader) -> None:
     unnamed = reader.missing_parts - sum("is missing: metadata" in problem for problem in problems)
     if unnamed > 0:
         report.problems.append(f"{unnamed} part(s) are missing, as the part numbers show")
-    if report.repeated:
-        report.problems.append(f"{report.repeated} journal entries occur more than once: the first of each is used")
-    if report.gaps:
-        report.problems.append(f"{report.gaps} journal entries are missing")
+    if repeated := report.repeated_entries:
+        report.problems.append(f"{repeated} journal entries occur more than once: the first of each is used")
+    if report.missing_entries:
+        report.problems.append(f"{report.missing_entries} journal entries are missing")
     for topic, count in report.lost.items():
         report.problems.append(f"{count} lost on {topic}, as counted by the recorder")
     if reader.status is FileStatus.STOPPED_EARLY:

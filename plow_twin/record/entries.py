@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,20 +125,18 @@ class Entries:
         if len(parts) == 1:
             return parts[0]
         begins = np.cumsum([0, *map(len, parts)]).tolist()
-        return cls(
-            np.concatenate([part.sequence for part in parts]),
-            np.concatenate([part.log_time_ns for part in parts]),
-            np.concatenate([part.sample for part in parts]),
-            np.concatenate([part.stamp_ns for part in parts]),
-            np.concatenate([part.wrench for part in parts]),
-            np.concatenate([begin + part.digest_at for begin, part in zip(begins, parts, strict=False)]),
-            np.concatenate([part.digest for part in parts]),
-            {
-                begin + index: entry
-                for begin, part in zip(begins, parts, strict=False)
-                for index, entry in part.rest.items()
-            },
+        sequence, log_time_ns, sample, stamp_ns, wrench, digest = concatenated(
+            parts, "sequence", "log_time_ns", "sample", "stamp_ns", "wrench", "digest"
         )
+        placed = list(zip(begins, parts, strict=False))
+        digest_at = np.concatenate([begin + part.digest_at for begin, part in placed])
+        rest = {begin + index: entry for begin, part in placed for index, entry in part.rest.items()}
+        return cls(sequence, log_time_ns, sample, stamp_ns, wrench, digest_at, digest, rest)
+
+
+def concatenated(parts: Sequence[Any], *names: str) -> list[Any]:
+    """Return the concatenation of the attribute with each name in all parts."""
+    return [np.concatenate([getattr(part, name) for part in parts]) for name in names]
 
 
 _NONE: Final = np.zeros(0, np.int64)

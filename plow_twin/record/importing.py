@@ -40,9 +40,8 @@ class Feed:
     #: intervals without samples, in which the twin interpolates the load linearly
     silences: Silences = field(default_factory=lambda: Silences(Policy.excitation_timeout_s))
     _poses: list[Pose | PartOfPose] = field(default_factory=list)
-    _stamps: list[int] = field(default_factory=list)
-    _wrench: list[tuple[float, float, float]] = field(default_factory=list)
-    _log_times: list[int] = field(default_factory=list)
+    #: stamp [ns], load and receive time [ns] of each buffered sample
+    _samples: list[tuple[int, tuple[float, float, float], int]] = field(default_factory=list)
     _reached_ns: int | None = None
 
     def __post_init__(self) -> None:
@@ -110,23 +109,21 @@ class Feed:
             for walker in self.walkers:
                 walker.apply(Reset(stamp_ns, verdict.value), max(0, log_time_ns))
         self._reached_ns = stamp_ns
-        self._stamps.append(stamp_ns)
-        self._wrench.append(wrench)
-        self._log_times.append(max(0, log_time_ns))
-        if len(self._stamps) >= BATCH:
+        self._samples.append((stamp_ns, wrench, max(0, log_time_ns)))
+        if len(self._samples) >= BATCH:
             self.flush()
 
     def flush(self) -> None:
         """Apply the buffered poses, and then advance the walkers by the buffered samples."""
-        first_ns = self._log_times[0] if self._log_times else 0
-        for pose in self._poses if self._log_times or self._reached_ns is not None else ():
+        first_ns = self._samples[0][2] if self._samples else 0
+        for pose in self._poses if self._samples or self._reached_ns is not None else ():
             self.walkers[0].apply(pose, first_ns)
         self._poses = []
-        if not self._stamps:
+        if not self._samples:
             return
-        stamps, wrench = np.array(self._stamps, np.int64), np.array(self._wrench)
-        times = np.array(self._log_times, np.int64)
-        self._stamps, self._wrench, self._log_times = [], [], []
+        stamp_ns, loads, log_time_ns = zip(*self._samples, strict=True)
+        stamps, wrench, times = np.array(stamp_ns, np.int64), np.array(loads), np.array(log_time_ns, np.int64)
+        self._samples = []
         self.silences.add(stamps)
         for walker in self.walkers:
             walker.samples(stamps, wrench, times)

@@ -6,6 +6,7 @@ record is written by a single call, so that the file of a killed process can be 
 
 from __future__ import annotations
 
+import io
 import os
 import struct
 from collections import Counter
@@ -158,13 +159,13 @@ class McapFile:
         #: number of messages of each channel
         self.counts: Counter[int] = Counter()
         self._times: list[int] = []
-        self.out.write(MAGIC)
+        #: size of the file so far [B]
+        self.size = 0
+        self._append(MAGIC)
         self._write(Header("ros2", library))
 
-    @property
-    def size(self) -> int:
-        """Size of the file so far [B]."""
-        return self.out.tell()
+    def _append(self, data: bytes) -> None:
+        self.size += self.out.write(data)
 
     @property
     def times(self) -> tuple[int, int]:
@@ -173,7 +174,7 @@ class McapFile:
 
     def _write(self, record: Any) -> int:
         data = _records_bytes([record])
-        self.out.write(data)
+        self._append(data)
         return len(data)
 
     def metadata(self, name: str, record: Mapping[str, str]) -> None:
@@ -218,7 +219,7 @@ class McapFile:
         try:
             yield
         except OSError:
-            self.out.truncate(size)
+            self.size = self.out.truncate(size)
             del self._metadata[metadata:]
             raise
 
@@ -241,7 +242,7 @@ class McapFile:
             raw = entries.tobytes()
             parts.append(struct.pack("<BQHI", 7, 6 + len(raw), channel, len(raw)) + raw)
             place += len(parts[-1])
-        self.out.write(b"".join(parts))
+        self._append(b"".join(parts))
         self._undeclared = []
         for channel, entries in index.items():
             self.counts[channel] += len(entries)
@@ -298,9 +299,9 @@ class McapFile:
         offset_start = start + len(summary)
         summary += _records_bytes(offsets)
         crc = crc32(struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offset_start), crc32(summary))
-        self.out.write(bytes(summary))
+        self._append(bytes(summary))
         self._write(Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=crc))
-        self.out.write(MAGIC)
+        self._append(MAGIC)
 
 
 def _records_bytes(records: Iterable[Any]) -> bytes:
@@ -324,7 +325,7 @@ def _compress(compression: str, content: Bytes) -> bytes:
     return bytes(zstandard.ZstdCompressor(level=3).compress(content.tobytes()))
 
 
-class UnbufferedFile:
+class UnbufferedFile(io.FileIO):
     """A new file without a buffer.
 
     After a failed write to a full disk, a buffered file would try to write the rest of its buffer again.
@@ -333,48 +334,33 @@ class UnbufferedFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         try:
-            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+            super().__init__(path, "xb", opener=lambda name, flags: os.open(name, flags, 0o644))
         except FileExistsError as error:
             raise TakenError(f"{path}: exists already, expected a new file for the recording") from error
-        claim(self._descriptor)
-        self._offset = 0
-        self._open = True
+        claim(self.fileno())
 
-    def write(self, data: bytes) -> None:
-        """Append all bytes of `data`."""
+    def write(self, data: Any) -> int:
+        """Append all bytes of `data`, and return their number."""
         view = memoryview(data)
         while view:
             with naming(self._path):
-                count = os.write(self._descriptor, view)
-            self._offset += count
-            view = view[count:]
+                view = view[super().write(view) :]
+        return len(data)
 
-    def tell(self) -> int:
-        """Return the size of the file [B]."""
-        return self._offset
-
-    def truncate(self, size: int) -> None:
-        """Truncate the file to `size` bytes."""
-        os.ftruncate(self._descriptor, size)
-        os.lseek(self._descriptor, size, os.SEEK_SET)
-        self._offset = size
+    def truncate(self, size: int | None = None) -> int:
+        """Truncate the file to `size` bytes, and continue at its end."""
+        return self.seek(super().truncate(size))
 
     def sync(self) -> None:
         """Wait until all data are on the disk."""
-        os.fdatasync(self._descriptor)
+        os.fdatasync(self.fileno())
 
     def is_linked(self) -> bool:
         """Return whether the file still exists at its path."""
         try:
-            return os.path.samestat(os.fstat(self._descriptor), os.stat(self._path))
+            return os.path.samestat(os.fstat(self.fileno()), os.stat(self._path))
         except (FileNotFoundError, NotADirectoryError):
             return False
-
-    def close(self) -> None:
-        """Close the file; further calls do nothing."""
-        if self._open:
-            self._open = False
-            os.close(self._descriptor)
 
     def remove(self) -> None:
         """Close and remove the file."""
@@ -382,23 +368,12 @@ class UnbufferedFile:
         self.close()
 
 
-class MemoryFile:
-    """A file in memory."""
+class MemoryFile(io.BytesIO):
+    """A file in memory, whose content can be read after `close`."""
 
-    def __init__(self) -> None:
-        self.content = bytearray()
-
-    def write(self, data: bytes) -> None:
-        """Append all bytes of `data`."""
-        self.content += data
-
-    def tell(self) -> int:
-        """Return the size of the file [B]."""
-        return len(self.content)
-
-    def truncate(self, size: int) -> None:
-        """Truncate the file to `size` bytes."""
-        del self.content[size:]
+    def truncate(self, size: int | None = None) -> int:
+        """Truncate the file to `size` bytes, and continue at its end."""
+        return self.seek(super().truncate(size))
 
     def sync(self) -> None:
         """Do nothing."""

@@ -63,7 +63,7 @@ class RingWriter(RunWriter):
         old = self._part
         super().split(loss, 0)
         assert isinstance(old.file.out, MemoryFile)
-        self._finished.append((self._begun, self._done.pop(), bytes(old.file.out.content)))
+        self._finished.append((self._begun, self._done.pop(), old.file.out.getvalue()))
         self._bytes_before, self._begun = 0, time.monotonic()
         while len(self._finished) > 1 and self._finished[1][0] <= self._begun - self._ring_s:
             self._finished.pop(0)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
-from plow_twin.record.entries import Outputs
+from plow_twin.record.entries import Outputs, concatenated
 from plow_twin.record.messages import JointState, Message, Odometry
 from plow_twin.record.template import Indexes, Template, read_numbers
 
@@ -33,12 +33,7 @@ class Rows:
     @classmethod
     def joined(cls, parts: list[Self]) -> Self:
         """Return the rows of several chunks in one object."""
-        if len(parts) == 1:
-            return parts[0]
-        sequence, stamp_ns, numbers = (
-            np.concatenate([getattr(part, name) for part in parts]) for name in ("sequence", "stamp_ns", "numbers")
-        )
-        return cls(sequence, stamp_ns, numbers)
+        return parts[0] if len(parts) == 1 else cls(*concatenated(parts, "sequence", "stamp_ns", "numbers"))
 
 
 def poses_of(numbers: Array) -> Array:

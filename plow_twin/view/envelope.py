@@ -7,6 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.record.entries import concatenated
+
 Array = NDArray[np.float64]
 Indexes = NDArray[np.int64]
 
@@ -97,12 +99,7 @@ class _Rows:
 
     @classmethod
     def joined(cls, parts: list[_Rows]) -> _Rows:
-        return cls(
-            np.concatenate([part.segment for part in parts]),
-            np.concatenate([part.place for part in parts]),
-            np.concatenate([part.least for part in parts]),
-            np.concatenate([part.largest for part in parts]),
-        )
+        return cls(*concatenated(parts, "segment", "place", "least", "largest"))
 
     def binned(self, width: float) -> _Rows:
         return _Rows(self.segment, np.floor(self.place / width), self.least, self.largest)

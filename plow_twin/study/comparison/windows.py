@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from plow_twin.errors import RecordingError
 from plow_twin.estimate.measurements import Load
 from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.record.entries import concatenated
 from plow_twin.record.recording import Batched, Recording
 from plow_twin.record.run_time import RunTime
 from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES
@@ -35,6 +36,8 @@ _NO_PERIOD_S: Final = 10.0
 #: Smallest ratio of the messages in a window to those of a full window, and of two sample rates that count as equal.
 FULL: Final = 0.9
 _PADS: Final = np.array([CLEARANCE_NAMES.index(name) for name in PAD_NAMES])
+#: Names of the arrays of `Windows` with one row for each window.
+_ROWS: Final = ("start_ns", "load", "clearance", "length_ns", "rate_hz")
 _TOTALS: Final = np.array([CLEARANCE_NAMES.index(name) for name in ("horizontal", "vertical")])
 
 
@@ -58,28 +61,16 @@ class Windows:
         """Return the windows selected by a mask, shape (n,), without a copy if all windows are selected."""
         if which.all():
             return self
-        return Windows(
-            self.start_ns[which],
-            {name: values[which] for name, values in self.pairs.items()},
-            self.load[which],
-            self.clearance[which],
-            self.length_ns[which],
-            self.rate_hz[which],
-        )
+        pairs = {name: values[which] for name, values in self.pairs.items()}
+        return replace(self, pairs=pairs, silent=0, **{name: getattr(self, name)[which] for name in _ROWS})
 
     @classmethod
     def joined(cls, parts: Sequence[Windows]) -> Windows:
         """Concatenate the windows of several runs. The windows of a single run are not copied."""
         if len(parts) == 1:
             return parts[0]
-        return cls(
-            np.concatenate([part.start_ns for part in parts]),
-            {name: np.concatenate([part.pairs[name] for part in parts]) for name in QUANTITIES},
-            np.concatenate([part.load for part in parts]),
-            np.concatenate([part.clearance for part in parts]),
-            np.concatenate([part.length_ns for part in parts]),
-            np.concatenate([part.rate_hz for part in parts]),
-        )
+        pairs = {name: np.concatenate([part.pairs[name] for part in parts]) for name in QUANTITIES}
+        return cls(pairs=pairs, **dict(zip(_ROWS, concatenated(parts, *_ROWS), strict=True)))
 
 
 @dataclass
