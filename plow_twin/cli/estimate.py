@@ -343,26 +343,14 @@ def _show_live(live: dict[str, Any]) -> None:
 
 def show_estimate(result: Estimate, scene: Scene) -> None:
     """Print an estimate as a table."""
-    from plow_twin.estimate.unknowns import QUANTITIES
+    from plow_twin.view.estimate import estimated_rows
 
-    states = {"horizontal": result.horizontal_state.value, "vertical": result.vertical_state.value}
-    labels = _labels(scene)
-    values = result.values()
-    rows = [
-        (labels[quantity.name], values[quantity.name], quantity.factor, quantity.digits, states.get(quantity.name, ""))
-        for quantity in QUANTITIES
-        if quantity.name in values
-    ]
-    rows += [
-        (f"{name.replace('_', ', ')} [mm]", value, 1e3, ".3f", state.value)
-        for name, (value, state) in result.groups.items()
-    ]
     view = table(
         f"Estimate of the window from {result.t_start:.2f} s to {result.t_end:.2f} s", "", "mean", "5 %", "95 %", ""
     )
-    for name, value, factor, form, state in rows:
+    for label, value, factor, form, state in estimated_rows(result, _labels(scene)).values():
         numbers = (format(factor * number, form) for number in (value.mean, value.p05, value.p95))
-        view.add_row(name, *numbers, state)
+        view.add_row(label, *numbers, state)
     console = output_console()
     console.print(view)
     console.print(f"model {result.model}, sensor {result.sensor}", highlight=False)

@@ -23,7 +23,17 @@ from plow_twin.cli.console import (
 )
 from plow_twin.cli.dashboard import access_if_shown, access_options, dashboard_option, say_where, stay
 from plow_twin.cli.live_report import Report
-from plow_twin.cli.options import FILE, FOLDER, PLACE, POSITIVE, json_option, map_option, quiet_option, unit_option
+from plow_twin.cli.options import (
+    FILE,
+    FOLDER,
+    PLACE,
+    POSITIVE,
+    json_option,
+    map_option,
+    named_option,
+    quiet_option,
+    unit_option,
+)
 from plow_twin.cli.telemetry import outputs_of, telemetry_options
 
 if TYPE_CHECKING:
@@ -47,7 +57,7 @@ _LOST = re.compile(r"dropped_.*|.*_dropped|.*_lost")
 @map_option
 @unit_option
 @click.option("--params", type=FILE, help="YAML file with parameters, in the form of a parameter file of the node.")
-@click.option("--set", "given", multiple=True, metavar="NAME=VALUE", help="Value of a parameter; may be repeated.")
+@named_option("--set", "given", "NAME=VALUE", metavar="NAME=VALUE", help="Value of a parameter; may be repeated.")
 @click.option("--record", type=FOLDER, help="Folder for the recording.")
 @click.option("--follow", is_flag=True, help="Continue while the files grow.")
 @click.option(
@@ -82,7 +92,7 @@ _LOST = re.compile(r"dropped_.*|.*_dropped|.*_lost")
 @access_options
 @json_option
 @quiet_option
-def live(source: str, as_json: bool, quiet: bool, lines: bool, seconds: float | None, **options: Any) -> int:
+def live(source: str, **options: Any) -> int:
     """Run the twin on the samples of SOURCE.
 
     SOURCE is a CSV or Parquet file, a folder of CSV or Parquet files, - (standard input), mqtt[s]://HOST:PORT or
@@ -91,19 +101,10 @@ def live(source: str, as_json: bool, quiet: bool, lines: bool, seconds: float | 
     from plow_twin.live.stop import StopSignals
 
     with StopSignals() as stop:
-        return _live(source, stop, options, as_json=as_json, quiet=quiet, lines=lines, seconds=seconds)
+        return _live(source, stop, options)
 
 
-def _live(
-    source: str,
-    stop: StopSignals,
-    options: dict[str, Any],
-    *,
-    as_json: bool,
-    quiet: bool,
-    lines: bool,
-    seconds: float | None,
-) -> int:
+def _live(source: str, stop: StopSignals, options: dict[str, Any]) -> int:
     from plow_twin.dashboard.live import open_screen
     from plow_twin.live.bridge.files import Files
     from plow_twin.live.control import TURN_S, Control
@@ -115,6 +116,7 @@ def _live(
     from plow_twin.live.timer import Timer
     from plow_twin.telemetry.live import open_output
 
+    as_json, quiet, lines = (bool(options[name]) for name in ("as_json", "quiet", "lines"))
     report = Report(lines=lines, quiet=quiet, stamp_ns=lambda: front.runtime.stamp_ns)
     try:
         settings = _settings(options)
@@ -150,7 +152,7 @@ def _live(
                 update = opened.enter_context(progress_bar("reading", quiet or lines))
                 front.timers.append(Timer(_PROGRESS_S, lambda: update(bridge.share)))
             stop.interrupt = False
-            lost = front.run(lambda: stop.stopped, seconds or float("inf"))
+            lost = front.run(lambda: stop.stopped, options["seconds"] or float("inf"))
             if screen is not None and bridge.finished and not stop.stopped:
                 stay(screen, lambda: stop.stopped)
     except StopRequested:
@@ -208,11 +210,7 @@ def _settings(options: dict[str, Any]) -> Settings:
     from plow_twin.live import parameters
 
     values = parameters.read_parameters(options["params"]) if options["params"] else {}
-    for text in options["given"]:
-        name, equals, value = text.partition("=")
-        if not equals:
-            raise click.BadParameter(f"got {text!r}, expected NAME=VALUE", param_hint="--set")
-        values[name.strip()] = parameters.read_value(value)
+    values |= {name.strip(): parameters.read_value(value) for name, value in options["given"].items()}
     for name, nearest in parameters.unknown(values):
         hint = f"; did you mean {nearest}?" if nearest else ""
         raise click.BadParameter(f"unknown parameter {name}{hint}", param_hint="--set or --params")

@@ -61,20 +61,22 @@ def find_ros_wheels() -> None:
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
 
 
-def unit_option(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the option `--unit NAME=UNIT`. The parameter `units` of the command receives the units by name."""
+def named_option(option: str, name: str, expected: str, **settings: Any) -> Decorator:
+    """Return an option that may be repeated. The parameter `name` of the command receives the values by name."""
 
     def parsed(context: click.Context, parameter: click.Parameter, texts: tuple[str, ...]) -> dict[str, str]:
-        units = dict(text.partition("=")[::2] for text in texts)
         for text in texts:
             if "=" not in text:
-                raise click.BadParameter(f"got {text!r}, expected NAME=UNIT, such as fx=kN or t=ms")
-        return units
+                raise click.BadParameter(f"got {text!r}, expected {expected}")
+        return dict(text.partition("=")[::2] for text in texts)
 
-    return click.option(
-        "--unit", "units", multiple=True, metavar="NAME=UNIT", callback=parsed,
-        help="Unit of a measured number, e.g. fx=kN, x=mm, theta=deg, t=ms; may be repeated.",
-    )(command)  # fmt: skip
+    return click.option(option, name, multiple=True, callback=parsed, **settings)
+
+
+unit_option = named_option(
+    "--unit", "units", "NAME=UNIT, such as fx=kN or t=ms", metavar="NAME=UNIT",
+    help="Unit of a measured number, e.g. fx=kN, x=mm, theta=deg, t=ms; may be repeated.",
+)  # fmt: skip
 
 
 class PositiveNumber(click.ParamType):  # type: ignore[type-arg]  # generic from click 8.3 on

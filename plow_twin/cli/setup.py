@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from plow_twin.cli.console import DONE, output_console, say_error, table
-from plow_twin.cli.options import FILE, FOLDER, quiet_option, unit_option
+from plow_twin.cli.options import FILE, FOLDER, named_option, quiet_option, unit_option
 from plow_twin.errors import UnitError
 
 if TYPE_CHECKING:
@@ -23,11 +23,15 @@ if TYPE_CHECKING:
 )
 @click.argument("file", type=FILE)
 @click.option("--scene", help="Scene file or preset of the machine; by default a stub of a scene is written.")
-@click.option("--column", "given", multiple=True, metavar="NAME=COLUMN", help="Column of a quantity, e.g. fx=Load_1.")
+@named_option(
+    "--column", "columns", "NAME=COLUMN", metavar="NAME=COLUMN", help="Column of a quantity, e.g. fx=Load_1."
+)
 @unit_option
 @click.option("--out", type=FOLDER, default=Path(), help="Folder for the files.")
 @quiet_option
-def setup(file: Path, scene: str | None, given: tuple[str, ...], units: dict[str, str], out: Path, quiet: bool) -> int:
+def setup(
+    file: Path, scene: str | None, columns: dict[str, str], units: dict[str, str], out: Path, quiet: bool
+) -> int:
     """Guess the separator, time, columns and units of FILE, and write a mapping and a stub of a scene.
 
     In a terminal, the command asks for columns that it cannot guess.
@@ -36,10 +40,6 @@ def setup(file: Path, scene: str | None, given: tuple[str, ...], units: dict[str
     from plow_twin.record.sources import Columns
     from plow_twin.scene_file import load_scene
 
-    columns = dict(text.partition("=")[::2] for text in given)
-    for text in given:
-        if "=" not in text:
-            raise click.BadParameter(f"got {text!r}, expected NAME=COLUMN", param_hint="--column")
     nominal = load_scene(scene or "paper")
     guess = guess_columns(file, nominal, columns, units)
     while guess.open:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, Any, Final, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -155,7 +155,7 @@ def _run(
     with ExitStack() as opened:
         bar = opened.enter_context(_progress(console, quiet))
         watch, spin = opened.enter_context(_watching())
-        twin = opened.enter_context(_process(node, folder / "node.log"))
+        twin = opened.enter_context(Child(node, folder / "node.log"))
         task = bar.add_task("compiling the solver", total=None)
         until = partial(_until, spin=spin, child=twin, timeout_s=_START_TIMEOUT_S)
         until("active node", lambda: watch.text("state", "lifecycle") == "active")
@@ -164,11 +164,11 @@ def _run(
             until("compiled estimator", lambda: watch.number("estimate", "ready") or watch.text("estimate", "error"))
         if screen is not None:
             command = ["plow_twin", "dashboard", "--ros", *screen]
-            shown = opened.enter_context(_process(command, folder / "screen.log"))
+            shown = opened.enter_context(Child(command, folder / "screen.log"))
             until("screen", lambda: "screen: " in shown.output(), child=shown)
             console.print(shown.output(), highlight=False, markup=False)
         bar.update(task, description="running", total=seconds, completed=0.0)
-        with _process([*publisher, "--rate", repr(_RATE_HZ)], folder / "publisher.log") as source:
+        with Child([*publisher, "--rate", repr(_RATE_HZ)], folder / "publisher.log") as source:
             _follow(source, twin, watch, spin, bar, task)
             sent = int(json.loads(source.output().splitlines()[-1])["sent"])
         bar.update(task, description="using the last samples", total=None)
@@ -229,6 +229,12 @@ class Child:
             command, stdout=self._stream, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL
         )
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.end()
+
     @property
     def running(self) -> bool:
         """True if the process has not ended."""
@@ -264,15 +270,6 @@ class Child:
                 self._process.kill()
                 self._process.wait()
         self._stream.close()
-
-
-@contextmanager
-def _process(arguments: list[str], log: Path) -> Iterator[Child]:
-    child = Child(arguments, log)
-    try:
-        yield child
-    finally:
-        child.end()
 
 
 @contextmanager

@@ -13,12 +13,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.record.chunks import Messages
 from plow_twin.record.entries import OutputRecord, Outputs
 from plow_twin.record.outputs import PUBLICATION_TOPICS, REPLAYED
 from plow_twin.record.template import STAMP_AT, Indexes, Templates, compiled, stamp_word
-from plow_twin.record.words import eight_differ, word, word_at
+from plow_twin.record.words import word, word_at
 from plow_twin.stream.outputs import Published
 from plow_twin.stream.topics import Cadence
 
@@ -214,11 +213,8 @@ def compare(  # type: ignore[no-untyped-def]
         for piece in range(piece_ends[k], piece_ends[k + 1]):
             begin, length = start + pieces[piece, 0], pieces[piece, 1]
             address = pieces[piece, 2] + place * pieces[piece, 3]
-            if length == PAIR_COUNT:
-                wrong |= eight_differ(buffer, begin, address)
-            else:
-                for i in range(length):
-                    wrong |= word(buffer, begin + 8 * i) ^ word_at(address + 8 * i)
+            for i in range(length):
+                wrong |= word(buffer, begin + 8 * i) ^ word_at(address + 8 * i)
         different[n] = wrong != 0
         count -= wrong == 0
     return count

@@ -143,16 +143,25 @@ def _part(path: Path) -> PartReport:
     if not begins:
         size = path.stat().st_size
         return PartReport(path, size, finished=False, damaged_chunks=0, messages={}, mcap=begins is None)
-    reader = ChunkReader(path)
+    reader, by_channel, _ = _read(path)
     counts: Counter[str] = Counter()
-    for messages in reader:
-        for number in messages.channel.tolist():
-            channel = reader.channels.get(number)
-            counts[channel.topic if channel else "undeclared"] += 1
+    for number, count in by_channel.items():
+        channel = reader.channels.get(number)
+        counts[channel.topic if channel else "undeclared"] += count
     size = path.stat().st_size
     trailing = size - reader.position - len(MAGIC) if reader.finished else 0
     damaged = reader.damaged - reader.left_out
     return PartReport(path, size, reader.finished, damaged, dict(sorted(counts.items())), trailing, reader.left_out)
+
+
+def _read(path: Path) -> tuple[ChunkReader, Counter[int], tuple[int, int]]:
+    """Read a file; return its reader, the number of messages of each channel, and the first and last log time [ns]."""
+    reader, counts, times = ChunkReader(path), Counter[int](), list[int]()
+    for messages in reader:
+        counts.update(messages.channel.tolist())
+        if len(messages):
+            times += [int(messages.log_time_ns.min()), int(messages.log_time_ns.max())]
+    return reader, counts, (min(times, default=0), max(times, default=0))
 
 
 def _name_problems(report: RunReport, reader: RunReader) -> None:
@@ -364,18 +373,11 @@ def _description(channel: Channel) -> Mapping[str, str]:
 
 
 def _facts(part: Path) -> PartFacts:
-    reader = ChunkReader(part)
-    counts: Counter[int] = Counter()
-    start, end = 0, 0
-    for messages in reader:
-        counts.update(messages.channel.tolist())
-        if len(messages):
-            first, last = int(messages.log_time_ns.min()), int(messages.log_time_ns.max())
-            start, end = first if not start else min(start, first), max(end, last)
+    reader, counts, times = _read(part)
     topics = []
     for number, count in sorted(counts.items()):
         channel = reader.channels.get(number)
         if channel is not None and (channel.message_type in MESSAGE_TYPES or _HASH in channel.metadata):
             qos, digest = channel.metadata.get(_QOS, ""), channel.metadata.get(_HASH, "")
             topics.append(TopicCount(channel.topic, channel.message_type, count, qos, digest))
-    return PartFacts(part.name, start, end, topics)
+    return PartFacts(part.name, *times, topics)

@@ -6,7 +6,7 @@ A record is a journal entry or an output, that is, a message that the twin sent.
 from __future__ import annotations
 
 from collections.abc import Container, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final
 
@@ -22,6 +22,8 @@ from plow_twin.record.template import Indexes, compiled
 from plow_twin.stream.journal import Digest, Entry, Sample
 
 _HALF, _WHOLE = 2**31, 2**32
+#: Names of the arrays of `Entries` with a value for each entry.
+_COLUMNS: Final = ("sequence", "log_time_ns", "sample", "stamp_ns", "wrench")
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,16 +84,10 @@ class Entries:
     def __getitem__(self, chosen: slice) -> Entries:
         first, last, _ = chosen.indices(len(self))
         begin, end = np.searchsorted(self.digest_at, (first, last)).tolist()
-        return Entries(
-            self.sequence[chosen],
-            self.log_time_ns[chosen],
-            self.sample[chosen],
-            self.stamp_ns[chosen],
-            self.wrench[chosen],
-            self.digest_at[begin:end] - first,
-            self.digest[begin:end],
-            {index - first: entry for index, entry in self.rest.items() if first <= index < last},
-        )
+        rest = {index - first: entry for index, entry in self.rest.items() if first <= index < last}
+        digest_at, digest = self.digest_at[begin:end] - first, self.digest[begin:end]
+        columns = {name: getattr(self, name)[chosen] for name in _COLUMNS}
+        return replace(self, digest_at=digest_at, digest=digest, rest=rest, **columns)
 
     def samples(self) -> tuple[Indexes, NDArray[np.float64]]:
         """Return the stamps and wrenches of the samples."""
@@ -125,13 +121,11 @@ class Entries:
         if len(parts) == 1:
             return parts[0]
         begins = np.cumsum([0, *map(len, parts)]).tolist()
-        sequence, log_time_ns, sample, stamp_ns, wrench, digest = concatenated(
-            parts, "sequence", "log_time_ns", "sample", "stamp_ns", "wrench", "digest"
-        )
         placed = list(zip(begins, parts, strict=False))
         digest_at = np.concatenate([begin + part.digest_at for begin, part in placed])
         rest = {begin + index: entry for begin, part in placed for index, entry in part.rest.items()}
-        return cls(sequence, log_time_ns, sample, stamp_ns, wrench, digest_at, digest, rest)
+        columns = dict(zip((*_COLUMNS, "digest"), concatenated(parts, *_COLUMNS, "digest"), strict=True))
+        return cls(digest_at=digest_at, rest=rest, **columns)
 
 
 def concatenated(parts: Sequence[Any], *names: str) -> list[Any]:

@@ -282,12 +282,8 @@ def _collect(
     tables = {name: _counted(found, lost) for name, found in rows.items()}
     if "excitation" in rows:
         begins = [row - rows["excitation"].dropped for row in begins]
-    return (
-        tables,
-        begins,
-        lost,
-        "".join(f"; {reason.removeprefix(UNFIT)}" for reason in lost if reason.startswith(UNFIT)),
-    )
+    reasons = "".join(f"; {reason.removeprefix(UNFIT)}" for reason in lost if reason.startswith(UNFIT))
+    return tables, begins, lost, reasons
 
 
 def _read(path: Path, lost: Counter[str], columns: tuple[str, ...], some: tuple[str, ...] = ()) -> Array:

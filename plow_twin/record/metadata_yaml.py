@@ -8,7 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
 
-from plow_twin.errors import Problem, RecordingError
+from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import type_hash
 from plow_twin.record.durable import sync_path
 from plow_twin.scene_file.yaml_text import dump_yaml, load_yaml, read_yaml
@@ -144,14 +144,10 @@ def listed_parts(folder: Path) -> list[str]:
 
 
 def _information(folder: Path) -> Any:
-    return _parsed(read_yaml(folder / "metadata.yaml", "metadata", "those of a bag"))["rosbag2_bagfile_information"]
-
-
-def _parsed(read: tuple[Any, list[Problem]]) -> Any:
-    document, problems = read
+    document, problems = read_yaml(folder / "metadata.yaml", "metadata", "those of a bag")
     if problems:
         raise RecordingError(f"{problems[0]}")
-    return document
+    return document["rosbag2_bagfile_information"]
 
 
 def recorded_losses(folder: Path) -> dict[str, int]:

@@ -142,12 +142,8 @@ class RunReader:
             return 0
         part_numbers = {self.number(file) for file in self.parts}
         numbers = sorted(self._headers[file].part for file in self.parts if file in self._headers)
-        between = (
-            numbers[-1]
-            - numbers[0]
-            + 1
-            - len({number for number in part_numbers if numbers[0] <= number <= numbers[-1]})
-        )
+        inside = {number for number in part_numbers if numbers[0] <= number <= numbers[-1]}
+        between = numbers[-1] - numbers[0] + 1 - len(inside)
         missing = missing_files(self._place, {file.name for file in self.foreign})
         named = {part_number(Path(name))[0] for name in missing} - part_numbers
         return between + sum(number >= 0 and not numbers[0] < number < numbers[-1] for number in named)

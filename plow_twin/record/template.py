@@ -28,10 +28,8 @@ STAMP_AT: Final = 4
 _SECOND_NS: Final = 1_000_000_000
 
 
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the compiled function, whose arguments are arrays of bytes."""
-    dispatcher: Callable[..., Any] = kept(function)
-    return dispatcher
+#: Decorator that compiles a function whose arguments are arrays of bytes.
+compiled: Final[Callable[[Callable[..., Any]], Callable[..., Any]]] = kept
 
 
 @dataclass(frozen=True)

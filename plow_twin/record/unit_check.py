@@ -261,12 +261,10 @@ def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
     if falling > _FALLING:
         description, expected = f"stamps of which {falling:.0%} fall", "times that rise"
         if falling > _REVERSED:
-            return [
-                UnitDoubt(
-                    "excitation", ("t",), description, expected, "rows from the newest to the oldest", False, _SORT
-                )
-            ]
-        return [UnitDoubt("excitation", ("t",), description, expected, "another column", False, _NAME_TIME)]
+            likely, advice = "rows from the newest to the oldest", _SORT
+        else:
+            likely, advice = "another column", _NAME_TIME
+        return [UnitDoubt("excitation", ("t",), description, expected, likely, advice=advice)]
     if stamps_s.max() > EPOCH_S:
         return []
     spacing = float(np.median(np.abs(steps)))
@@ -274,7 +272,7 @@ def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
     low, high = (days + _START_S for days in _SHEET_DAYS)
     if low <= stamps_s[0] <= high and np.ptp(stamps_s) < 1.0 and spacing < _SHORTEST_SPACING_S:
         description = f"{stamps_s[0] - _START_S:.6g} and stamps {spacing:.2g} s apart"
-        return [UnitDoubt("excitation", ("t",), description, "seconds", "days of a spreadsheet", False, _WRITE_SECONDS)]
+        return [UnitDoubt("excitation", ("t",), description, "seconds", "days of a spreadsheet", advice=_WRITE_SECONDS)]
     load = load[np.isfinite(load).all(axis=1)]
     span = np.ptp(load, axis=0) if len(load) >= _FEW else np.zeros(0)
     if spacing < _SLOW_S or not span.any():

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any, cast
 
 from llvmlite import ir
-from numba.core import cgutils, types
+from numba.core import types
 from numba.extending import intrinsic
 
 _WORD = ir.IntType(64)
@@ -51,23 +51,6 @@ def _bits(typingctx: Any, number: Any) -> Any:
     return types.int64(types.float64), codegen
 
 
-def _eight_differ(typingctx: Any, data: Any, place: Any, address: Any) -> Any:
-    """Return 0 if the 64 bytes at offset `place` of a contiguous array equal the 64 bytes at an address."""
-
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        vector = ir.VectorType(_WORD, 8)
-        own = builder.bitcast(_place(context, builder, signature, arguments), vector.as_pointer())
-        other = builder.inttoptr(arguments[2], vector.as_pointer())
-        differing = builder.xor(builder.load(own, align=1), builder.load(other, align=8))
-        kind = ir.FunctionType(_WORD, [vector])
-        reduce: Any = cgutils.get_or_insert_function(  # type: ignore[no-untyped-call]
-            builder.module, kind, "llvm.vector.reduce.or.v8i64"
-        )
-        return builder.call(reduce, [differing])
-
-    return types.int64(data, place, types.int64), codegen
-
-
 def _word_at(typingctx: Any, address: Any) -> Any:
     """Return the eight bytes at a memory address as an int64."""
 
@@ -80,5 +63,4 @@ def _word_at(typingctx: Any, address: Any) -> Any:
 word = cast("Callable[[Any, Any], Any]", intrinsic(_word))
 set_word = cast("Callable[[Any, Any, Any], None]", intrinsic(_set_word))
 bits = cast("Callable[[float], int]", intrinsic(_bits))
-eight_differ = cast("Callable[[Any, Any, int], int]", intrinsic(_eight_differ))
 word_at = cast("Callable[[int], int]", intrinsic(_word_at))
