@@ -118,10 +118,7 @@ def _recording(path: Path, as_json: bool) -> int:
 def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
     """Return a summary of a recording, and whether it is incomplete or has losses or failed advances.
 
-    Raises
-    ------
-    RecordingError
-        The file is not a recording of plow_twin.
+    Raise `RecordingError` if the file is not a recording of plow_twin.
     """
     from plow_twin.record.reader import FileStatus, RunReader
     from plow_twin.record.run_time import RunTime

@@ -151,10 +151,7 @@ class Outlet:
     def close(self) -> bool:
         """Wait until all lines are written; return False if the reader does not read all lines.
 
-        Raises
-        ------
-        BrokenPipeError
-            The reader has ended.
+        Raise `BrokenPipeError` if the reader has ended.
         """
         with self._news:
             self._closed = True

@@ -73,10 +73,7 @@ def encode(message: Message) -> bytes:
 def decode(data: bytes, message_type: str) -> Message:
     """Return the message that is encoded in CDR bytes.
 
-    Raises
-    ------
-    RecordingError
-        The message type is unknown, or the bytes are not a message of the type.
+    Raise `RecordingError` if the message type is unknown, or the bytes are not a message of the type.
     """
     kind = MESSAGE_TYPES.get(message_type)
     if kind is None:

@@ -98,12 +98,9 @@ def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: M
     """Guess the meanings of the columns of a CSV file.
 
     The magnitudes of the numbers, in at most 20,000 rows and two million cells, are compared with the loads and sizes
-    of the scene. The user states `columns` and `units` by name of the quantity (`t` for the time).
-
-    Raises
-    ------
-    RecordingError
-        The file cannot be read, the header or the rows are missing, or the file has no column with a stated name.
+    of the scene. The user states `columns` and `units` by name of the quantity (`t` for the time). Raise
+    `RecordingError` if the file cannot be read, the header or the rows are missing, or the file has no column with a
+    stated name.
     """
     guess, rows = _read(path)
     for name, column in columns.items():

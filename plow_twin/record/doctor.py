@@ -97,10 +97,7 @@ class RunReport:
 def examine(path: Path) -> RunReport:
     """Read a recording from front to back, and return a report of its content and losses.
 
-    Raises
-    ------
-    RecordingError
-        The path is not a recording of plow_twin, or its journal cannot be decoded.
+    Raise `RecordingError` if the path is not a recording of plow_twin, or its journal cannot be decoded.
     """
     reader = RunReader(path)
     report = RunReport(path)

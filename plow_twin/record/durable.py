@@ -25,12 +25,8 @@ def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
     """Open a stream, and replace the file `path` atomically by the content of the stream when the context ends.
 
     If an error occurs or the process is killed, an existing file stays unchanged. With `sync`, the new file survives a
-    loss of power. If `path` is a pipe or a device, it cannot be replaced, so the stream writes to it directly.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written. The error contains the path.
+    loss of power. If `path` is a pipe or a device, it cannot be replaced, so the stream writes to it directly. Raise
+    `OSError` if the file cannot be written. The error contains the path.
     """
     try:
         if path.exists() and not path.is_file():

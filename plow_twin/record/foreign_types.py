@@ -21,11 +21,8 @@ _MOST_PARTS: Final = 1_000
 def parsed_types(text: str, message_type: str) -> dict[str, Any]:
     """Return the types that a `ros2msg` text defines.
 
-    Raises
-    ------
-    RecordingError
-        The text is too long, the type contains itself, or the type has too many parts. For any other fault of the text,
-        the parser of rosbags raises its own errors.
+    Raise `RecordingError` if the text is too long, the type contains itself, or the type has too many parts. For any
+    other fault of the text, the parser of rosbags raises its own errors.
     """
     from rosbags.typesys import get_types_from_msg
 

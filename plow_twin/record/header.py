@@ -102,10 +102,7 @@ class RunHeader:
     def from_record(cls, record: Mapping[str, str], source: str) -> RunHeader:
         """Return the header from the content of the MCAP metadata record. Unknown keys are ignored.
 
-        Raises
-        ------
-        RecordingError
-            A key is missing or has an invalid value. The message begins with `source`.
+        Raise `RecordingError` if a key is missing or has an invalid value. The message begins with `source`.
         """
         layout = record.get("layout_version", "")
         if layout != str(LAYOUT_VERSION):

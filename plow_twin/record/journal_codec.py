@@ -86,10 +86,7 @@ def to_message(entry: journal.Entry | Dropped, frame_id: str) -> Message:
 def from_message(message: Message, source: str = "journal") -> journal.Entry | Dropped:
     """Return the journal entry that a message represents.
 
-    Raises
-    ------
-    RecordingError
-        The message does not represent a journal entry. The error begins with `source`.
+    Raise `RecordingError` if the message does not represent a journal entry. The error begins with `source`.
     """
     if isinstance(message, WrenchStamped):
         wrench = (message.force[0], message.force[1], message.torque[2])

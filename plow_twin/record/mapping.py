@@ -371,12 +371,8 @@ def _check_nodes(path: Path, role: str, read_role: Role) -> None:
 def with_units(roles: Mapping[str, Role], units: Mapping[str, str]) -> dict[str, Role]:
     """Return the roles with the units that the user states.
 
-    `units` maps the name of a quantity (fx, x, ..., or t for the stamps) to its unit.
-
-    Raises
-    ------
-    UnitError
-        No role has a quantity with a stated name, or a quantity cannot have the stated unit.
+    `units` maps the name of a quantity (fx, x, ..., or t for the stamps) to its unit. Raise `UnitError` if no role has
+    a quantity with a stated name, or a quantity cannot have the stated unit.
     """
     changed = dict(roles)
     for name, unit in units.items():

@@ -116,12 +116,7 @@ class Measured:
 def read_measured(folder: Path, scene: Path | None = None) -> Measured:
     """Return the measurements in a folder of tables. If the file `scene` is given, it replaces scene.yaml.
 
-    Raises
-    ------
-    RecordingError
-        A file or a column is missing.
-    SceneError
-        The scene is invalid.
+    Raise `RecordingError` if a file or a column is missing, and `SceneError` if the scene is invalid.
     """
     lost, load = Counter[str](), np.zeros((0, 4))
     if (file := _table(folder, LOAD_FILE)).is_file():
@@ -160,14 +155,9 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
 
     The measurements of a run are read from the journal of the run. If the journal contains no pose, the poses are read
     from the topics in the folder of the run and in its subfolders `beside`, `beside_2`, .... A recording of another
-    program is read with the help of the mapping. If there is no load, time is counted from the first pose or gap.
-
-    Raises
-    ------
-    RecordingError
-        A recording cannot be read, has no pose, or has a load that does not fit its role.
-    SceneError
-        The scene is invalid.
+    program is read with the help of the mapping. If there is no load, time is counted from the first pose or gap. Raise
+    `RecordingError` if a recording cannot be read, has no pose, or has a load that does not fit its role, and
+    `SceneError` if the scene is invalid.
     """
     own, deviations = own_run(path), (UNSTATED, UNSTATED)
     if own is None:

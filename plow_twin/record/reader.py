@@ -65,12 +65,8 @@ class RunReader:
     in which its header differs.
 
     The iteration determines `status`, `damaged_chunks` (a part that is not an MCAP file counts as one), `stop_reason`,
-    `counts` (records by topic) and `position` (share of the data that has been read, from 0 to 1).
-
-    Raises
-    ------
-    RecordingError
-        The file does not exist, or it is not a recording of plow_twin.
+    `counts` (records by topic) and `position` (share of the data that has been read, from 0 to 1). Raise
+    `RecordingError` if the file does not exist, or it is not a recording of plow_twin.
     """
 
     path: Path
@@ -426,10 +422,7 @@ def sample_template(frame_id: str) -> Template:
 def read_header(path: Path) -> RunHeader | None:
     """Return the header of a recording of plow_twin, or None for a recording of another program.
 
-    Raises
-    ------
-    RecordingError
-        The file is not an MCAP file, or its header is invalid.
+    Raise `RecordingError` if the file is not an MCAP file, or its header is invalid.
     """
     headers: list[RunHeader] = []
 
@@ -457,10 +450,7 @@ def _has_no_message(path: Path) -> bool:
 def run_parts(path: Path) -> list[Path]:
     """Return the MCAP files of a recording in order; `path` is the folder, or a single file.
 
-    Raises
-    ------
-    RecordingError
-        No file exists.
+    Raise `RecordingError` if no file exists.
     """
     if path.is_dir():
         files = sorted(path.glob("*.mcap"), key=part_number)

@@ -103,12 +103,8 @@ class Recorder:
     loss of power.
 
     `now_ns` returns the receive time [ns], in the thread of the caller. `on_error` receives the reason when recording
-    stops early, once, in the thread of the recorder.
-
-    Raises
-    ------
-    RecordingError
-        The folder is not empty or cannot be created.
+    stops early, once, in the thread of the recorder. Raise `RecordingError` if the folder is not empty or cannot be
+    created.
     """
 
     def __init__(

@@ -421,10 +421,7 @@ def read_table(path: Path) -> tuple[Columns, Iterator[list[str]]]:
 def read_columns(path: Path, names: Sequence[str]) -> NDArray[np.float64]:
     """Return the numbers in the columns `names` of a CSV or Parquet file, shape (n, k).
 
-    Raises
-    ------
-    RecordingError
-        The file cannot be read, a column occurs twice, or a column or a number is missing.
+    Raise `RecordingError` if the file cannot be read, a column occurs twice, or a column or a number is missing.
     """
     columns, rows = read_table(path)
     if not set(names) <= set(columns.names):

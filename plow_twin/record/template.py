@@ -48,10 +48,7 @@ class Template:
     def of(cls, build: Callable[[NDArray[np.float64]], Message], count: int) -> Self:
         """Return the template of the messages that `build` creates from an array of `count` numbers.
 
-        Raises
-        ------
-        RecordingError
-            A message does not contain one of the numbers unchanged.
+        Raise `RecordingError` if a message does not contain one of the numbers unchanged.
         """
         marks = np.frombuffer(np.arange(0x3FD1_2345_6789_0000, 0x3FD1_2345_6789_0000 + count, dtype=np.int64).tobytes())
         message = build(marks)

@@ -137,12 +137,8 @@ def large_loads(values: Mapping[tuple[str, str], Array], units: Mapping[str, str
 def check_units(messages: Iterable[Arrived], roles: Mapping[str, Role], scene: Scene, source: object) -> None:
     """Check the units in the first 20,000 messages of a recording.
 
-    A quantity is not checked if the mapping states its unit, scale or limits.
-
-    Raises
-    ------
-    UnitError
-        The numbers of a quantity seem to be in another unit. The error contains advice on how to state the unit.
+    A quantity is not checked if the mapping states its unit, scale or limits. Raise `UnitError` if the numbers of a
+    quantity seem to be in another unit. The error contains advice on how to state the unit.
     """
     stamps: list[float] = []
     values: dict[tuple[str, str], list[float]] = {}

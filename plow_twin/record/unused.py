@@ -61,12 +61,8 @@ def unused_messages(path: Path) -> Iterator[dict[str, Any]]:
     """Yield a row for each unused message in the journal of a run: input, sender, reason, stamp and values.
 
     For some messages, the journal contains only their number. These messages have one common row, which contains the
-    number as `count` and has no stamp.
-
-    Raises
-    ------
-    RecordingError
-        The path is not a recording of plow_twin, or its journal cannot be decoded.
+    number as `count` and has no stamp. Raise `RecordingError` if the path is not a recording of plow_twin, or its
+    journal cannot be decoded.
     """
     for batch in RunReader(path).batches(outputs=False):
         for _, entry in sorted(batch.entries.others.items()):

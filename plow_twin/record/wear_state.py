@@ -59,10 +59,7 @@ def read_wear(folder: Path) -> bytes | None:
 def parse_wear(content: bytes, path: Path, head: str, scene: Scene) -> tuple[float, ...]:
     """Return the wear depths [m] from the content of a wear file.
 
-    Raises
-    ------
-    WearStateError
-        The content is invalid, or belongs to another head or scene.
+    Raise `WearStateError` if the content is invalid, or belongs to another head or scene.
     """
     try:
         record: dict[str, Any] = json.loads(content)
@@ -90,10 +87,7 @@ def parse_wear(content: bytes, path: Path, head: str, scene: Scene) -> tuple[flo
 def claim_folder(folder: Path) -> int:
     """Create a folder for the wear file of one twin, and lock it until the returned descriptor is closed.
 
-    Raises
-    ------
-    WearStateError
-        The folder cannot be written to, or another twin has locked it.
+    Raise `WearStateError` if the folder cannot be written to, or another twin has locked it.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

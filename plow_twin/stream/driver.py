@@ -308,10 +308,7 @@ class Driver:
     def set_wear(self, stamp_ns: int, depth_m: Sequence[float], reason: str) -> None:
         """Set the wear depth of each pad [m], for example after pads were replaced, and restart the motion.
 
-        Raises
-        ------
-        ValueError
-            If `depth_m` does not contain 8 finite depths of at least 0. The twin is unchanged.
+        Raise `ValueError` if `depth_m` does not contain 8 finite depths of at least 0. The twin is unchanged.
         """
         depth = tuple(float(value) for value in depth_m)
         if len(depth) != PAIR_COUNT or not all(0.0 <= value < math.inf for value in depth):

@@ -26,10 +26,7 @@ CHANGEABLE: Final[Mapping[str, float]] = {
 def changed_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
     """Return the scene with the numbers in `changes` replaced.
 
-    Raises
-    ------
-    ArgumentError
-        If a key is not in `CHANGEABLE`, or a number is not allowed in the scene.
+    Raise `ArgumentError` if a key is not in `CHANGEABLE`, or a number is not allowed in the scene.
     """
     for key, value in changes.items():
         if key not in CHANGEABLE:
@@ -50,10 +47,8 @@ def changed_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
 def changed_twin(twin: Driven, scene: Scene, changes: Mapping[str, float]) -> Driven:
     """Return a twin of the changed scene, in the initial state of the scene and with the settings of `twin`.
 
-    Raises
-    ------
-    ArgumentError
-        As for `changed_scene`, or if the changed scene needs new compiled code. A live twin has no time to compile.
+    Raise `ArgumentError` as `changed_scene` does, or if the changed scene needs new compiled code. A live twin has no
+    time to compile.
     """
     twin_changed = twin.like(changed_scene(scene, changes))
     if twin_changed.signature != twin.signature:

@@ -185,12 +185,8 @@ class Session:
     def apply(self, entry: journal.Entry) -> Rows | None:
         """Emit an entry and apply it; return the row of its advance, shape (1,), or None if the entry makes no advance.
 
-        A `Digest` or a `Loss` describes the journal from which it was read. It is neither applied nor emitted.
-
-        Raises
-        ------
-        ValueError
-            If the stamp is older than all stored states, or a number is not finite. The motion is unchanged.
+        A `Digest` or a `Loss` describes the journal from which it was read. It is neither applied nor emitted. Raise
+        `ValueError` if the stamp is older than all stored states, or a number is not finite. The motion is unchanged.
         """
         match entry:
             case journal.Sample():
@@ -254,12 +250,7 @@ class Session:
 
         The motion does not depend on the division into parts. If `each` is set, each sample is published, except that
         samples inserted late are published together. If `each` is not set, `outputs` collects the samples for the next
-        publication.
-
-        Raises
-        ------
-        ValueError
-            As for `apply`.
+        publication. Raise `ValueError` as `apply` does.
         """
         late, first_ns = 0, samples[0].stamp_ns
         if self._is_late(first_ns):

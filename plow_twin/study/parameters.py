@@ -105,12 +105,8 @@ def parameter_of(scene: Scene, path: str) -> Value | None:
 def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
     """Return the scene with new values. The mark of each changed number is removed.
 
-    Raises
-    ------
-    StudyError
-        The scene does not have a path, or a value is of the wrong kind.
-    SceneError
-        The scene cannot be used with these values; the error lists every problem.
+    Raise `StudyError` if the scene does not have a path, or a value is of the wrong kind, and `SceneError` if the scene
+    cannot be used with these values; the error lists every problem.
     """
     paths = parameter_paths(scene)
     for path, value in values.items():

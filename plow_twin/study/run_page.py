@@ -35,10 +35,7 @@ _LOADS: Final = ("Fx", "Fy", "M")
 def write_run_page(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], int]:
     """Write the page of a run. Return the status of the recording, its losses, and the number of failed advances.
 
-    Raises
-    ------
-    RecordingError
-        The file is not a recording, or has no rows to draw.
+    Raise `RecordingError` if the file is not a recording, or has no rows to draw.
     """
     reader = RunReader(path)
     curves = RunCurves.of(reader)

@@ -32,12 +32,9 @@ _CHUNK_NAME: Final = re.compile(r"\d{5,}\.npz|\.\d{5,}\.npz\.\d+")
 class Store:
     """The stored chunks of one sweep, in a folder that is created if necessary.
 
-    A chunk has `chunk` members, or as many as the chunks that are already stored. `fresh` deletes a stored sweep.
-
-    Raises
-    ------
-    StudyError
-        The folder contains a sweep with other arguments, an unreadable sweep, or chunks without `sweep.json`.
+    A chunk has `chunk` members, or as many as the chunks that are already stored. `fresh` deletes a stored sweep. Raise
+    `StudyError` if the folder contains a sweep with other arguments, an unreadable sweep, or chunks without
+    `sweep.json`.
     """
 
     def __init__(self, folder: Path, sweep: Sweep, chunk: int, fresh: bool = False) -> None:

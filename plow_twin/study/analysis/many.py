@@ -27,12 +27,8 @@ def run_many(
     """Return the result of each task, or a mapping with the key `error` if the task failed.
 
     A task with a stored result does not run. The tasks run in `workers` processes, or on the Dask cluster with the
-    scheduler at `dask`. The workers of the cluster must have access to the same files.
-
-    Raises
-    ------
-    StudyError
-        The cluster cannot be reached, or has no worker.
+    scheduler at `dask`. The workers of the cluster must have access to the same files. Raise `StudyError` if the
+    cluster cannot be reached, or has no worker.
     """
     results = {number: facts for number, task in enumerate(tasks) if (facts := task.stored()) is not None}
 

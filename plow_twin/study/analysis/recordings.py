@@ -45,12 +45,8 @@ def left_out(path: Path, results: Sequence[Path] = ()) -> list[Path]:
 def expand(paths: Sequence[Path], results: Sequence[Path] = ()) -> list[Path]:
     """Return the recordings at the given paths, and those directly inside the given folders.
 
-    The folders `results` contain results of an earlier analysis and are not recordings.
-
-    Raises
-    ------
-    RecordingError
-        A folder has no recording.
+    The folders `results` contain results of an earlier analysis and are not recordings. Raise `RecordingError` if a
+    folder has no recording.
     """
     recordings: list[Path] = []
     for path in paths:

@@ -86,10 +86,7 @@ class Task:
     def clear(self, inputs: Sequence[Path] = ()) -> None:
         """Remove the files of an earlier analysis. A run that a twin has recorded is not removed.
 
-        Raises
-        ------
-        RecordingError
-            A file to remove is an input of this analysis.
+        Raise `RecordingError` if a file to remove is an input of this analysis.
         """
         old = self._old()
         self._keep(old, (*self._inputs(), *inputs))

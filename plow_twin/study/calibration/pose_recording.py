@@ -67,12 +67,8 @@ class PoseRecording:
 def load_poses(path: Path) -> PoseRecording:
     """Read the columns t, x, y, theta from a .csv, .parquet or .npz file, or the poses of a run from an .mcap file.
 
-    An .npz file may contain `q`, shape (n, 3), instead of the three columns.
-
-    Raises
-    ------
-    StudyError
-        The file cannot be read, or its rows cannot be used.
+    An .npz file may contain `q`, shape (n, 3), instead of the three columns. Raise `StudyError` if the file cannot be
+    read, or its rows cannot be used.
     """
     readers: dict[str, Callable[[Path], tuple[Array, Array, Table | None]]]
     readers = {".csv": _read_csv, ".parquet": _read_csv, ".npz": _read_npz, ".mcap": _read_mcap}

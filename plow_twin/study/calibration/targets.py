@@ -126,10 +126,7 @@ class TargetSet:
     def without(self, patterns: Sequence[str]) -> TargetSet:
         """Return the set without the targets whose names match one of the patterns, such as `max at*`.
 
-        Raises
-        ------
-        StudyError
-            A pattern matches no target, or no target is left.
+        Raise `StudyError` if a pattern matches no target, or no target is left.
         """
         names = [target.name for target in self.targets]
         for pattern in patterns:

@@ -116,12 +116,8 @@ def compare(
     """Compare the first group of windows with each later group.
 
     `runs` are the names and windows of the runs in order of time. `scenes` contains the name and the contents of the
-    scene of each run. `seed` is the seed of the bootstrap draws.
-
-    Raises
-    ------
-    RecordingError
-        There are fewer than two groups.
+    scene of each run. `seed` is the seed of the bootstrap draws. Raise `RecordingError` if there are fewer than two
+    groups.
     """
     parts: dict[str, list[Windows]] = {}
     names: dict[str, list[str]] = {}

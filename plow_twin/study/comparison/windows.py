@@ -97,12 +97,8 @@ def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
     """Return the windows of a run of plow_twin.
 
     The outputs of the run must have been recorded. A window is `window_s` long. The default length is the period of the
-    load, or 10 s if the load has no period.
-
-    Raises
-    ------
-    RecordingError
-        The recording is not a run of plow_twin, has no outputs, or has missing samples in every window.
+    load, or 10 s if the load has no period. Raise `RecordingError` if the recording is not a run of plow_twin, has no
+    outputs, or has missing samples in every window.
     """
     sums = _RunSums(round(1e9 * (window_s or _load_period(recording))), RunTime(recording.header.parameters).silences)
     for found in recording.batches("excitation", "contact_forces", "contact_peaks", "clearance"):

@@ -137,12 +137,8 @@ def fit_flight(first_flight: ArrayLike, block: NDArray[np.void] = SQUARE, scatte
     """Fit a flight with drag to the rows before the first impact, by robustly weighted least squares.
 
     `first_flight`, shape (k, 3), contains rows x, z [m], theta [rad] at 250 Hz. Gravity and drag are those of `block`.
-    The errors of a measured row are those of `scatter`.
-
-    Raises
-    ------
-    ArgumentError
-        There are fewer than four rows, a number is not finite, or the rows are not a flight above the table.
+    The errors of a measured row are those of `scatter`. Raise `ArgumentError` if there are fewer than four rows, a
+    number is not finite, or the rows are not a flight above the table.
     """
     try:
         rows = np.array(first_flight, dtype=np.float64)

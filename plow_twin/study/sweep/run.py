@@ -39,12 +39,7 @@ def run_on_cluster(store: Store, address: str, on_progress: OnProgress = lambda 
     """Compute the missing chunks on the Dask cluster at `address`. Return the whole table.
 
     Each chunk is one task, and its result is stored on arrival. If a worker dies, the scheduler assigns its tasks to
-    another worker.
-
-    Raises
-    ------
-    StudyError
-        The cluster cannot be reached, has no worker, or gives up a task.
+    another worker. Raise `StudyError` if the cluster cannot be reached, has no worker, or gives up a task.
     """
     chunks, missing = store.chunks, store.missing()
     done = store.sweep.size - sum(len(chunks[index]) for index in missing)
