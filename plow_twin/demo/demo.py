@@ -232,9 +232,6 @@ class Child:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *error: object) -> None:
-        self.end()
-
     @property
     def running(self) -> bool:
         """True if the process has not ended."""
@@ -260,7 +257,7 @@ class Child:
             raise DemoError(f"{self._name} did not stop within {_STOP_TIMEOUT_S:g} s\n{self.output()}") from None
         self.check(allowed=(0,))
 
-    def end(self) -> None:
+    def __exit__(self, *error: object) -> None:
         """Terminate the process. If the process does not end, kill it."""
         if self.running:
             self._process.terminate()

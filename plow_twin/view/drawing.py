@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import rerun as rr
@@ -129,30 +129,29 @@ class Drawing:
 
     def _draw_still(self, scene: Scene, source: Path) -> None:
         layout.style_curves(self.stream)
-        outline = self.section.frame_strip()
-        self.stream.log("section/frame", rr.LineStrips2D([outline], colors=[_GREY], radii=[1.5]), static=True)
-        self.stream.log("exaggerated/frame", rr.LineStrips2D([outline], colors=[_GREY], radii=[1.5]), static=True)
-        self.stream.log("exaggerated/head", rr.LineStrips2D.from_fields(radii=[1.5]), static=True)
-        pads = rr.Boxes2D.from_fields(colors=list(PAIR_COLORS), radii=[1.0])
-        self.stream.log("exaggerated/pads", pads, static=True)
-        depths = rr.Points2D.from_fields(colors=list(PAIR_COLORS), radii=[0.1], show_labels=True)
-        self.stream.log("exaggerated/pads/wear", depths, static=True)
+        frame = rr.LineStrips2D([self.section.frame_strip()], colors=[_GREY], radii=[1.5])
         places = np.concatenate((0.85 * self.section.corners(), [[0.0, -0.37 * self.section.frame[1]]]))
         names = (*self.section.labels, self.section.frame_name)
         if self.section.is_block:
             places, names = np.array([[0.0, -0.5 * self.section.cavity[1]]]), (self.section.frame_name,)
         places[:, 1] -= LABEL_MM
-        labels = rr.Points2D(places, labels=names, radii=[0.1], colors=[_GREY], show_labels=True)
-        self.stream.log("section/frame/names", labels, static=True)
-        self.stream.log("section/head", rr.LineStrips2D.from_fields(radii=[0.9]), static=True)
-        self.stream.log("section/corners", rr.Points2D.from_fields(colors=[_WHITE]), static=True)
-        self.stream.log("section/force", rr.Arrows2D.from_fields(radii=[2.2], show_labels=True), static=True)
-        name = rr.Points2D.from_fields(labels=["head (moves)"], radii=[0.1], colors=[_WHITE], show_labels=True)
-        self.stream.log("section/head/name", name, static=True)
-        load = rr.Arrows2D.from_fields(radii=[2.2], colors=[LOAD_COLOR], show_labels=True)
-        self.stream.log("section/load", load, static=True)
-        document = rr.TextDocument(layout.about(scene, self.header, source), media_type=rr.MediaType.MARKDOWN)
-        self.stream.log("about", document, static=True)
+        label: dict[str, Any] = {"radii": [0.1], "show_labels": True}
+        still: dict[str, Any] = {
+            "section/frame": frame,
+            "exaggerated/frame": frame,
+            "exaggerated/head": rr.LineStrips2D.from_fields(radii=[1.5]),
+            "exaggerated/pads": rr.Boxes2D.from_fields(colors=list(PAIR_COLORS), radii=[1.0]),
+            "exaggerated/pads/wear": rr.Points2D.from_fields(colors=list(PAIR_COLORS), **label),
+            "section/frame/names": rr.Points2D(places, labels=names, colors=[_GREY], **label),
+            "section/head": rr.LineStrips2D.from_fields(radii=[0.9]),
+            "section/corners": rr.Points2D.from_fields(colors=[_WHITE]),
+            "section/force": rr.Arrows2D.from_fields(radii=[2.2], show_labels=True),
+            "section/head/name": rr.Points2D.from_fields(labels=["head (moves)"], colors=[_WHITE], **label),
+            "section/load": rr.Arrows2D.from_fields(radii=[2.2], colors=[LOAD_COLOR], show_labels=True),
+            "about": rr.TextDocument(layout.about(scene, self.header, source), media_type=rr.MediaType.MARKDOWN),
+        }
+        for entity, archetype in still.items():
+            self.stream.log(entity, archetype, static=True)
 
     def add(self, batch: Batch) -> None:
         """Draw a batch. Lines are interrupted at missing journal entries and at resets."""
