@@ -43,7 +43,10 @@ def info(target: str | None, unused: bool, mapping: Path | None, units: dict[str
     if target is None:
         return _show(_environment(), as_json)
     if Path(target).suffix == ".mcap" or Path(target).is_dir():
-        return _recording(Path(target), as_json)
+        facts, lossy = read_recording(Path(target))
+        _show(facts, as_json)
+        say_end(target, facts["status"])
+        return DONE_WITH_LOSS if lossy else DONE
     if Path(target).suffix.lower() in (".csv", ".parquet"):
         raise RecordingError(f"{target}: got a table, expected --map with a mapping of its load, travel and pose")
     return _scene(target, as_json)
@@ -106,13 +109,6 @@ def _print_numbers(console: Console, target: str, rows: Sequence[dict[str, Any]]
     console.print(stated)
     for index, source in enumerate(sources, 1):
         console.print(Padding(f"{index:2}: {source}", (0, 0, 0, 2)), highlight=False)
-
-
-def _recording(path: Path, as_json: bool) -> int:
-    facts, lossy = read_recording(path)
-    _show(facts, as_json)
-    say_end(path, facts["status"])
-    return DONE_WITH_LOSS if lossy else DONE
 
 
 def read_recording(path: Path) -> tuple[dict[str, Any], bool]:

@@ -142,12 +142,6 @@ def _plot(fit: Fit, space: Space, objective: Objective, title: str, path: Path) 
         draw_targets(fit, space, title, path)
 
 
-def _check_options(options: dict[str, Any]) -> None:
-    for name, value in (("--without", options["without"]), ("--t-end", options["t_end"])):
-        if value and options["target"] is None:
-            raise click.UsageError(f"{name}: got it with --recording, expected it only with --target")
-
-
 def _objective(
     scene: str, settings: Sequence[str], options: dict[str, Any]
 ) -> tuple[Scene, Objective, str, tuple[str, ...]]:
@@ -162,7 +156,9 @@ def _objective(
     target, recording, workers = options["target"], options["recording"], options["workers"]
     if (target is None) == (recording is None):
         raise click.UsageError("expected either --target or --recording")
-    _check_options(options)
+    for name, value in (("--without", options["without"]), ("--t-end", options["t_end"])):
+        if value and target is None:
+            raise click.UsageError(f"{name}: got it with --recording, expected it only with --target")
     model = study_scene(scene, settings)
     if recording is not None:
         poses = load_poses(recording)

@@ -64,7 +64,8 @@ def warm_up() -> None:
 def encode(message: Message) -> bytes:
     """Return the CDR bytes of a message."""
     if isinstance(message, Text):
-        return _encode_short_text(message)
+        text = message.data.encode()
+        return b"\x00\x01\x00\x00" + struct.pack("<I", len(text) + 1) + text + b"\x00"
     types = typestore().types
     encoded, _ = _CODECS[type(message)]
     return bytes(typestore().serialize_cdr(types[message.TYPE](*encoded(types, message)), message.TYPE))
@@ -134,11 +135,6 @@ def _decode_short_text(data: bytes) -> Text:
         return Text(data[_TEXT_AT : _TEXT_AT + length - 1].decode())
     except UnicodeDecodeError as error:
         raise RecordingError(f"{Text.TYPE}: got {len(data)} bytes, expected one message ({error})") from error
-
-
-def _encode_short_text(message: Text) -> bytes:
-    text = message.data.encode()
-    return b"\x00\x01\x00\x00" + struct.pack("<I", len(text) + 1) + text + b"\x00"
 
 
 #: For each message, the function that returns the fields of the rosbags message, and the function that returns the

@@ -125,8 +125,11 @@ class Sent:
         slow_of = np.full(len(rows), -1)
         slow_of[slow["row"]] = np.arange(len(slow))
         numbers = [topic.numbers(topic.record_of(published)) for topic in REPLAYED]
-        #: arrays that compiled code reads by address; this attribute keeps them in memory
-        self._numbers = [[_with_whole_rows(part) for part in parts] for parts in numbers]
+        #: arrays with contiguous rows, which compiled code reads by address; this attribute keeps them in memory
+        self._numbers = [
+            [part if part.strides[1] == part.itemsize else np.ascontiguousarray(part) for part in parts]
+            for parts in numbers
+        ]
         self._expected = (
             self.publication, slow_of, kinds, np.ascontiguousarray(rows["stamp_ns"]),
             *_pieces(self._numbers, templates), templates.data, templates.fixed, templates.ends,
@@ -154,10 +157,6 @@ def find_advances(sequence, kind, done, first, after, counts, numbers):  # type:
             counts[kind[n]] += 1
             if numbers[advance] < 0:
                 numbers[advance] = sequence[n]
-
-
-def _with_whole_rows(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    return numbers if numbers.strides[1] == numbers.itemsize else np.ascontiguousarray(numbers)
 
 
 def _pieces(numbers: list[list[NDArray[np.float64]]], templates: Templates) -> tuple[Indexes, Indexes]:

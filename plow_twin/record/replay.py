@@ -97,7 +97,10 @@ def replay(
     reader = RunReader(Path(path))
     run = _Replay(reader.header, ReplayReport(reader.path), digests_only or write is not None)
     if write is not None:
-        run.sink = _sink(write, reader.header)
+        from plow_twin.record.writer import RunWriter
+
+        full = replace(reader.header, record_outputs="all", part=0, build=build_fingerprint())
+        run.sink = RunWriter(write, full, chunk_size=2**20, min_free_bytes=0)
     begin = time.perf_counter()
     for batch in reader.batches(outputs=not digests_only):
         run.batch(batch)
@@ -106,13 +109,6 @@ def replay(
     if run.sink is not None:
         run.sink.close(reader.lost, reader.stop_reason)
     return run.finish(reader, time.perf_counter() - begin)
-
-
-def _sink(folder: Path, header: RunHeader) -> RunWriter:
-    from plow_twin.record.writer import RunWriter
-
-    full = replace(header, record_outputs="all", part=0, build=build_fingerprint())
-    return RunWriter(folder, full, chunk_size=2**20, min_free_bytes=0)
 
 
 def following_twin(header: RunHeader, scene: Scene) -> Driven:

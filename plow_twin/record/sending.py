@@ -81,8 +81,7 @@ class _Group(NamedTuple):
             (topic.name, buffer.data[begin:end]) for topic, begin, end in zip(topics, ends, ends[1:], strict=False)
         ]
         places = np.concatenate([begin + template.places for begin, template in zip(ends, templates, strict=False)])
-        sources = np.concatenate([_sources(topic) for topic in topics])
-        integers = np.concatenate([_integers(topic) for topic in topics])
+        sources, integers = (np.concatenate(columns) for columns in zip(*map(_sources, topics), strict=True))
         return cls(tuple(parts), buffer, ends[:-1].copy(), places, sources, integers)
 
     def fill(self, records: NDArray[np.void]) -> bool:
@@ -90,15 +89,12 @@ class _Group(NamedTuple):
         return bool(_write(numbers, stamp_ns, self.buffer, self.starts, self.places, self.sources, self.integers))
 
 
-def _sources(topic: Topic) -> NDArray[np.int64]:
-    """Return the offset of each number of a message in the record [words of 8 bytes]."""
+def _sources(topic: Topic) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the offset of each number of a message in the record [words of 8 bytes], and whether it is an integer."""
     fields: Any = topic.record_type.fields
-    return np.concatenate([fields[name][1] // _WORD + np.arange(count) for name, count in topic.parts])
-
-
-def _integers(topic: Topic) -> NDArray[np.bool_]:
-    fields: Any = topic.record_type.fields
-    return np.concatenate([np.full(count, fields[name][0].base.kind == "i") for name, count in topic.parts])
+    places = [fields[name][1] // _WORD + np.arange(count) for name, count in topic.parts]
+    integers = [np.full(count, fields[name][0].base.kind == "i") for name, count in topic.parts]
+    return np.concatenate(places), np.concatenate(integers)
 
 
 def warm_up() -> None:

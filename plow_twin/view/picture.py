@@ -150,10 +150,6 @@ def _draw_section(axis: Any, section: Section, instant: Instant, curves: RunCurv
     axis.margins(0.1)
     axis.set_xlabel("to scale: where a wall overlaps a corner, the overlap is the penetration", fontsize=8)
     axis.legend(loc="upper left", bbox_to_anchor=(0.0, -0.1), ncols=2, fontsize=7)
-    _y_upwards(axis)
-
-
-def _y_upwards(axis: Any) -> None:
     axis.invert_yaxis()
     axis.yaxis.set_major_formatter(lambda y, _: signed(0.0 - y, "g"))
 
