@@ -34,12 +34,8 @@ class BagWriter:
 
     If the process is killed, the messages since the last `flush` are lost. The attribute `lost` contains, for each
     topic, the number of messages that did not fit on the disk. The function `on_trouble` receives a text when the disk
-    becomes full, and a text at the first successful write after that.
-
-    Raises
-    ------
-    RecordingError
-        The folder cannot be created.
+    becomes full, and a text at the first successful write after that. Raise `RecordingError` if the folder cannot be
+    created.
     """
 
     def __init__(self, folder: Path, on_trouble: Callable[[str], object] = lambda text: None) -> None:
@@ -94,10 +90,7 @@ class BagWriter:
     def close(self) -> None:
         """Write the index of the file, close the file, and write `metadata.yaml`.
 
-        Raises
-        ------
-        OSError
-            The disk is full. The file stays without an index.
+        Raise `OSError` if the disk is full. The file stays without an index.
         """
         self.flush()
         self._file.finish()
