@@ -66,14 +66,8 @@ def csv_rows(stream: IO[str], comment: str = "") -> Iterator[tuple[int, list[str
     """Yield the line number and the cells of each row that is not empty, beginning with the header.
 
     The delimiter is found in the header. With semicolons or tabs, decimal commas are converted to points. Lines that
-    begin with `comment` are skipped.
-
-    Raises
-    ------
-    csv.Error
-        A line cannot be read as a row.
-    ExcessError
-        A row is longer than `LONGEST_ROW`, or there are more than `MOST_COLUMNS` columns.
+    begin with `comment` are skipped. Raise `ExcessError` if a row is longer than `LONGEST_ROW`, or there are more than
+    `MOST_COLUMNS` columns.
     """
     number = length = 0
 

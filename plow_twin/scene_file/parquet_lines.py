@@ -36,16 +36,8 @@ class ParquetLines(io.RawIOBase):
     """A Parquet file that is read as UTF-8 text: a line with the names of the columns, then a line for each row.
 
     Numbers are written without loss of digits, and times with a zone in UTC. A missing value gives an empty cell.
-    Columns of lists, structures or bytes are omitted.
-
-    Raises
-    ------
-    OSError
-        The file cannot be opened.
-    csv.Error
-        The file is not a Parquet file, or is damaged. The read methods can raise the same error.
-    ExcessError
-        The unpacked file would exceed a limit of this module.
+    Columns of lists, structures or bytes are omitted. Raise `OSError` if the file cannot be opened, and `ExcessError`
+    if the unpacked file would exceed a limit of this module.
     """
 
     def __init__(self, path: Path) -> None:

@@ -11,10 +11,7 @@ PRESETS: Final = ("paper", "bench_kv", "bench_hc", "measured_square", "measured_
 def config_folder() -> Path:
     """Return the folder with the configuration files of the package.
 
-    Raises
-    ------
-    FileNotFoundError
-        The package was installed without its data files.
+    Raise `FileNotFoundError` if the package was installed without its data files.
     """
     package = Path(__file__).resolve().parent.parent
     if (package.parent / "package.xml").is_file():

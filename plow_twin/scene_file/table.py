@@ -23,12 +23,8 @@ def read_table(path: Path, columns: Sequence[str] | None = None, key: str = "fil
     """Read times [s], shape (n,), and wrenches [N, N, N m], shape (n, 3), from a CSV file with a header line.
 
     `columns` are the names of the columns of time, Fx, Fy and M. The default names are `t` (or `time`), `fx`, `fy` and
-    `m`. Lines that start with `#` are skipped. `key` is the name of the file in error messages.
-
-    Raises
-    ------
-    SceneError
-        The file, a column or a number is missing. The error lists all bad lines.
+    `m`. Lines that start with `#` are skipped. `key` is the name of the file in error messages. Raise `SceneError` if
+    the file, a column or a number is missing. The error lists all bad lines.
     """
     names = tuple(columns or TABLE_COLUMNS)
     try:
