@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
     from plow_twin.errors import LimitError, RunInterrupted
     from plow_twin.run.energy_balance import EnergyBalance
-    from plow_twin.run.sensitivity import Sensitivity
     from plow_twin.run.simulate import Result
 
 
@@ -91,7 +90,8 @@ def simulate(
     if out is not None:
         write_samples(result, out)
     if as_json:
-        click.echo(json.dumps(as_plain(result, scene, t_end), indent=2, allow_nan=False))
+        facts = _facts(result, scene, t_end)
+        click.echo(json.dumps(facts, indent=2, allow_nan=False, default=lambda array: array.tolist()))
     elif not quiet:
         _print_statistics(result, scene, t_end)
         if result.sensitivity is not None:
@@ -176,44 +176,27 @@ def _write_npz(result: Result, stream: BinaryIO) -> None:
     )
 
 
-def as_plain(result: Result, scene: str, t_end: float) -> dict[str, Any]:
+def _facts(result: Result, scene: str, t_end: float) -> dict[str, Any]:
     """Return the result without the output rows as a dictionary for JSON."""
-    return {
+    facts: dict[str, Any] = {
         "scene": scene,
         "t_end": t_end,
-        "pairs": _plain(result.statistics),
-        "contact_sets": _plain(result.contact_sets),
-        "solver": _plain(result.solver),
-        "wall_s": float(result.wall_s),
-        "compile_s": float(result.compile_s),
-        **({} if result.sensitivity is None else {"trust": _trust_of(result.sensitivity)}),
-        **({} if result.energy_balance is None else {"energy_balance": _plain(balance_of(result.energy_balance))}),
+        "pairs": result.statistics,
+        "contact_sets": result.contact_sets,
+        "solver": result.solver,
+        "wall_s": result.wall_s,
+        "compile_s": result.compile_s,
     }
-
-
-def balance_of(balance: EnergyBalance) -> dict[str, Any]:
-    """Return the energy balance as a dictionary for JSON, with the ratio of the imbalance to the turnover."""
-    from dataclasses import asdict
-
-    import numpy as np
-
-    plain = {key: np.asarray(value).tolist() for key, value in asdict(balance).items()}
-    return {**plain, "relative_imbalance": balance.relative_imbalance}
-
-
-def _trust_of(sensitivity: Sensitivity) -> dict[str, Any]:
-    return {
-        "trusted": sensitivity.trusted,
-        "growth": float(sensitivity.growth.max()),
-        "lyapunov_exponent_1_s": sensitivity.exponent,
-        "good_to_1_percent_until_s": sensitivity.good_until(1e-2),
-    }
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    return value.item() if hasattr(value, "item") else value
+    if (trust := result.sensitivity) is not None:
+        facts["trust"] = {
+            "trusted": trust.trusted,
+            "growth": trust.growth.max(),
+            "lyapunov_exponent_1_s": trust.exponent,
+            "good_to_1_percent_until_s": trust.good_until(1e-2),
+        }
+    if (balance := result.energy_balance) is not None:
+        facts["energy_balance"] = {**vars(balance), "relative_imbalance": balance.relative_imbalance}
+    return facts
 
 
 def _balance_table(balance: EnergyBalance) -> Table:
