@@ -262,9 +262,9 @@ def test_repeated_entries_are_counted_and_used_once(tmp_path: Path) -> None:
     begin, end = spans[2][0] - head, spans[8][0] - head
     run.file.write_bytes(whole[:end] + whole[begin:end] + whole[end:])
     after, report = replay(run.folder), examine(run.folder)
-    assert after.divergences == 0 and after.samples == before.samples and after.repeated == report.repeated > 0
+    assert after.divergences == 0 and after.samples == before.samples and after.repeated == report.repeated_entries > 0
     assert after.inputs == before.inputs and before.inputs
-    assert report.gaps == 0 and any("more than once" in problem for problem in report.problems)
+    assert report.missing_entries == 0 and any("more than once" in problem for problem in report.problems)
 
 
 def test_on_a_full_disk_a_repair_leaves_no_incomplete_file(tmp_path: Path) -> None:
