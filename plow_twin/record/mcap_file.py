@@ -165,7 +165,8 @@ class McapFile:
         self._write(Header("ros2", library))
 
     def _append(self, data: bytes) -> None:
-        self.size += self.out.write(data)
+        self.out.write(data)
+        self.size += len(data)
 
     @property
     def times(self) -> tuple[int, int]:

@@ -102,12 +102,17 @@ def replay(
         full = replace(reader.header, record_outputs="all", part=0, build=build_fingerprint())
         run.sink = RunWriter(write, full, chunk_size=2**20, min_free_bytes=0)
     begin = time.perf_counter()
-    for batch in reader.batches(outputs=not digests_only):
-        run.batch(batch)
-        on_progress(reader.position)
-    on_progress(1.0)
-    if run.sink is not None:
-        run.sink.close(reader.lost, reader.stop_reason)
+    try:
+        for batch in reader.batches(outputs=not digests_only):
+            run.batch(batch)
+            on_progress(reader.position)
+        on_progress(1.0)
+        if run.sink is not None:
+            run.sink.close(reader.lost, reader.stop_reason)
+    except BaseException:
+        if run.sink is not None:
+            run.sink.abandon()
+        raise
     return run.finish(reader, time.perf_counter() - begin)
 
 

@@ -462,10 +462,15 @@ def _walk_other(
     feed = Feed(walkers, roles, add, Intake(), with_poses=writer is not None)
     try:
         feed.run(messages_of(source, roles))
+        if writer is not None:
+            writer.close({})
     except RecordingError as error:
         unread = [f"{name} {count}" for name, count in source.losses.counts.items() if count]
         unread += [f"{topic} is {kind}" for topic, kind in source.losses.unknown_types.items()]
         raise RecordingError(f"{error} ({', '.join(unread)})" if unread else str(error)) from None
+    finally:
+        if writer is not None:
+            writer.abandon()
     intake = feed.intake
     dropped = {
         f"dropped_{verdict.value}": count for verdict, count in intake.counts.items() if not verdict.used and count
@@ -473,8 +478,6 @@ def _walk_other(
     losses = {**source.losses.counts, **dropped}
     losses |= {f"{UNFIT}{reason}": count for reason, count in feed.unfit.items()}
     losses |= _failures(walkers)
-    if writer is not None:
-        writer.close({})
     counted = {"samples_in": intake.arrived, "samples_used": intake.used, **dropped}
     unknown = dict(source.losses.unknown_types)
     return Analysis(path, "other", predictions, measured, counted, losses, unknown, feed.silences)
