@@ -21,7 +21,7 @@ from plow_twin.model.scene import (
     describe,
     must_be_given,
 )
-from plow_twin.scene_file.validation import Schema, choice, mapping
+from plow_twin.scene_file.validation import TEXT, Schema, choice, mapping
 
 LOAD_KINDS: Final[dict[str, type[Load]]] = {"harmonic": Harmonic, "constant": Constant, "table": Table}
 #: Default columns of a load file: time, Fx, Fy, M.
@@ -48,11 +48,8 @@ def scene_schema() -> Schema:
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "plow_twin scene",
-        "type": "object",
+        **mapping(properties, ["version", *(key for key in SECTIONS if must_be_given(described[key]))]),
         "description": "a mapping with the sections of a scene",
-        "properties": properties,
-        "required": ["version", *(key for key in SECTIONS if must_be_given(described[key]))],
-        "additionalProperties": False,
     }
 
 
@@ -83,22 +80,15 @@ def _quantity(spec: Field[Any]) -> Schema:
 
 
 def _markable(plain: Schema) -> Schema:
-    marked = {
-        "type": "object",
-        "description": f"a mapping with value, mark, source and deviation, value: {plain['description']}",
-        "properties": {
-            "value": plain,
-            "mark": choice([mark.value for mark in Mark]),
-            "source": {"type": "string", "description": "a text"},
-            "deviation": {
-                "type": "number",
-                "minimum": 0.0,
-                "description": "a standard deviation in the unit of the value, at least 0",
-            },
-        },
-        "required": ["value", "mark"],
-        "additionalProperties": False,
+    deviation = {"type": "number", "minimum": 0.0}
+    properties = {
+        "value": plain,
+        "mark": choice([mark.value for mark in Mark]),
+        "source": TEXT,
+        "deviation": {**deviation, "description": "a standard deviation in the unit of the value, at least 0"},
     }
+    expected = f"a mapping with value, mark, source and deviation, value: {plain['description']}"
+    marked = {**mapping(properties, ("value", "mark")), "description": expected}
     return _either(plain, marked, plain["description"])
 
 
@@ -124,12 +114,10 @@ def _load() -> Schema:
     at_m = _property(next(spec for spec in fields(Constant) if spec.name == "at_m"))
     kinds = {kind: _object(part, without=("name", "at_m")) for kind, part in LOAD_KINDS.items()}
     kinds["table"] = _table(kinds["table"])
+    name = {"type": "string", "minLength": 1, "description": "a name"}
     return {
-        "type": "object",
+        **mapping({"name": name, **kinds, "at_m": at_m}, ("name",)),
         "description": f"a mapping with name, at_m and one of {', '.join(kinds)}",
-        "properties": {"name": {"type": "string", "minLength": 1, "description": "a name"}, **kinds, "at_m": at_m},
-        "required": ["name"],
-        "additionalProperties": False,
         "oneOf": [{"required": [kind]} for kind in kinds],
     }
 
@@ -149,9 +137,7 @@ def _table(plain: Schema) -> Schema:
     }
     file = {"file": {"type": "string", "minLength": 1, "description": "the path of a csv file"}, "columns": columns}
     return {
-        "type": "object",
+        **mapping({**plain["properties"], **file, **samples}),
         "description": "a mapping with file (and columns), or with t and wrench",
-        "properties": {**plain["properties"], **file, **samples},
         "oneOf": [{"required": ["file"]}, {"required": ["t", "wrench"]}],
-        "additionalProperties": False,
     }
