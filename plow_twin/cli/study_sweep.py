@@ -174,9 +174,10 @@ def _extremes(result: Table, index: int, first: Axis, second: Axis) -> str:
 
 
 def _thinned(count: int, most: int) -> list[int]:
-    if count <= most:
-        return list(range(count))
-    return sorted({round(index * (count - 1) / (most - 1)) for index in range(most)})
+    import numpy as np
+
+    places: list[int] = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
+    return places
 
 
 def _unit(name: str) -> str:

@@ -20,6 +20,7 @@ from plow_twin.record.sources import columns_of
 from plow_twin.record.times import NUMBER, STAMP_UNITS, time_ns
 from plow_twin.record.unit_check import CHECKED, unit_doubts
 from plow_twin.scene_file.csv_rows import csv_rows, delimiter_of, open_csv
+from plow_twin.scene_file.yaml_text import dump_yaml
 
 Array = NDArray[np.float64]
 
@@ -84,10 +85,7 @@ class Guess:
 
     def mapping_text(self) -> str:
         """Return the content of a mapping file as YAML."""
-        import yaml
-
-        text: str = yaml.safe_dump(self.mapping(), sort_keys=False, allow_unicode=True)
-        return text
+        return dump_yaml(self.mapping(), flow=False)
 
 
 #: Time zone at the end of a date with time.
