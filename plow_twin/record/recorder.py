@@ -248,7 +248,8 @@ class Recorder:
         now = self._now_ns()
         with self._lock:
             if fits := self._admitted(now, 2, (topic,)):
-                self._queue.append(_OutputItem(self._sequence, now, topic, stamp_ns, message))
+                place = topic, self._sequence, now, stamp_ns, message
+                self._queue.append(_Call(lambda writer: writer.write_output(*place), {topic: 1}))
         return fits
 
     def publication(self, published: Published, sent: Mapping[str, bytes] = MappingProxyType({})) -> bool:
@@ -273,9 +274,9 @@ class Recorder:
         now, samples = self._now_ns(), len(series.stamps)
         count = samples + len(series.digests)
         with self._lock:
-            item = _SeriesItem(self._sequence + 1, now, series)
+            first = self._sequence + 1
             if self._journal_gap == 0 and self._room(count, self._queue_size):
-                self._push_many(item, count)
+                self._push_many(lambda writer: _write_series(writer, first, now, series), {JOURNAL: count}, count)
             else:
                 self._snapshot_due = True
                 self._journal_gap += count
@@ -283,7 +284,7 @@ class Recorder:
             self._sequence += count
         ends = np.zeros(samples, np.int64)
         ends[series.digest_after - 1] = 1
-        return item.sequence + np.arange(samples) + np.cumsum(ends)
+        return first + np.arange(samples) + np.cumsum(ends)
 
     def publications(self, published: Published, sequence: NDArray[np.int64]) -> bool:
         """Add publications that the node has not sent to the queue; return False if the publications are lost.
@@ -291,11 +292,12 @@ class Recorder:
         `sequence`, shape (n,), is the number of the journal entry before each publication.
         """
         now, count = self._now_ns(), len(published.rows)
+        log_times = np.full(count, now, np.int64)
         topics = Counter(dict.fromkeys(self._topics_of[False, False], count))
         topics.update(dict.fromkeys(set(self._topics_of[True, False]) - topics.keys(), len(published.slow)))
         with self._lock:
             if fits := self._admitted(now, count + len(topics), topics):
-                self._push_many(_PublicationsItem(sequence, now, published, topics), count)
+                self._push_many(lambda writer: writer.write_publications(sequence, log_times, published), topics, count)
         return fits
 
     def _admitted(self, now: int, items: int, topics: Iterable[str]) -> bool:
@@ -321,9 +323,9 @@ class Recorder:
     def _queued(self) -> int:
         return len(self._queue) + self._more
 
-    def _push_many(self, item: _SeriesItem | _PublicationsItem, count: int) -> None:
+    def _push_many(self, write: Callable[[RunWriter], object], keys: Mapping[str, int], count: int) -> None:
         self._more += count - 1
-        self._queue.append(item)
+        self._queue.append(_Call(write, keys, count))
 
     def _push_entry(self, now: int, entry: Entry | Dropped) -> None:
         self._sequence += 1
@@ -392,7 +394,7 @@ class Recorder:
             backlog -= len(items)
             _add_keys(self._unflushed, items)
             self._write(items)
-            count = sum(map(_count, items))
+            count = sum(item.size if isinstance(item, _Call) else 1 for item in items)
             self._written += count
             if count > len(items):
                 with self._lock:
@@ -409,18 +411,15 @@ class Recorder:
                 publications.append(item)
             elif isinstance(item, _EntryItem) and isinstance(item.entry, Sample):
                 samples.append(item)
-            elif isinstance(item, _SeriesItem | _PublicationsItem):
+            elif isinstance(item, _Call):
                 samples, publications = self._write_samples(samples), self._write_publications(publications)
                 item.write(self._writer)
-            elif isinstance(item, _EntryItem):
+            else:
                 samples = self._write_samples(samples)
                 if isinstance(item.entry, Snapshot) and (self._mark is not None or self._part_is_full()):
                     publications = self._write_publications(publications)
                     self._split()
-                item.write(self._writer)
-            else:
-                publications = self._write_publications(publications)
-                item.write(self._writer)
+                self._writer.write_entry(*item)
         # in the file, the chunk of samples precedes the chunk of the messages that were sent after the samples
         self._write_samples(samples)
         self._write_publications(publications)
@@ -533,43 +532,27 @@ class Recorder:
             self._on_error(self._error)
 
 
-class _SeriesItem(NamedTuple):
-    """Samples and digests to write, with the sequence number of the first entry."""
-
-    sequence: int
-    log_time_ns: int
-    series: Series
-
-    @property
-    def keys(self) -> Mapping[str, int]:
-        return {JOURNAL: len(self.series.stamps) + len(self.series.digests)}
-
-    def write(self, writer: RunWriter) -> None:
-        series = self.series
-        digests = dict(zip(series.digest_after.tolist(), series.digests, strict=True))
-        log_times = np.full(len(series.stamps), self.log_time_ns, np.int64)
-        writer.write_series(self.sequence, log_times, series.stamps, series.wrench, digests)
-
-
-class _PublicationsItem(NamedTuple):
-    """Publications to write, each with the number of the journal entry before it.
-
-    The attribute `keys`, which every kind of item has, contains the topics of the messages that are lost with the item.
-    """
-
-    sequence: NDArray[np.int64]
-    log_time_ns: int
-    published: Published
-    keys: Mapping[str, int]
-
-    def write(self, writer: RunWriter) -> None:
-        log_times = np.full(len(self.sequence), self.log_time_ns, np.int64)
-        writer.write_publications(self.sequence, log_times, self.published)
+def _write_series(writer: RunWriter, first: int, log_time_ns: int, series: Series) -> None:
+    digests = dict(zip(series.digest_after.tolist(), series.digests, strict=True))
+    log_times = np.full(len(series.stamps), log_time_ns, np.int64)
+    writer.write_series(first, log_times, series.stamps, series.wrench, digests)
 
 
 def _numbers(items: Sequence[_EntryItem | _PublicationItem]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     sequence, log_time_ns, *_ = zip(*items, strict=True)
     return np.array(sequence, np.int64), np.array(log_time_ns, np.int64)
+
+
+class _Call(NamedTuple):
+    """A call of the writer.
+
+    The attribute `keys`, which every kind of item has, contains the topics of the messages that are lost with the item,
+    and `size` is the number of entries and publications of the item.
+    """
+
+    write: Callable[[RunWriter], object]
+    keys: Mapping[str, int]
+    size: int = 1
 
 
 # A live node creates thousands of items each second, and a named tuple is created four times as fast as a frozen
@@ -583,24 +566,6 @@ class _EntryItem(NamedTuple):
     def keys(self) -> tuple[str, ...]:
         return (JOURNAL,)
 
-    def write(self, writer: RunWriter) -> None:
-        writer.write_entry(self.sequence, self.log_time_ns, self.entry)
-
-
-class _OutputItem(NamedTuple):
-    sequence: int
-    log_time_ns: int
-    topic: str
-    stamp_ns: int
-    message: Message
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        return (self.topic,)
-
-    def write(self, writer: RunWriter) -> None:
-        writer.write_output(self.topic, self.sequence, self.log_time_ns, self.stamp_ns, self.message)
-
 
 class _PublicationItem(NamedTuple):
     sequence: int
@@ -610,17 +575,11 @@ class _PublicationItem(NamedTuple):
     keys: tuple[str, ...]
 
 
-_Item: TypeAlias = _EntryItem | _OutputItem | _PublicationItem | _SeriesItem | _PublicationsItem
-
-
-def _count(item: _Item) -> int:
-    if isinstance(item, _SeriesItem):
-        return item.keys[JOURNAL]
-    return len(item.sequence) if isinstance(item, _PublicationsItem) else 1
+_Item: TypeAlias = _EntryItem | _PublicationItem | _Call
 
 
 def _add_keys(counts: Counter[str], items: Iterable[_Item]) -> None:
-    if any(isinstance(item, _SeriesItem | _PublicationsItem) for item in items):
+    if any(isinstance(item, _Call) for item in items):
         for item in items:
             counts.update(item.keys)
     else:
