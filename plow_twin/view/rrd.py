@@ -59,7 +59,6 @@ def to_rrd(
     path: Path,
     out: Path,
     *,
-    section_hz: float = SECTION_HZ,
     exaggerate: float | None = None,
     most_rows: int = MOST_ROWS,
     others: Mapping[str, Scene] | None = None,
@@ -73,8 +72,6 @@ def to_rrd(
         The `.mcap` file or its folder.
     out
         The .rrd file to write.
-    section_hz
-        Rate of the cross-section [Hz].
     exaggerate
         Factor by which the second cross-section widens the clearance. With None, the factor follows from the clearance.
     most_rows
@@ -96,7 +93,7 @@ def to_rrd(
         drawing = Drawing(
             reader,
             file.attach,
-            section_hz=min(section_hz, max(1.0, 0.05 * most_rows / max(duration_s, 1e-9))),
+            section_hz=min(SECTION_HZ, max(1.0, 0.05 * most_rows / max(duration_s, 1e-9))),
             exaggerate=exaggerate,
             span_ns=_span_ns(reader, duration_s, most_rows),
             others=others,

@@ -82,7 +82,7 @@ def calibrate(
     *,
     seed: int,
     starts: int,
-    search: Search | None = None,
+    search: Search,
     first: Array | None = None,
     on_progress: OnProgress = lambda share, best: None,
 ) -> Calibration:
@@ -91,7 +91,6 @@ def calibrate(
     The first population of the first start contains the point `first`, for example the point of the given scene.
     `on_progress` is called after every generation.
     """
-    search = search or Search()
     done: list[Start] = []
     populations: list[tuple[Array, Array]] = []
     for number, child in enumerate(np.random.SeedSequence(seed).spawn(starts)):
