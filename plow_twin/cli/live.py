@@ -57,7 +57,7 @@ _LOST = re.compile(r"dropped_.*|.*_dropped|.*_lost")
 @map_option
 @unit_option
 @click.option("--params", type=FILE, help="YAML file with parameters, in the form of a parameter file of the node.")
-@named_option("--set", "given", "NAME=VALUE", metavar="NAME=VALUE", help="Value of a parameter; may be repeated.")
+@named_option("--set", "given", "NAME=VALUE", "Value of a parameter; may be repeated.")
 @click.option("--record", type=FOLDER, help="Folder for the recording.")
 @click.option("--follow", is_flag=True, help="Continue while the files grow.")
 @click.option(

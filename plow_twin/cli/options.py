@@ -61,8 +61,11 @@ def find_ros_wheels() -> None:
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
 
 
-def named_option(option: str, name: str, expected: str, **settings: Any) -> Decorator:
-    """Return an option that may be repeated. The parameter `name` of the command receives the values by name."""
+def named_option(option: str, name: str, expected: str, text: str) -> Decorator:
+    """Return an option that may be repeated, with the help `text`.
+
+    The parameter `name` of the command receives the values by name. `expected` begins with the form of a value.
+    """
 
     def parsed(context: click.Context, parameter: click.Parameter, texts: tuple[str, ...]) -> dict[str, str]:
         for text in texts:
@@ -70,12 +73,13 @@ def named_option(option: str, name: str, expected: str, **settings: Any) -> Deco
                 raise click.BadParameter(f"got {text!r}, expected {expected}")
         return dict(text.partition("=")[::2] for text in texts)
 
-    return click.option(option, name, multiple=True, callback=parsed, **settings)
+    metavar = expected.partition(",")[0]
+    return click.option(option, name, multiple=True, callback=parsed, metavar=metavar, help=text)
 
 
 unit_option = named_option(
-    "--unit", "units", "NAME=UNIT, such as fx=kN or t=ms", metavar="NAME=UNIT",
-    help="Unit of a measured number, e.g. fx=kN, x=mm, theta=deg, t=ms; may be repeated.",
+    "--unit", "units", "NAME=UNIT, such as fx=kN or t=ms",
+    "Unit of a measured number, e.g. fx=kN, x=mm, theta=deg, t=ms; may be repeated.",
 )  # fmt: skip
 
 

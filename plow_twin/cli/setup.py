@@ -23,9 +23,7 @@ if TYPE_CHECKING:
 )
 @click.argument("file", type=FILE)
 @click.option("--scene", help="Scene file or preset of the machine; by default a stub of a scene is written.")
-@named_option(
-    "--column", "columns", "NAME=COLUMN", metavar="NAME=COLUMN", help="Column of a quantity, e.g. fx=Load_1."
-)
+@named_option("--column", "columns", "NAME=COLUMN", "Column of a quantity, e.g. fx=Load_1.")
 @unit_option
 @click.option("--out", type=FOLDER, default=Path(), help="Folder for the files.")
 @quiet_option
