@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from plow_twin.errors import RecordingError
 from plow_twin.record.bag import beside_folders
 from plow_twin.record.cdr import type_hash
@@ -35,7 +37,6 @@ from plow_twin.record.run_time import RunTime
 from plow_twin.record.unused import InputCounts
 from plow_twin.stream.journal import Digest, Failed, Sample, Snapshot
 
-_CHUNK_SIZE: Final = 2**20
 #: Key under which `metadata.yaml` contains the names of repaired parts. In the file, the prefix `plow_twin_` precedes
 #: the key.
 REPAIRED_KEY: Final = "repaired"
@@ -342,22 +343,15 @@ def _rewrite(part: Path, *, last: bool) -> None:
 
 
 def _copy(messages: Messages, reader: ChunkReader, file: McapFile, numbers: dict[int, int]) -> None:
-    builder = ChunkBuilder("zstd")
-    for index, number in enumerate(messages.channel.tolist()):
+    for number in dict.fromkeys(messages.channel.tolist()):
         channel = reader.channels.get(number)
-        if channel is None:
-            continue
-        if number not in numbers:
+        if channel is not None and number not in numbers:
             numbers[number] = file.channel(channel.topic, channel.message_type, channel.schema, _description(channel))
-        builder.add(
-            numbers[number],
-            int(messages.sequence[index]),
-            int(messages.log_time_ns[index]),
-            int(messages.publish_time_ns[index]),
-            messages.data(index),
-        )
-        if builder.size >= _CHUNK_SIZE:
-            file.chunk(builder)
+    known = messages[np.isin(messages.channel, list(numbers))]
+    channels = np.array([numbers[number] for number in known.channel.tolist()], np.int64)
+    data = b"".join(map(known.data, range(len(known))))
+    builder = ChunkBuilder("zstd")
+    builder.add_bytes(channels, known.sequence, known.log_time_ns, known.publish_time_ns, known.length, data)
     file.chunk(builder)
 
 
