@@ -7,7 +7,7 @@ import pytest
 from estimate_support import known
 from scipy.signal import lfilter
 
-from plow_twin.estimate.measurements import EstimateError, Load, Poses, believed
+from plow_twin.estimate.measurements import EstimateError, Load, Poses, without_uncertain
 
 
 def test_arrays_of_the_wrong_shape_are_named() -> None:
@@ -29,7 +29,7 @@ def test_the_covariance_of_a_pose_is_used() -> None:
     """A covariance of 1e6, which means `not measured`, must not make the other poses useless."""
     q, own = np.ones((40, 3)), np.full((40, 3), 1e-3)
     own[7], own[8, 0], own[9] = 1e3, 0.02, np.nan
-    kept, deviation = believed((0.0, 0.0, 4e-3), q, own)
+    kept, deviation = without_uncertain((0.0, 0.0, 4e-3), q, own)
     assert deviation == pytest.approx((1e-3, 1e-3, 4e-3))
     assert np.argwhere(np.isnan(kept)).tolist() == [[7, 0], [7, 1], [7, 2], [8, 0]]
     for wrong in ((np.nan, 0.0, 0.0), (0.0, -1.0, 0.0), (np.inf, 0.0, 0.0)):

@@ -81,7 +81,7 @@ def test_kelvin_voigt_without_pull(z: float, e: float) -> None:
     assert restitution.measure("kelvin_voigt", [z])[0].delivered == pytest.approx(e, abs=6e-5)
 
 
-def test_kelvin_voigt_is_the_closed_form() -> None:
+def test_kelvin_voigt_agrees_with_the_closed_form() -> None:
     """The restitution is exp(-z / r (pi - atan(2 z r / (1 - 2 z^2)))) with r = sqrt(1 - z^2), for z < 1 / sqrt(2).
 
     The formula follows from F = 0 on the damped sine (Schwager and Poeschel, Granular Matter 9 (2007) 465).

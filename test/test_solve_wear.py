@@ -49,7 +49,7 @@ def test_linear_feedback_of_wear_on_force() -> None:
     assert result.force[-1, 0] == pytest.approx(stiffness * (depth - expected), rel=1e-4)
 
 
-def test_depth_is_the_wear_law_of_the_impulse_and_widens_the_clearance() -> None:
+def test_depth_follows_from_the_impulse_and_widens_the_clearance() -> None:
     # a pinned motion compiles the same kernels
     scene = dataclasses.replace(preset("bench_kv"), wear=Wear(1e-10, 0.015, 2.5))
     result = simulate(scene, 20.0)

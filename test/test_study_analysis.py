@@ -208,7 +208,7 @@ def test_messages_beside_a_run_that_do_not_fit_are_counted_by_topic(tmp_path: Pa
     assert analysis.lost == {"unfit, head_pose: /pose has no number at 'pose.x' for x": 10} and analysis.lossy
 
 
-def test_a_partial_recording_beside_a_run_is_read_as_far_as_it_goes_and_its_loss_counted(tmp_path: Path) -> None:
+def test_a_partial_recording_beside_a_run_is_read_to_its_end_and_its_loss_counted(tmp_path: Path) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(1000)))
     for name, data in (("beside", b""), ("beside_2", b"no such file")):
         (run.folder / name).mkdir()

@@ -27,9 +27,7 @@ if TYPE_CHECKING:
 @unit_option
 @click.option("--out", type=FOLDER, default=Path(), help="Folder for the files.")
 @quiet_option
-def setup(
-    file: Path, scene: str | None, columns: dict[str, str], units: dict[str, str], out: Path, quiet: bool
-) -> int:
+def setup(file: Path, scene: str | None, columns: dict[str, str], units: dict[str, str], out: Path, quiet: bool) -> int:
     """Guess the separator, time, columns and units of FILE, and write a mapping and a stub of a scene.
 
     In a terminal, the command asks for columns that it cannot guess.

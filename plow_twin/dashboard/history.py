@@ -6,7 +6,7 @@ from collections import deque
 from typing import Any, Final
 
 SPAN_S: Final = 3600
-#: Names of the clearances in a second, in the order in which the page reads them.
+#: Names of the clearances of each second, in the order in which the page reads them.
 _CLEARANCES: Final = tuple(f"{name}{point}" for name in ("horizontal", "vertical") for point in ("", "/p05", "/p95"))
 
 

@@ -487,9 +487,9 @@ def path_delay(motion_features: MotionFeatures, features: Array, drawn: list[Arr
     if finite.sum() < tuning.PATH_PHASES:
         return 0.0
     value, residual = _Near.to(features, measured).left_over(paths[:, finite])
-    off = ((measured_path[:, finite] - value) ** 2 / ((residual**2).mean(axis=0) + _NO_SCATTER)).sum(axis=1)
+    square_distance = ((measured_path[:, finite] - value) ** 2 / ((residual**2).mean(axis=0) + _NO_SCATTER)).sum(axis=1)
     # the delay of a sensor cannot be negative
-    return max(float(_LAGS_S[int(np.argmin(off))]), 0.0)
+    return max(float(_LAGS_S[int(np.argmin(square_distance))]), 0.0)
 
 
 def _of_other_law(
@@ -573,13 +573,13 @@ def _distance_of_paths(features: Array, paths: Array, measured: Array, measured_
     deviation = np.sqrt(variance * (1.0 + near.inverse[0, 0]))
     residual *= np.sqrt(near.weight / near.weight.sum())[:, None] / deviation
     share, size = tuning.SHRINKAGE[1], residual.shape[1]
-    off = (measured_path - value) / deviation
+    difference = (measured_path - value) / deviation
     # a path has more numbers than there are draws, so the smaller matrix L L^T is inverted:
     # (a L^T L + b I)^-1 = (I - L^T (b/a I + L L^T)^-1 L) / b
     equal = share * float(np.square(residual).sum()) / size
     among = residual @ residual.T + equal / (1.0 - share) * np.eye(len(residual))
-    along = residual @ off.T
-    square = (np.square(off).sum(axis=1) - (along * np.linalg.solve(among, along)).sum(axis=0)) / equal
+    along = residual @ difference.T
+    square = (np.square(difference).sum(axis=1) - (along * np.linalg.solve(among, along)).sum(axis=0)) / equal
     return float(square.min() / measured_path.shape[1])
 
 

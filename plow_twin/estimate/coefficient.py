@@ -83,8 +83,8 @@ class Coefficient:
     def quantile(self, share: float) -> float:
         """Return the quantile of k_s in m^2/N below which the probability is `share`, with the model error included."""
         middle, point = np.log(np.interp([0.5, share], np.cumsum(self.weight), self.value))
-        off = math.hypot(point - middle, tuning.PATH_DEVIATION * float(ndtri(share)))
-        return math.exp(float(middle) + math.copysign(off, share - 0.5))
+        distance = math.hypot(point - middle, tuning.PATH_DEVIATION * float(ndtri(share)))
+        return math.exp(float(middle) + math.copysign(distance, share - 0.5))
 
     def draw(self, count: int, rng: np.random.Generator) -> Array:
         """Return random values of k_s in m^2/N from the posterior, shape (count,)."""

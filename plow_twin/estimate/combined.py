@@ -34,10 +34,10 @@ def with_gaps(result: Estimate, by_gaps: GapsFit) -> Estimate:
         strict=True,
     ):
         moved = value.deviation
-        off = deviations_apart((value.mean, moved), (mean, deviation))
-        if state.known and off > tuning.OUTLYING:
+        apart = deviations_apart((value.mean, moved), (mean, deviation))
+        if state.known and apart > tuning.OUTLYING:
             found.append(
-                f"gaps: {name} {mean:.5f} m by the gaps, {value.mean:.5f} m by the motion, {off:.1f} deviations apart"
+                f"gaps: {name} {mean:.5f} m by the gaps, {value.mean:.5f} m by the motion, {apart:.1f} deviations apart"
             )
         if state.known:
             mean, deviation = weighted_mean((mean, deviation), (value.mean, moved))

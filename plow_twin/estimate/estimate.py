@@ -288,9 +288,9 @@ def _searched(
     verdict, plain = judge(*found, period), found
     behind = behind_low_pass(*searched) if searched and fails(found[1], verdict) and not verdict.broken else None
     if behind is not None:
-        again = refine(forward.renewed(), unknowns, poses, period, behind.shared, behind.noise, drift, LOW_PASS)
-        if again and again[1].loss < found[1].loss:
-            found, verdict = again, judge(*again, period)
+        refined = refine(forward.renewed(), unknowns, poses, period, behind.shared, behind.noise, drift, LOW_PASS)
+        if refined and refined[1].loss < found[1].loss:
+            found, verdict = refined, judge(*refined, period)
     found, verdict = _with_differences(found, verdict, period)
     if bounced is None and fails(found[1], verdict) and (verdict.by_scale or not verdict.sensor):
         # friction can resemble wrong scales of the sensor
@@ -374,10 +374,10 @@ def _with_differences(
     least = tuning.MORE_ASKEW * verdict.figures["scale"] if verdict.by_scale else tuning.OUTLYING**2
     if (verdict.by_scale or not fails(found[1], verdict)) and shown(*found) < least:
         return found, verdict
-    again = with_differences(*found)
-    other = None if again is None else judge(*again, period)
-    if again and other and not fails(again[1], other):
-        return again, other
+    fitted = with_differences(*found)
+    other = None if fitted is None else judge(*fitted, period)
+    if fitted and other and not fails(fitted[1], other):
+        return fitted, other
     return found, verdict
 
 

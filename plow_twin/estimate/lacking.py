@@ -76,10 +76,10 @@ def _alternated(
         shared, states = (np.clip(one, -bound, bound) for one, bound in zip((shared, states), most, strict=True))
         shared = problem.unknowns.within(fitted.shared + shared)
         states = better_states(problem, shared, fitted.point.states + states)
-        again = fit(problem, shared, states, fitted.noise, _ITERATIONS)
-        if again is None:
+        refitted = fit(problem, shared, states, fitted.noise, _ITERATIONS)
+        if refitted is None:
             return None
-        fitted = again
+        fitted = refitted
         in_vain = 0 if fitted.loss < best else in_vain + 1
         best = min(best, fitted.loss)
     return problem, fitted, harmonics

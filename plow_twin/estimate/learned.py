@@ -115,15 +115,16 @@ class Learner:
         both, in_self, in_before = np.intersect1d(self.open, before.open, return_indices=True)
         if not len(both):
             return
-        covariance, off = before.covariance[np.ix_(in_before, in_before)], before.mean[in_before] - self.mean[in_self]
+        covariance = before.covariance[np.ix_(in_before, in_before)]
+        difference = before.mean[in_before] - self.mean[in_self]
         total = covariance + self.covariance[np.ix_(in_self, in_self)]
-        if off @ np.linalg.solve(total, off) > tuning.OUTLYING**2:
+        if difference @ np.linalg.solve(total, difference) > tuning.OUTLYING**2:
             return
         gain = self.covariance[:, in_self] @ np.linalg.inv(total)
-        self.mean = np.clip(self.mean + gain @ off, self._least, self._most)
+        self.mean = np.clip(self.mean + gain @ difference, self._least, self._most)
         self.covariance = self.covariance - gain @ self.covariance[in_self]
 
-    def add(self, numbers: Array, measured_change: Array, off: Array, noise: Array) -> None:
+    def add(self, numbers: Array, measured_change: Array, difference: Array, noise: Array) -> None:
         """Add the information from a pose.
 
         Parameters
@@ -132,7 +133,7 @@ class Learner:
             Parameters of the members.
         measured_change : ndarray, shape (m, c)
             Predictions of the members, minus their mean.
-        off : ndarray, shape (c,)
+        difference : ndarray, shape (c,)
             The pose minus the mean prediction.
         noise : ndarray, shape (c,)
             Standard deviation of the pose.
@@ -147,7 +148,7 @@ class Learner:
         inverse = np.linalg.inv(alone + np.diag(noise**2))
         # subtract the information in the slope that is due to the random scatter of the members
         self._precision += slope @ inverse @ slope.T - spread * np.trace(inverse @ alone)
-        self._score += slope @ inverse @ (off - (self.mean - middle) @ slope)
+        self._score += slope @ inverse @ (difference - (self.mean - middle) @ slope)
 
     def learn(self, time: float) -> None:
         """Update the distribution with the information from poses since the last update."""

@@ -167,16 +167,16 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
         change = 0.5 * step * (ahead - force)
         # the noise of the mean forces is not an error of the step
         noise = 0.5 * step * np.hypot(deviation, ahead_deviation)
-        off = float(np.maximum(np.abs(change) - 2.0 * noise, 0.0).max()) / smallest
-        if off > tuning.JUMP[1] and step * float(force.max()) > 1e-3 * smallest:
+        excess = float(np.maximum(np.abs(change) - 2.0 * noise, 0.0).max()) / smallest
+        if excess > tuning.JUMP[1] and step * float(force.max()) > 1e-3 * smallest:
             step *= 0.5
             continue
         exposure, steady, force, deviation = exposure + step, euler + change, ahead, ahead_deviation
         depth = with_running_in(scene.wear, steady)
-        error += off * off * smallest + float(noise.max()) ** 2 / smallest
+        error += excess * excess * smallest + float(noise.max()) ** 2 / smallest
         rows.append((exposure, steady, force, deviation))
         smallest = max(min(_clearances(scene, depth)), _LEAST_CLEARANCE)
-        grow = 1.5 if off < 0.3 * tuning.JUMP[1] else 1.0
+        grow = 1.5 if excess < 0.3 * tuning.JUMP[1] else 1.0
         step = min(grow * step, tuning.JUMP[0] * smallest / max(float(force.max()), 1.0))
     if exposure < most_exposure and not _beyond(scene, depth, limit):
         raise LifeError(f"path: got {len(rows)} steps and no end, expected at most {_MOST_STEPS}")

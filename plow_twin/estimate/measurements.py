@@ -402,9 +402,9 @@ def filled(poses: Poses) -> Array:
     return out
 
 
-def own_deviations(brought: Iterable[tuple[float, ...]]) -> Array:
+def own_deviations(stated: Iterable[tuple[float, ...]]) -> Array:
     """Return the standard deviations in n messages of poses, shape (n, 3); NaN for a message without deviations."""
-    return np.array([deviations or (math.nan,) * 3 for deviations in brought], dtype=np.float64).reshape(-1, 3)
+    return np.array([deviations or (math.nan,) * 3 for deviations in stated], dtype=np.float64).reshape(-1, 3)
 
 
 def useless_deviation() -> Deviation:
@@ -412,7 +412,7 @@ def useless_deviation() -> Deviation:
     return tuple(tuning.MUCH_WORSE * bias for bias in priors.BIAS)
 
 
-def believed(stated: Deviation, q: Array, own: Array) -> tuple[Array, Deviation]:
+def without_uncertain(stated: Deviation, q: Array, own: Array) -> tuple[Array, Deviation]:
     """Return poses without the components that have a large stated deviation, and the deviations of the others.
 
     Parameters

@@ -340,34 +340,34 @@ class Ensemble:
         path = np.stack([self._path[index][1] for index in range(after - 1, len(times))])
         share = min((t - times[after - 1]) / (times[after] - times[after - 1]), 1.0)
         # pose that the sensor of each member would have measured
-        then = ((1.0 - share) * path[0] + share * path[1] + biases_of(self._numbers))[:, finite]
+        predicted = ((1.0 - share) * path[0] + share * path[1] + biases_of(self._numbers))[:, finite]
         since = self.first.time - self._drifted
         self._drift(load_error)
         state = np.concatenate([self._v, *path, self._load_off], axis=1)
         use = self._used()
         if not self._steers_first and use[1:].any():
             use = use & (np.arange(len(use)) > 0)
-        about, centred_poses = state - state[use].mean(axis=0), then - then[use].mean(axis=0)
+        about, centred_poses = state - state[use].mean(axis=0), predicted - predicted[use].mean(axis=0)
         freedom = max(int(use.sum()) - 1, 1)
         scatter = centred_poses[use].T @ centred_poses[use] / freedom + np.diag(noise[finite] ** 2)
-        center = _off(q, then[use].mean(axis=0), finite)
+        center = _difference(q, predicted[use].mean(axis=0), finite)
         if (np.abs(center) <= tuning.OUTLYING * np.sqrt(np.diag(scatter))).all():
             self.outlying = 0
         else:
             self.outlying += 1
             if self.outlying <= _MOST_OUTLYING:
                 return False
-        white = self._rng.standard_normal((len(then), len(finite)))
+        white = self._rng.standard_normal((len(predicted), len(finite)))
         white[0] = 0.0
         if self._learner is not None:
             self._learner.add(self._numbers[use], centred_poses[use], center, noise[finite])
-        off = _off(q, then, finite)
+        differences = _difference(q, predicted, finite)
         # limit the influence of a single wrong pose
         most = tuning.OUTLYING * noise[finite]
-        self.square += ((off.clip(-most, most) / noise[finite]) ** 2).sum(axis=1)
+        self.square += ((differences.clip(-most, most) / noise[finite]) ** 2).sum(axis=1)
         weight = np.linalg.solve(scatter, centred_poses[use].T @ about[use] / freedom)
         weight[:, ~np.tile(self._free, len(path) + 2)] = 0.0
-        moved = state + (off + noise[finite] * white) @ weight
+        moved = state + (differences + noise[finite] * white) @ weight
         v, places = moved[:, :3], moved[:, 3:-3].reshape(len(moved), -1, 3).transpose(1, 0, 2)
         allowed = np.flatnonzero(self._allowed(places[-1], self._force(self._depth)))
         allowed = allowed[allowed >= 1 - self._steers_first]
@@ -535,12 +535,12 @@ def _bytes(rows: Rows) -> NDArray[np.uint8]:
     return views
 
 
-def _off(q: Array, then: Array, there: NDArray[np.int64]) -> Array:
-    """Return the pose `q` minus the poses `then`, shape (..., k), for the k components `there`; angles in [-pi, pi]."""
-    off: Array = q[there] - then
-    turn = there == _THETA
-    off[..., turn] = np.remainder(off[..., turn] + np.pi, 2.0 * np.pi) - np.pi
-    return off
+def _difference(q: Array, others: Array, components: NDArray[np.int64]) -> Array:
+    """Return the pose `q` minus the poses `others`, shape (..., k), for k components; angles in [-pi, pi]."""
+    difference: Array = q[components] - others
+    turn = components == _THETA
+    difference[..., turn] = np.remainder(difference[..., turn] + np.pi, 2.0 * np.pi) - np.pi
+    return difference
 
 
 def _clearance_of(scenes: Sequence[Scene]) -> Array:

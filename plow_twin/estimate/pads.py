@@ -79,10 +79,10 @@ def with_differences(problem: Problem, fitted: Fit) -> tuple[Problem, Fit] | Non
         if index and size < tuning.SETTLED:
             break
         problem = problem.having(forward=forward, differences=differences, drift=problem.drift)
-        again = fit(problem, fitted.shared, fitted.point.states, fitted.noise, _ITERATIONS)
-        if again is None:
+        refitted = fit(problem, fitted.shared, fitted.point.states, fitted.noise, _ITERATIONS)
+        if refitted is None:
             return None
-        fitted = again
+        fitted = refitted
     return problem, fitted
 
 

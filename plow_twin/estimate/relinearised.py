@@ -36,10 +36,10 @@ def with_other_law_numbers(problem: Problem, fitted: Fit, period: float) -> tupl
             break
         unknowns = _changed(first, changes, first.penetration_of(float(fitted.shared[SOFTNESS])))
         other = problem.having(forward=forward.of(unknowns.scene), unknowns=unknowns)
-        again = fit(other, unknowns.within(beside.shared), fitted.point.states, fitted.noise, _ITERATIONS)
-        if again is None or again.loss > fitted.loss - tuning.OUTLYING**2:
+        refitted = fit(other, unknowns.within(beside.shared), fitted.point.states, fitted.noise, _ITERATIONS)
+        if refitted is None or refitted.loss > fitted.loss - tuning.OUTLYING**2:
             break
-        problem, fitted = other, again
+        problem, fitted = other, refitted
     if problem.unknowns.nominal_scene is None:
         return None
     verdict = judge(problem, fitted, period)

@@ -78,8 +78,8 @@ def behind_low_pass(problem: Problem, fitted: Fit) -> Fit | None:
     if problem.window.poses.interval() > RESOLVING:
         return None
     other = problem.having(forward=problem.forward.renewed(), differences=LOW_PASS)
-    again = fit(other, fitted.shared, fitted.point.states, fitted.noise, _STAGES[-1][1])
-    return again if again is not None and again.loss < fitted.loss - tuning.OUTLYING**2 else None
+    refitted = fit(other, fitted.shared, fitted.point.states, fitted.noise, _STAGES[-1][1])
+    return refitted if refitted is not None and refitted.loss < fitted.loss - tuning.OUTLYING**2 else None
 
 
 def refine(

@@ -404,7 +404,7 @@ def summarise_bounced(
         vertical_state=states[1],
         apparent=(apparent[0], apparent[1]) if all(state.known for state in states) else None,
         # bounces determine only a lower limit of the stiffness
-        stiffness=Interval(float(mean), float(soft), max(float(hard), unknowns.hardest_believed)),
+        stiffness=Interval(float(mean), float(soft), max(float(hard), unknowns.hardest_stiffness)),
         damping=damping_interval(unknowns, Interval.normal(*bounced.ln_damping)),
         bias_x=bias[0],
         bias_y=bias[1],
@@ -439,11 +439,11 @@ def _numbers(unknowns: Unknowns, normal: list[Interval]) -> dict[str, Any]:
 def _stiffness(unknowns: Unknowns, psi: Interval) -> Interval:
     """Return the stiffness from the softness `psi`.
 
-    The interval extends to `Unknowns.hardest_believed` if it includes contacts that are too hard to be resolved.
+    The interval extends to `Unknowns.hardest_stiffness` if it includes contacts that are too hard to be resolved.
     """
     soft, hard = unknowns.stiffness_of(psi.p95), unknowns.stiffness_of(psi.p05)
     if unknowns.within(np.full(SIZE, psi.p05))[SOFTNESS] > psi.p05:
-        hard = max(hard, unknowns.hardest_believed)
+        hard = max(hard, unknowns.hardest_stiffness)
     return Interval(unknowns.stiffness_of(psi.mean), soft, hard)
 
 

@@ -85,7 +85,7 @@ MOST_SCALE = 16.0
 MORE_ASKEW = 2.0
 #: smallest reduction of chi^2 by a change within the window [chi^2]
 CHANGE_CHI2 = 200.0
-#: smallest share of the excess residuals that such a change explains [1]
+#: smallest share of the excess residuals that a change within the window explains [1]
 CHANGE_SHARE = 0.25
 #: share of the swings at each end of the window at which no change is tested [1]
 #: Basis: load in steps (`load_steps`, seed 98201): a change after 3 of 176 swings reduces chi^2 by 254, a change after
@@ -265,8 +265,8 @@ DRAWN_CLEARANCE = (1.2e-3, 3e-4, 3e-4, 2.5e-4)
 #: distribution of drawn hard contacts: median penetration, and deviations of the logarithm of penetration, of the
 #: logarithm of damping, and of the gains [m, 1, 1, 1]
 HARD_DRAWN = (1.2e-5, 1.6, 0.7, 0.06)
-#: deviation of the logarithms drawn for a firm contact: in the first round, relative to the deviation of the previous
-#: result, and smallest value [1]
+#: deviations from which the logarithms for a firm contact are drawn: deviation in the first round; in later rounds,
+#: factor of the deviation of the previous result, and smallest deviation [1]
 #: Basis: seeds 43200 to 43215
 FIRM_SPREAD = (0.5, 1.5, 0.1)
 #: distance in the first round above which a contact is firm, not hard [1]
@@ -338,9 +338,9 @@ MODULATED = 0.12
 #: averaging time of the load that would cause a motion, if the load was not measured [s]
 #: Basis: `plain`, seeds 30200 to 30202: errors of clearances are at most 3.7 mm; with 0.2 s, they reach 8 mm
 LOAD_AVERAGED = 0.4
-#: if the load was not measured: penetrations of both walls, relative to the penetration under the reference force, as
-#: the median and the deviation of the logarithm; share of the penetrations that is added to the deviation of a
-#: clearance [1, 1, 1]
+#: if the load was not measured: median of the penetrations of both walls, relative to the penetration under the
+#: reference force; deviation of its logarithm; share of the penetrations that is added to the deviation of a clearance
+#: [1, 1, 1]
 #: Basis: as for `LOAD_AVERAGED`
 YIELDED = (1.5, 0.4, 0.1)
 #: number of draws in each of three rounds, with and without measured theta [motions]

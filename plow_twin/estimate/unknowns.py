@@ -207,7 +207,7 @@ class Unknowns:
         return 2.0 * math.sqrt(stiffness * self.scene.head.mass_kg)
 
     @property
-    def hardest_believed(self) -> float:
+    def hardest_stiffness(self) -> float:
         """Upper end in N/m^n of the interval of a stiffness that is too large to be determined."""
         return float(self.force / (1e-6) ** self.scene.contact.exponent)
 

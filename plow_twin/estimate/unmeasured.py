@@ -167,10 +167,10 @@ def fit_some_components(
         # each repetition has better values of the missing components
         for _ in range(tuning.UNMEASURED_ROUNDS):
             # the losses of two rounds do not compare, because their missing components have different random noise
-            again = None if candidate[1].finished else refined(candidate[1].shared, end, candidate[1])
-            if again is None:
+            improved = None if candidate[1].finished else refined(candidate[1].shared, end, candidate[1])
+            if improved is None:
                 break
-            candidate = again
+            candidate = improved
         return candidate
 
     candidates = [refined(vector, end) for vector in _starts(whole, int(np.searchsorted(poses.t, end)), rng)]

@@ -64,7 +64,7 @@ def judge(problem: Problem, fit: Fit, period: float) -> Verdict:
         excess = (abs(gain - 1.0) - tuning.MOST_GAIN) / max(deviation, 1e-9)
         verdict.figures[f"gain_{name}"] = float(gain)
         if excess > 2.0:
-            verdict.model.append(f"load {name}: {gain:.2f} times the believed load")
+            verdict.model.append(f"load {name}: {gain:.2f} times the given load")
     if not fit.converged:
         verdict.figures["not_converged"] = 1.0
     if verdict.sensor:

@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
 from plow_twin.estimate.gaps import Gaps
-from plow_twin.estimate.measurements import FEWEST_POSES, UNSTATED, Deviation, Load, Poses, believed, own_deviations
+from plow_twin.estimate.measurements import (
+    FEWEST_POSES,
+    UNSTATED,
+    Deviation,
+    Load,
+    Poses,
+    own_deviations,
+    without_uncertain,
+)
 from plow_twin.model.pairs import PAIR_COUNT
 
 Array = NDArray[np.float64]
@@ -207,7 +215,9 @@ class Windows:
 
     def _table_of_poses(self, rows: list[_Pose], start_ns: int) -> tuple[Poses, int]:
         times, q = _table([(stamp, values) for stamp, values, _ in rows], start_ns)
-        q, deviation = believed(self._pose_deviation, q, own_deviations(brought for _, _, brought in rows))
+        q, deviation = without_uncertain(
+            self._pose_deviation, q, own_deviations(deviations for _, _, deviations in rows)
+        )
         return Poses.of(times, q, deviation)
 
     def _table_of_gaps(

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
 from plow_twin.estimate import tuning
-from plow_twin.estimate.measurements import UNSTATED, Deviation, believed
+from plow_twin.estimate.measurements import UNSTATED, Deviation, without_uncertain
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.bag import readable_beside
@@ -171,10 +171,10 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
         other_scene = scene is not None
         model = load_scene(scene_path(str(scene))) if other_scene else own.header.scene(own.path)
         lost = Counter[str]()
-        loads, begins, journalled, gaps, spread, brought = _journal(own, lost)
+        loads, begins, journalled, gaps, spread, deviations_of_poses = _journal(own, lost)
         gaps_deviation = float(own.header.parameters.get("gaps_deviation", 0.0))
         of_poses, of_load = stated(own.header.parameters)
-        journalled[:, 1:], of_poses = believed(of_poses, journalled[:, 1:], brought)
+        journalled[:, 1:], of_poses = without_uncertain(of_poses, journalled[:, 1:], deviations_of_poses)
         deviations = of_poses, tuple(np.maximum(of_load, spread).tolist())
         rows, reason = {"head_pose": journalled}, ""
         if mapping is not None or not (len(journalled) or len(gaps)):

@@ -206,7 +206,7 @@ class RunReader:
             merger.begin(part, reader)
             for messages in reader:
                 self.position = min(1.0, (before + reader.position) / max(1, size))
-                if len(messages):  # between these and the messages of a truncated part before, some may be missing
+                if len(messages):  # messages may be missing between a truncated part and the next part
                     self.damaged_chunks, cut = self.damaged_chunks + cut, 0
                 yield from merger.add(messages)
                 if self.tail is not None and not len(messages):

@@ -70,9 +70,9 @@ class Credentials:
             raise InputError(problems, str(path))
         return cls(data, path.parent)
 
-    def text(self, section: str, key: str, otherwise: str = "") -> str:
-        """Return a value of a section, or `otherwise` if the value is missing."""
-        return str(self.sections.get(section, {}).get(key, otherwise))
+    def text(self, section: str, key: str, default: str = "") -> str:
+        """Return a value of a section, or `default` if the value is missing."""
+        return str(self.sections.get(section, {}).get(key, default))
 
     def file(self, section: str, key: str) -> str | None:
         """Return the absolute path of a file, or None if the section has no path.
