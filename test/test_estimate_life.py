@@ -40,7 +40,7 @@ def test_the_jump_agrees_with_the_direct_run() -> None:
     assert direct.max() > 1e-3
 
 
-def test_the_jump_agrees_with_the_direct_run_with_sliding_in_the_plane_and_running_in() -> None:
+def test_sliding_in_the_plane_and_running_in_do_not_disturb_the_jump() -> None:
     """With a hundredth of the usual travel, most wear is by sliding in the plane. New pads wear three times as fast."""
     slow = replace(FAST, travel_speed_m_s=0.02, coefficient_m2_n=3e-9, sliding="total")
     scene = replace(preset("paper"), wear=replace(slow, running_in_ratio=3.0, running_in_depth_m=2e-4))

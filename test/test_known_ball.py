@@ -118,7 +118,7 @@ def doubling_threshold(r: float, stiffness: float) -> float:
     return float(brentq(growth, 1.48, 1.56, xtol=1e-8))
 
 
-def test_both_thresholds_of_the_vibrating_table() -> None:
+def test_both_thresholds_of_the_vibrating_table_converge_to_the_known_values() -> None:
     """With r = 0.5, a = pi (1-r)/(1+r) is 1.0472, and (a^2 + 4 ((1+r^2)/(1+r)^2)^2)^0.5 is 1.5268.
 
     The error is proportional to K^-1/2, like the duration of a contact. At K = 1e9 N/m, it is 1e-3 and 4e-4. The values

@@ -77,7 +77,7 @@ def test_every_law_has_the_restitution_of_the_energy_identity(law: str) -> None:
 @pytest.mark.parametrize(
     ("z", "e"), [(0.01, 0.9693), (0.05, 0.8588), (0.1, 0.7441), (0.2, 0.5717), (0.3, 0.4510), (0.5, 0.2984)]
 )
-def test_kelvin_voigt_without_pull(z: float, e: float) -> None:
+def test_kelvin_voigt_without_pull_has_the_known_restitution(z: float, e: float) -> None:
     assert restitution.measure("kelvin_voigt", [z])[0].delivered == pytest.approx(e, abs=6e-5)
 
 

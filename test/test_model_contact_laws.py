@@ -89,7 +89,7 @@ def test_power_series_equals_the_power(shift: int, n: float) -> None:
 
 
 @pytest.mark.parametrize("n", [0.5, 1.5, 2.2])
-def test_eight_power_series_side_by_side(n: float) -> None:
+def test_eight_power_series_side_by_side_are_accurate(n: float) -> None:
     order, rng = 24, np.random.default_rng(5)
     base, power = np.zeros((order + 1, 8)), np.zeros((order + 1, 8))
     base[0], base[1:5] = rng.uniform(0.5, 2.0, 8), rng.uniform(-0.3, 0.3, (4, 8))

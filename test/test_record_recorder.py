@@ -167,7 +167,7 @@ def test_killed_writers_lose_at_most_the_last_second(tmp_path: Path) -> None:
 
 @pytest.mark.stress
 @pytest.mark.timeout(3600)
-def test_killed_writers_many_times(tmp_path: Path) -> None:
+def test_two_hundred_killed_writers_lose_only_items_since_the_last_flush(tmp_path: Path) -> None:
     kill_writers((tmp_path / f"run{n}" for n in range(200)), random.Random(1), flush_s=0.5, longest_s=4.0)
 
 

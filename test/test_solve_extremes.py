@@ -38,7 +38,7 @@ def bouncing(contact: Contact, mass: float, gap: float = 0.01) -> Scene:
 
 @pytest.mark.parametrize("n", [1.0, 1.5])
 @pytest.mark.parametrize("stiffness", [1e3, 1e5, 1e7, 1e9, 1e11, 1e13])
-def test_stiffness_over_ten_decades(stiffness: float, n: float) -> None:
+def test_a_head_comes_to_rest_at_any_stiffness_over_ten_decades(stiffness: float, n: float) -> None:
     """The head comes to rest. Its depth is 0.5 mm in the softest wall, and at least 1 nm in the other walls."""
     mass = max(0.1, 2e-10 * stiffness)
     contact = Contact("exact_restitution", stiffness, n, restitution=0.3, impact_speed_floor_m_s=1e-2)
@@ -55,7 +55,7 @@ def test_stiffness_over_ten_decades(stiffness: float, n: float) -> None:
 
 @pytest.mark.parametrize("mass", [10.0**k for k in range(-1, 6)])
 @pytest.mark.parametrize("e", [0.0, 0.5, 1.0])
-def test_mass_and_restitution_over_their_range(mass: float, e: float) -> None:
+def test_the_rebound_has_the_requested_speed_for_any_mass_and_restitution(mass: float, e: float) -> None:
     """The rebound speed is e times the impact speed for all masses. At e = 0, the limit of the damping gives 1/1000."""
     contact = Contact("exact_restitution", 1e8, 1.5, restitution=e)
     result = simulate(with_presets_terms(wall_and_point(contact, speed=0.5, mass=mass)), 1.0, tol=1e-10)
@@ -64,7 +64,7 @@ def test_mass_and_restitution_over_their_range(mass: float, e: float) -> None:
 
 @pytest.mark.parametrize("n", [1.0, 1.5])
 @pytest.mark.parametrize("gap", [1.0, 1e-9])
-def test_clearance_from_zero_to_a_metre(gap: float, n: float) -> None:
+def test_a_pose_stays_within_clearances_from_a_nanometre_to_a_metre(gap: float, n: float) -> None:
     contact = Contact("exact_restitution", 1e8, n, restitution=0.3 if n == 1.0 else 0.7, impact_speed_floor_m_s=1e-2)
     scene = dataclasses.replace(preset("paper"), clearance=Clearance(gap, gap), contact=contact)
     scene = dataclasses.replace(scene, frame=dataclasses.replace(scene.frame, width_m=3.3, height_m=2.7))

@@ -16,7 +16,7 @@ from plow_twin import Clearance, Constant, Contact, Frame, Gravity, Head, Scene,
 from plow_twin.model.contact_laws import exact_damping_number
 
 
-def test_hertz_impact_of_a_sphere_on_a_rigid_plane() -> None:
+def test_a_hertz_impact_of_a_sphere_agrees_with_the_published_values() -> None:
     """Chung and Ooi, Granular Matter 13 (2011) 643, test 2: 49.7172 um, 11.36986 kN and 731.66 us."""
     radius, modulus, poisson, density = 0.1, 7e10, 0.30, 2699.0
     stiffness = 4.0 / 3.0 * modulus / (1.0 - poisson**2) * math.sqrt(radius)
@@ -30,7 +30,7 @@ def test_hertz_impact_of_a_sphere_on_a_rigid_plane() -> None:
 
 
 @pytest.mark.parametrize(("n", "duration"), [(1.0, math.pi), (1.5, 2.94327518)])
-def test_depth_and_time_of_an_impact(n: float, duration: float) -> None:
+def test_depth_and_time_of_an_impact_agree_with_the_closed_form(n: float, duration: float) -> None:
     """d_max^(n+1) = (n+1) m v0^2 / K (D - ln(1+D)) / D^2. Without damping, T = c_n d_max / v0."""
     stiffness, mass, speed = 1e8, 2.0, 0.7
     # for n = 1 a damping without effect gives the scene the law of a preset

@@ -27,7 +27,7 @@ def pressed(wear: Wear | None, *, clearance: float, gravity: float, stiffness: f
     return with_presets_terms(scene)
 
 
-def test_constant_force_and_speed() -> None:
+def test_constant_force_and_speed_give_the_known_wear() -> None:
     """h = k_s F v t / A, where F is the weight on two pads."""
     k_s, area, speed, g, t = 1e-12, 0.015, 2.0, 9.81, 50.0
     start = simulate(pressed(Wear(k_s, area, speed), clearance=0.02, gravity=g), 5.0)
@@ -81,7 +81,7 @@ def worn_by(exposure: float) -> float:
     ],
 )
 @pytest.mark.parametrize(("along", "t"), [(0.0, 20.0), (0.4, 1.0)])
-def test_sliding_in_the_plane_and_running_in_under_a_constant_load(contact: Contact, along: float, t: float) -> None:
+def test_sliding_in_the_plane_and_running_in_give_the_known_wear(contact: Contact, along: float, t: float) -> None:
     """A head that slides steadily along the bottom wears its pads by both motions, more slowly after running-in."""
     weight, stiffness = 2000.0 * 9.81, 1e7
     scene = dataclasses.replace(

@@ -107,7 +107,9 @@ def test_no_peak_is_lost_from_the_force_curves(run: Run, view: tuple[ViewSummary
     assert summary.curve_rows == COUNT and summary.status is FileStatus.COMPLETE
 
 
-def test_curves_of_penetration_clearance_and_load(run: Run, view: tuple[ViewSummary, dict[str, pa.Table]]) -> None:
+def test_a_view_has_curves_of_penetration_clearance_and_load(
+    run: Run, view: tuple[ViewSummary, dict[str, pa.Table]]
+) -> None:
     tables = view[1]
     forces = [m for topic, m in run.outputs if topic == "/contact_forces" and isinstance(m, JointState)]
     np.testing.assert_array_equal(

@@ -187,7 +187,7 @@ class _Joint:
         point, force = self._problem.evaluate(place.shared, place.states), self._force(place)
         return None if point is None or force is None else _Evaluation(place, point, force)
 
-    def _away(self, place: _Place) -> Array:
+    def _prior_offset(self, place: _Place) -> Array:
         """Return the prior means of the border's unknowns minus their present values."""
         late = self._cells.delay - place.delay
         return np.concatenate([self._problem.mean - place.shared, [late], -place.gain])
@@ -195,8 +195,8 @@ class _Joint:
     def _cost(self, at: _Evaluation) -> float:
         z = np.abs(self._measured - at.force) / np.sqrt(self._spread)
         loss = huber_loss(z)
-        away = self._away(at.place)[SIZE:]
-        prior = float(self._precision[SIZE:] @ away**2)
+        offset = self._prior_offset(at.place)[SIZE:]
+        prior = float(self._precision[SIZE:] @ offset**2)
         return self._problem.cost(at.point, self._variance) + float(np.nansum(loss) + np.isnan(loss).sum()) + prior
 
     def _linearised(self, at: _Evaluation) -> tuple[Linear, Array]:
@@ -250,7 +250,7 @@ class _Joint:
         """Return the step of the border, shape (b,), and its covariance."""
         normal = np.sum([block.normal for block in blocks], axis=0) + np.diag(self._precision)
         covariance: Array = np.linalg.inv(normal)
-        pull = self._precision * self._away(at.place)
+        pull = self._precision * self._prior_offset(at.place)
         score = np.sum([block.score for block in blocks], axis=0) + pull
         return covariance @ score, covariance
 

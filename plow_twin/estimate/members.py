@@ -45,7 +45,7 @@ LATEST_S: Final = 0.25
 _PATH_S: Final = 2e-3
 #: Upper bound on the number of consecutive outliers that are ignored. After more outliers, the head has really moved.
 _MOST_OUTLYING: Final = 5
-#: Lower bound on the number of members that adopt parameters in one call, which costs as much as three members.
+#: Lower bound on the number of members that adopt parameters in one call. A call costs as much as three members.
 _AT_ONCE: Final = 8
 _ALL: Final = slice(None)
 #: Smallest probability of a difference that members have, by definition of the median probability model.

@@ -68,8 +68,8 @@ IDLE_LOAD = 0.05
 #: correct models (seeds 42000 to 42004); of 780 poses of three followed machines, none exceeded it with soft contacts,
 #: and eight with a hard contact
 OUTLYING = 5.0
-#: largest ratio of the residuals to their differences between successive rows, of their scatter between phases of the
-#: load to their scatter within a phase, and of the noise in one part of the window to the noise in the rest [1]
+#: limit of three ratios: residuals to their differences between successive rows; scatter of the residuals between
+#: phases of the load to their scatter within a phase; noise in one part of the window to the noise in the rest [1]
 #: Basis: the ratios are 1 without a fault
 MOST_RATIO = 2.0
 #: largest difference from 1 of the load's gain, or of a cell's gain, that is not suspect [1]
