@@ -111,7 +111,7 @@ def test_forces_of_another_law_make_the_model_suspect(truth: Truth, fitted: tupl
     assert estimated.stiffness == result.stiffness and "remain unexplained" in estimated.reasons[-1]
 
 
-def test_the_law_s_forces_are_those_of_the_solver() -> None:
+def test_the_law_s_forces_agree_with_the_solver() -> None:
     scene = preset("paper")
     scene = replace(scene, contact=Contact(law="hunt_crossley", stiffness=1e7, damping=0.7))
     run = simulate(scene, 1.5, 1e-2, 1e-6)

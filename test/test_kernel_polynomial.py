@@ -26,7 +26,7 @@ def _expected(g: NDArray[np.float64], h: float, floor: float) -> float:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_the_maximum_is_that_of_all_stationary_points_and_ends(seed: int) -> None:
+def test_the_maximum_is_found_among_stationary_points_and_ends(seed: int) -> None:
     random, work = np.random.default_rng(seed), new_work()
     for _ in range(20):
         degree, h = int(random.integers(0, 12)), 10.0 ** random.uniform(-4.0, 1.0)

@@ -93,7 +93,7 @@ def test_kelvin_voigt_agrees_with_the_closed_form() -> None:
 
 
 @pytest.mark.parametrize(("z", "ramp"), [(0.1, 0.1), (0.3, 1.0), (2.0, 0.3)])
-def test_ramped_damping_is_that_of_another_integrator(z: float, ramp: float) -> None:
+def test_ramped_damping_agrees_with_another_integrator(z: float, ramp: float) -> None:
     """SciPy integrates u'' = -max(0, u + 2 z s u') with the ramp s.
 
     This is the law for depths in units of v sqrt(m/K) and times in units of sqrt(m/K).

@@ -38,7 +38,7 @@ def test_gap_functions_are_our_penetrations() -> None:
         assert -siconos.gaps(y, theta) == pytest.approx(depth[[0, 2, 6, 4]], abs=1e-15)
 
 
-def test_touches_are_those_of_the_rigid_mechanism() -> None:
+def test_touches_agree_with_the_rigid_mechanism() -> None:
     """The first five touches, and the speeds after them, are late by the duration of a contact, about K^-1/2."""
     t, states, impacts = siconos.rigid_motion(0.009, 5)
     assert len(impacts) >= 5 and impacts[0] == pytest.approx(2.69e-3, abs=2e-5)

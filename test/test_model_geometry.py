@@ -81,7 +81,7 @@ def test_pose_and_body_coordinates_agree(
     assert rates @ rows[:4] == pytest.approx(difference, abs=1e-7)
 
 
-def test_senses_are_those_of_the_paper() -> None:
+def test_senses_agree_with_the_paper() -> None:
     labels = preset("paper").frame.labels
     stops_ccw = {PAIR_NAMES[i] for i in np.flatnonzero(STOPS_COUNTER_CLOCKWISE)}
     expected = {

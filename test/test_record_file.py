@@ -154,7 +154,7 @@ def test_mcap_reader_finds_ros2_conventions(run: Run) -> None:
             previous = message.log_time
 
 
-def test_metadata_yaml_is_that_of_rosbag2(run: Run) -> None:
+def test_metadata_yaml_agrees_with_rosbag2(run: Run) -> None:
     bag = yaml.safe_load((run.folder / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert (bag["version"], bag["storage_identifier"], bag["ros_distro"]) == (9, "mcap", "jazzy")
     assert bag["relative_file_paths"] == [run.file.name] == [file["path"] for file in bag["files"]]

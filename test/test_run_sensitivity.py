@@ -51,7 +51,7 @@ def bouncing(gamma: float, r: float, stiffness: float) -> Scene:
     )
 
 
-def test_the_exponent_of_a_ball_on_a_vibrating_table_is_that_of_its_map() -> None:
+def test_the_exponent_of_a_ball_on_a_vibrating_table_agrees_with_its_map() -> None:
     """The map of the impacts shrinks areas by r^2 per period. Its two eigenvalues of size r give ln(r) per period."""
     r = 0.5
     result = simulate(bouncing(1.3, r, 1e10), 4.0, sensitivity=True)

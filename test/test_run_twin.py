@@ -37,7 +37,7 @@ def test_sampled_at_1_khz_follows_the_analytic_motion() -> None:
 
 
 @pytest.mark.parametrize("name", ["paper", pytest.param("bench_hc", marks=pytest.mark.stress)])
-def test_impulses_of_all_advances_are_those_of_the_run(name: str) -> None:
+def test_impulses_of_all_advances_agree_with_the_run(name: str) -> None:
     """In steps that begin at a touch, time is counted from the touch; with d^1.5, the series are in its root."""
     exact = simulate(preset(name), 2.0, tol=1e-9)
     expected = [row["impulse"] for row in exact.statistics.values()]

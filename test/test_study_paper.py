@@ -95,7 +95,7 @@ def test_the_command_writes_a_report_a_table_and_the_run(tmp_path: Path, capsys:
     assert "expected a new folder" in " ".join(capsys.readouterr().err.split())
 
 
-def test_forces_are_those_of_the_reconstruction(study: PaperStudy) -> None:
+def test_forces_agree_with_the_reconstruction(study: PaperStudy) -> None:
     expected = {
         "counter-clockwise: largest force, at a": (153.0, 147.60, -0.035, Verdict.AGREES),
         "counter-clockwise: largest mean force, at a": (74.0, 74.99, 0.013, Verdict.AGREES),
@@ -110,7 +110,7 @@ def test_forces_are_those_of_the_reconstruction(study: PaperStudy) -> None:
         assert statement.verdict is verdict
 
 
-def test_trends_are_those_of_the_reconstruction(study: PaperStudy) -> None:
+def test_trends_agree_with_the_reconstruction(study: PaperStudy) -> None:
     vertical, horizontal = (np.round(sweep.on_grid() / 1e3) for sweep in (study.runs.vertical, study.runs.horizontal))
     np.testing.assert_array_equal(vertical[:, 0], [136, 138, 136, 130, 126])
     np.testing.assert_array_equal(vertical[:, 1], [172, 175, 174, 171, 169])
@@ -188,7 +188,7 @@ def test_contact_sets_from_the_events_agree_with_the_solver(study: PaperStudy) -
         assert set(paper_sets.at(timeline, float(study.runs.case.t[index]))) == from_solver
 
 
-def test_published_forces_are_those_of_the_calibration_s_targets() -> None:
+def test_published_forces_agree_with_the_calibration_s_targets() -> None:
     targets = yaml.safe_load((ROOT / "config" / "paper_targets.yaml").read_text())["targets"]
     ours = {f"{force.statistic}.{force.sense}.{force.corner}": force.value_n for force in FORCES}
     assert ours == {target["statistic"]: target["value"] for target in targets if "value" in target}

@@ -51,7 +51,7 @@ def test_every_file_of_the_package_is_installed(metadata: dict[str, Any]) -> Non
     assert {".".join(folder.relative_to(ROOT).parts) for folder in folders} == {*metadata["packages"]}
 
 
-def test_the_lowest_versions_are_those_that_setup_names(metadata: dict[str, Any]) -> None:
+def test_the_lowest_versions_agree_with_setup(metadata: dict[str, Any]) -> None:
     stated: dict[str, str] = {}
     extras = metadata["extras_require"]
     of_tests = [line for line in extras["test"] if re.match("pytest(-xdist)?>", line)]

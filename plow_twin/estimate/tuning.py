@@ -24,7 +24,7 @@ Value = float | int | tuple[Any, ...] | NDArray[np.float64]
 #: largest deviation of an estimated clearance; a rough clearance may have twice this deviation; the limit for a group
 #: of pads, and the smallest reported change within a window, are half of it [m]
 OBSERVED = 1e-3
-#: increase of a clearance from a comparison of motions at which the reach is tested [m]
+#: increase of a clearance with which motions are drawn to test whether the reach of the motion follows [m]
 FARTHER = 3e-3
 #: smallest change of the reach, relative to that of the clearance, for a clearance that is observed [1]
 #: Basis: nine clearances that were 2.6 to 13 mm off: at most 0.40; 11 of 12 of `hard`, `firm`, `middle` and
