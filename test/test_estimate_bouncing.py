@@ -175,7 +175,7 @@ def test_a_contact_of_any_hardness_gives_finite_numbers() -> None:
     poses, _ = Poses.of(np.arange(100) * 0.01, np.zeros((100, 3)))
     two = np.full(2, 1e-2)
     bounced = Bounced(two, two, np.zeros(3), np.ones(3), (-8.0, 500.0), (0.0, 1.0), np.ones(3), 1.0, 1.0, 0.0, -np.inf)
-    text = json.dumps(summarise_bounced(unknowns, poses, bounced, 0, 0).as_dict(), allow_nan=False)
+    text = json.dumps(summarise_bounced(unknowns, poses, bounced, 0).as_dict(), allow_nan=False)
     assert json.loads(text)["stiffness"]["p95"] > 1e9
 
 
@@ -190,7 +190,7 @@ def test_a_motion_like_those_of_another_law_is_suspect_unless_that_law_is_unlike
     two, poses = np.full(2, 1e-3), Poses.of(np.arange(100) * 0.01, 1e-3 * moved)[0]
     logarithms = (-8.0, 0.5), (0.0, 1.0)
     bounced = Bounced(two, 0.1 * two, np.zeros(3), np.ones(3), *logarithms, np.ones(3), 1.0, 1.0, deviate, odds)
-    assert summarise_bounced(Unknowns(preset("paper")), poses, bounced, 0, 0).model == model
+    assert summarise_bounced(Unknowns(preset("paper")), poses, bounced, 0).model == model
 
 
 def test_quantities_hidden_by_a_hard_motion_widen_the_clearances_and_not_the_twins() -> None:
@@ -203,7 +203,7 @@ def test_quantities_hidden_by_a_hard_motion_widen_the_clearances_and_not_the_twi
     zero, narrow = np.zeros(3), np.full(2, 5e-5)
     found = (-12.0, 1.0), (0.0, 1.0), np.ones(3), 1.0, 1.0, 0.0, -np.inf
     bounced = Bounced(truth.clearance, narrow, zero, zero, *found, unseen, rounded)
-    result = summarise_bounced(unknowns, truth.poses, bounced, 0, 0)
+    result = summarise_bounced(unknowns, truth.poses, bounced, 0)
     below, above = (abs(end - result.horizontal.mean) for end in (result.horizontal.p05, result.horizontal.p95))
     assert below > 1.9 * rounded[0] and below > 1.1 * above
     assert result.apparent is not None and result.apparent[0].deviation == pytest.approx(5e-5)
@@ -224,7 +224,7 @@ def test_a_hard_motion_unlike_the_model_is_rough() -> None:
     poses = Poses.of(np.arange(100) * 0.01, 1e-3 * rng.standard_normal((100, 3)))[0]
     found = (-12.0, 1.0), (0.0, 1.0), np.ones(3), 2.0 * tuning.MOST_DISTANCE, 1.0, 0.0, -np.inf
     bounced = Bounced(np.full(2, 0.02), np.full(2, 5e-5), np.zeros(3), np.zeros(3), *found)
-    result = summarise_bounced(Unknowns(preset("paper")), poses, bounced, 0, 0)
+    result = summarise_bounced(Unknowns(preset("paper")), poses, bounced, 0)
     assert result.model == "suspect" and result.horizontal_state is State.ROUGH
     assert result.horizontal.deviation > 2.0 * tuning.UNEXPLAINED_HARD
 
@@ -236,7 +236,7 @@ def test_a_clearance_whose_walls_do_not_limit_the_motion_is_not_observable(devia
     found = (-7.0, 1.0), (0.0, 1.0), np.ones(3), 1.0, 1.0, 0.0, -np.inf
     two = np.full(2, 0.02), np.full(2, deviation)
     bounced = Bounced(*two, np.zeros(3), np.zeros(3), *found, follows=np.array([0.9, 0.4]))
-    result = summarise_bounced(Unknowns(preset("paper")), poses, bounced, 0, 0)
+    result = summarise_bounced(Unknowns(preset("paper")), poses, bounced, 0)
     assert (result.horizontal_state, result.vertical_state) == (horizontal, State.NOT_OBSERVABLE)
     assert result.reasons[-1] == "vertical clearance not observable: the reach follows 40% of a clearance, expected 50%"
 
@@ -247,13 +247,13 @@ def test_a_clearance_at_its_bound_is_not_observable() -> None:
     found = np.zeros(3), np.zeros(3), (-12.0, 1.0), (0.0, 1.0), np.ones(3), 1.0, 1.0, 0.0, -np.inf
     two = np.full(2, 0.02)
     bounced = Bounced(np.array([-2e-3, 0.02]), np.full(2, 5e-5), *found)
-    result = summarise_bounced(Unknowns(preset("paper")), poses, bounced, 0, 0)
+    result = summarise_bounced(Unknowns(preset("paper")), poses, bounced, 0)
     assert result.horizontal_state is State.NOT_OBSERVABLE and result.vertical_state is State.ESTIMATED
     assert result.horizontal.p95 - result.horizontal.p05 > 0.02
     contact = np.ones((4, 8))
     contact[:, [4, 6]] = 0.0  # the head never touches the bottom
     first = Mock(point=Mock(contact=contact))
-    result = summarise_bounced(Unknowns(preset("paper")), poses, replace(bounced, clearance=two), 0, 0, first)
+    result = summarise_bounced(Unknowns(preset("paper")), poses, replace(bounced, clearance=two), 0, first)
     assert result.horizontal_state is State.ESTIMATED and result.vertical_state is State.NOT_OBSERVABLE
 
 

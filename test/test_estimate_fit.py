@@ -91,7 +91,7 @@ def test_a_clearance_at_its_bound_is_not_observable() -> None:
     shared[GX] = LEAST_CLEARANCE
     bound = replace(fit_found, point=replace(fit_found.point, shared=shared))
     for fitted, state in ((fit_found, State.ESTIMATED), (bound, State.NOT_OBSERVABLE)):
-        result = summarise(problem, fitted, Verdict(broken=True), 0)
+        result = summarise(problem, fitted, Verdict(broken=True))
         assert result.horizontal_state is state and result.vertical_state is State.ESTIMATED
     assert result.horizontal.p95 - result.horizontal.p05 > 5e-3
 
@@ -111,7 +111,7 @@ def test_a_wall_that_is_not_touched_is_behind_the_range_of_motion_minus_the_pene
         shared[BIAS] += bias
         problem.window = replace(window, poses=window.poses.moved(bias))
         point = replace(fit_found.point, contact=contact, shared=shared)
-        result = summarise(problem, replace(fit_found, point=point), Verdict(broken=True), 0)
+        result = summarise(problem, replace(fit_found, point=point), Verdict(broken=True))
         problem.window = window
         assert result.horizontal_state is State.NOT_OBSERVABLE
         ends.append(result.horizontal.p05)

@@ -212,7 +212,7 @@ def _columns(problem: Problem, fitted: Fit) -> tuple[dict[str, _Column], Array]:
     column = by_compliance(problem, point)
     if column is not None:
         out["compliance"] = _Column(UNSTATED["compliance"], column, least=0.0)
-    for (wall, pads), part in product(zip(("left", "right", "top", "bottom"), WALLS, strict=True), _of_walls(scene)):
+    for (wall, pads), part in product(WALLS.items(), _of_walls(scene)):
         of_pads, step = np.ones(PAIR_COUNT), problem.steps * _WALL_STEP
         of_pads[list(pads)] += step
         column = by(step, **{part: of_pads})

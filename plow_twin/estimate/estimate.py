@@ -98,7 +98,8 @@ def estimate_window(
     if scene.head.carries == "corners":
         span = (float(load.t[0]), float(load.t[-1]))
         poses = poses.between(span[0], span[1] + 1e-9)
-        return estimate_block(scene, load, poses, prior_of(Unknowns.stated(scene, load, poses), span, lost)), ()
+        found = estimate_block(scene, load, poses, prior_of(Unknowns.stated(scene, load, poses), span))
+        return replace(found, lost=lost), ()
     units = Units.of(scene, load.longest_stretch())
     if units == Units():
         return _estimate(scene, load, poses, lost, guess, gaps, forces)
@@ -119,7 +120,6 @@ def _estimate(
 ) -> tuple[Estimate, Guess]:
     """Return the result of `estimate_window`, with all numbers in the units of the arguments."""
     load, poses, unusable = _usable(load, poses)
-    lost += unusable
     span = float(load.t[0]), float(load.t[-1])
     by_gaps = None if gaps is None else fit_gaps(scene, gaps.between(span[0], span[1] + 1e-9), poses)
     if isinstance(by_gaps, GapsFit) and len(by_gaps.poses.t) and (len(poses.t) < FEWEST_POSES or shortages(poses)):
@@ -127,21 +127,21 @@ def _estimate(
     if forces is not None:
         forces = forces.between(span[0], span[1] + 1e-9)
     try:
-        result, following = _from_motion(scene, load, poses, lost, guess, forces)
+        result, following = _from_motion(scene, load, poses, guess, forces)
         if _unexplained(result) and load.interval() > tuning.COARSEST:
             smooth = load.smooth(0.1 * tuning.COARSEST)
-            other, following = _from_motion(scene, smooth, poses, lost, (), forces)
+            other, following = _from_motion(scene, smooth, poses, (), forces)
             reason = f"load: a sample every {load.interval():.2g} s, expected {tuning.COARSEST:g} s; taken as averages"
             result = replace(other, reasons=(reason, *other.reasons)) if _known(other) else result
     except (np.linalg.LinAlgError, OverflowError) as error:
-        result, following = without_fit(Unknowns(scene), poses, lost, f"the fit cannot be computed: {error}"), ()
+        result, following = without_fit(Unknowns(scene), poses, f"the fit cannot be computed: {error}"), ()
     if forces is not None and result.forces_measured is None:
         result = replace(result, forces_measured=ForcesUsed(unused="the motion is not known moment by moment"))
     if isinstance(by_gaps, GapsFit):
         result = with_gaps(result, by_gaps)
     elif by_gaps is not None:
         result = replace(result, reasons=(*result.reasons, by_gaps))
-    return result, following
+    return replace(result, lost=lost + unusable), following
 
 
 def _usable(load: Load, poses: Poses) -> tuple[Load, Poses, int]:
@@ -169,7 +169,7 @@ def _unexplained(result: Estimate) -> bool:
 
 
 def _from_motion(
-    scene: Scene, load: Load, poses: Poses, lost: int, guess: Guess, forces: ContactForces | None
+    scene: Scene, load: Load, poses: Poses, guess: Guess, forces: ContactForces | None
 ) -> tuple[Estimate, Guess]:
     span = float(load.t[0]), float(load.t[-1])
     unknowns = Unknowns.stated(scene, load, poses)
@@ -178,20 +178,20 @@ def _from_motion(
             f"got {len(poses.t)} poses within the load's span, {span[0]:g} s to {span[1]:g} s, expected at least "
             f"{FEWEST_POSES}"
         )
-        return replace(prior_of(unknowns, span, lost), reasons=(few,)), ()
+        return replace(prior_of(unknowns, span), reasons=(few,)), ()
     short_of = shortages(poses)
     some = well_measured(poses)
     if some is not None and not is_dead(load, some):
-        return _from_some_components(unknowns, load, some, lost, short_of), ()
+        return _from_some_components(unknowns, load, some, short_of), ()
     if short_of:
-        return not_observable(unknowns, poses, lost, short_of), ()
+        return not_observable(unknowns, poses, short_of), ()
     if is_dead(load, poses):
-        return _without_load(unknowns, load, poses, lost), ()
+        return _without_load(unknowns, load, poses), ()
     if is_idle(scene, load, poses):
-        return not_observable(unknowns, poses, lost, ("the head rests under a load that hardly changes",)), ()
+        return not_observable(unknowns, poses, ("the head rests under a load that hardly changes",)), ()
     if rests(poses):
         return without_fit(
-            unknowns, poses, lost, "the head rests under a load that changes: the head or its sensor is stuck"
+            unknowns, poses, "the head rests under a load that changes: the head or its sensor is stuck"
         ), ()
     period = _period(load, poses)
     measured_load, broad = thinned(load, period)
@@ -206,37 +206,33 @@ def _from_motion(
         verdict = judge(*near, period) if near else None
         if near and verdict and not fails(near[1], verdict):
             near, verdict = _with_differences(near, verdict, period)
-            return summarise(*near, verdict, lost, forces), _next_guess(*near)
+            return summarise(*near, verdict, forces), _next_guess(*near)
         forward = Forward(scene, measured_load)
     bias = bias_of_hard(unknowns, poses)
-    if bias.any():
-        result, following = _searched(forward, unknowns, poses.moved(-bias), period, drift, lost, forces)
-        if following:
-            numbers = np.array(following)
-            numbers[BIAS] += bias
-            following = tuple(numbers.tolist())
-        return _moved_back(result, bias), following
-    return _searched(forward, unknowns, poses, period, drift, lost, forces)
+    result, following = _searched(forward, unknowns, poses.moved(-bias), period, drift, forces)
+    if following:
+        numbers = np.array(following)
+        numbers[BIAS] += bias
+        following = tuple(numbers.tolist())
+    return _moved_back(result, bias), following
 
 
-def _without_load(unknowns: Unknowns, load: Load, poses: Poses, lost: int) -> Estimate:
+def _without_load(unknowns: Unknowns, load: Load, poses: Poses) -> Estimate:
     """Return the estimate from the poses alone, without a measured load.
 
     The range of motion is the clearance plus the penetrations at two opposite walls, which are estimated from the
     equations of motion for walls that yield.
     """
-    nothing = without_fit(unknowns, poses, lost, "load: the same value throughout, while the head moves")
+    nothing = without_fit(unknowns, poses, "load: the same value throughout, while the head moves")
     bias = bias_of_hard(unknowns, poses)
     poses = poses.moved(-bias)
     if bounces(unknowns, poses):
-        found = summarise_bounced(unknowns, poses, by_range(unknowns, poses), lost, 0)
+        found = summarise_bounced(unknowns, poses, by_range(unknowns, poses), 0)
         return replace(_moved_back(found, bias), model="suspect", reasons=(*nothing.reasons, *found.reasons))
     return under_uncertain_load(nothing, unknowns, None, poses, float(poses.t[-1] - poses.t[0]) / 10.0)
 
 
-def _from_some_components(
-    unknowns: Unknowns, load: Load, poses: Poses, lost: int, short_of: tuple[str, ...]
-) -> Estimate:
+def _from_some_components(unknowns: Unknowns, load: Load, poses: Poses, short_of: tuple[str, ...]) -> Estimate:
     """Return the estimate from poses in which one or two components were never measured."""
     period = _period(load, poses)
     measured_load, _ = thinned(load, period)
@@ -244,13 +240,13 @@ def _from_some_components(
     drift = 2.0 * time * (share * load.wrench.std(axis=0) / np.asarray(inertias(unknowns.scene))) ** 2
     found = fit_some_components(Forward(unknowns.scene, measured_load), unknowns, poses, period, drift)
     if found is not None:
-        result = summarise(*found, judge(*found, period), lost)
+        result = summarise(*found, judge(*found, period))
         if _known(result):
             return replace(result, reasons=(*short_of, *result.reasons))
     if poses.measured[:2].all():
-        nothing = replace(prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost), reasons=short_of)
+        nothing = replace(prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1]))), reasons=short_of)
         return under_uncertain_load(nothing, unknowns, measured_load, poses, period)
-    return not_observable(unknowns, poses, lost, short_of)
+    return not_observable(unknowns, poses, short_of)
 
 
 def _searched(
@@ -259,7 +255,6 @@ def _searched(
     poses: Poses,
     period: float,
     drift: Array | None,
-    lost: int,
     forces: ContactForces | None,
 ) -> tuple[Estimate, Guess]:
     """Return the estimate from a search or from the comparison of whole motions, without a guess."""
@@ -275,16 +270,16 @@ def _searched(
             bounced = compare(forward, unknowns, poses.moved(-first.shared[BIAS]), period, first.shared)
             bounced = bounced and replace(bounced, bias=bounced.bias + first.shared[BIAS])
     if bounced is not None and (first is None or bounced.ln_penetration[0] < math.log(tuning.FITTED)):
-        return summarise_bounced(unknowns, poses, bounced, lost, forward.work, first), ()
+        return summarise_bounced(unknowns, poses, bounced, forward.work, first), ()
     if first is None:
-        return under_uncertain_load(without_fit(unknowns, poses, lost), unknowns, forward.load, poses, period), ()
+        return under_uncertain_load(without_fit(unknowns, poses), unknowns, forward.load, poses, period), ()
     start = first.shared if bounced is None else _from_bounced(unknowns, first.shared, bounced)
     spent, forward = forward.work, forward.renewed() if bounced else forward
     found = refine(forward, unknowns, poses, period, start, first.noise, drift, close=bounced is not None)
     if bounced is not None and (found is None or not found[1].finished):
-        return summarise_bounced(unknowns, poses, bounced, lost, spent + forward.work, first), ()
+        return summarise_bounced(unknowns, poses, bounced, spent + forward.work, first), ()
     if found is None:
-        return under_uncertain_load(without_fit(unknowns, poses, lost), unknowns, forward.load, poses, period), ()
+        return under_uncertain_load(without_fit(unknowns, poses), unknowns, forward.load, poses, period), ()
     verdict, plain = judge(*found, period), found
     behind = behind_low_pass(*searched) if searched and fails(found[1], verdict) and not verdict.broken else None
     if behind is not None:
@@ -298,7 +293,7 @@ def _searched(
     if bounced is None and fails(found[1], verdict) and not verdict.sensor:
         # a low pass of the sensor or a change of the machine can resemble harmonics
         found, verdict = with_harmonics(*plain, forward.load, period) or (found, verdict)
-    result = summarise(*found, verdict, lost, forces if bounced is None else None)
+    result = summarise(*found, verdict, forces if bounced is None else None)
     if bounced is None and fails(found[1], verdict) and not verdict.broken:
         result = under_uncertain_load(result, unknowns, forward.load, poses, period, found)
     following = () if verdict.model or verdict.sensor or verdict.added else _next_guess(*found)

@@ -43,8 +43,8 @@ _DISPLACED = np.array([2e-4, 2e-4, 1e-3, 5e-3, 5e-3, 3e-2])
 #: Lower bound on the spectral density of an unknown acceleration in m2/s3 and rad2/s3. It changes a rate by 0.1 mm/s or
 #: 0.1 mrad/s in one second, which no sensor resolves.
 _LEAST_DRIFT = 1e-8
-#: Definition of the walls left, right, top and bottom by the indices of two pads. The first pad is top or left.
-WALLS: Final = ((1, 7), (3, 5), (0, 2), (6, 4))
+#: Definition of the walls by the indices of two pads. The first pad is top or left.
+WALLS: Final = {"left": (1, 7), "right": (3, 5), "top": (0, 2), "bottom": (6, 4)}
 #: Definition of the *differences*, the unknowns by which the machine or the sensor differs from the model:
 #:
 #: - `turn_<wall>`: rotation of a wall, expressed as the distance in m by which the first pad in `WALLS` lies farther
@@ -232,7 +232,7 @@ def depth_of(turns: Array) -> Array | None:
     if not turns.any():
         return None
     depth = np.zeros(PAIR_COUNT)
-    for (first, second), turn in zip(WALLS, turns, strict=True):
+    for (first, second), turn in zip(WALLS.values(), turns, strict=True):
         depth[first], depth[second] = 0.5 * turn, -0.5 * turn
     return depth
 
@@ -402,14 +402,16 @@ class Problem:
         """Return the Jacobians of the predicted measurements and of the ends of the swings."""
         rows, ends = np.zeros((len(point.residual), 3, SIZE + OWN)), np.zeros((len(point.defect), 6, SIZE + OWN))
         # only the latest scene is cached, so the derivatives that need the unchanged scene come first
-        displaced = self.steps * _DISPLACED
-        together = self._evaluate(point.shared, point.states + np.diag(displaced)[:, None])
-        for j in range(6):
-            if together is not None:
-                derivatives = _by_state(point, together[j], j, displaced[j])
-            else:
-                derivatives = self._quotient_by_state(point, j, displaced[j])
-            rows[:, :, SIZE + j], ends[:, :, SIZE + j] = derivatives
+        for displaced in (self.steps * _DISPLACED, -self.steps * _DISPLACED):
+            together = self._evaluate(point.shared, point.states + np.diag(displaced)[:, None])
+            if together is None:
+                continue
+            for j, other in enumerate(together):
+                ends[:, :, SIZE + j] = point.defect - other.defect
+                ends[:, j, SIZE + j] += displaced[j]  # `other` displaces the start of the next swing too
+                ends[:, :, SIZE + j] /= displaced[j]
+                rows[:, :, SIZE + j] = np.nan_to_num((point.residual - other.residual) / displaced[j])
+            break
         for j in reversed(MOVING):
             if j != DAMPING or self.unknowns.damped:
                 rows[:, :, j], ends[:, :, j] = self._quotient(point, j)
@@ -472,21 +474,6 @@ class Problem:
                 # a residual is measured minus predicted
                 return np.nan_to_num((point.residual - other.residual) / change), (point.defect - other.defect) / change
         return np.zeros_like(point.residual), np.zeros_like(point.defect)
-
-    def _quotient_by_state(self, point: Point, index: int, step: float) -> tuple[Array, Array]:
-        for signed in (step, -step):
-            moved = point.states.copy()
-            moved[:, index] += signed
-            other = self.evaluate(point.shared, moved)
-            if other is not None:
-                return _by_state(point, other, index, signed)
-        return np.zeros_like(point.residual), np.zeros_like(point.defect)
-
-
-def _by_state(point: Point, other: Point, index: int, moved: float) -> tuple[Array, Array]:
-    ends = point.defect - other.defect
-    ends[:, index] += moved  # `other` displaces the start of the next swing too
-    return np.nan_to_num((point.residual - other.residual) / moved), ends / moved
 
 
 def unmoved_span(noise: Array, drift: Array) -> float:

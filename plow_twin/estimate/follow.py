@@ -635,7 +635,7 @@ def prior(scene: Scene) -> Estimate:
         value = normal[DAMPING]
         damping = Interval(*(unknowns.damping_of(number) for number in (value.mean, value.p05, value.p95)))
     fx, fy, m = normal[GAIN]
-    prior_estimate = replace(prior_of(unknowns, (0.0, 0.0), 0), damping=damping, gain_fx=fx, gain_fy=fy, gain_m=m)
+    prior_estimate = replace(prior_of(unknowns, (0.0, 0.0)), damping=damping, gain_fx=fx, gain_fy=fy, gain_m=m)
     return prior_estimate if units == Units() else units.in_si(prior_estimate, scene)
 
 

@@ -14,7 +14,7 @@ from plow_twin.estimate import tuning
 from plow_twin.estimate.bouncing import Bounced
 from plow_twin.estimate.combined import with_apparent
 from plow_twin.estimate.discrepancy import Graded, graded
-from plow_twin.estimate.fit import Fit, Problem, eliminated, scatter_ratio
+from plow_twin.estimate.fit import WALLS, Fit, Problem, eliminated, scatter_ratio
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.pads import by_group, of_differences
 from plow_twin.estimate.priors import UNSTATED
@@ -45,11 +45,9 @@ MOST_OTHER_LAW = round(float(ndtri(0.99)), 2)
 _HALF_NORMAL_P95 = float(ndtri(0.975))
 #: Bounds on the logarithm of a contact's penetration in m.
 _LN_PENETRATIONS = (math.log(1e-9), math.log(0.12))
-#: Definition of the walls of the cavity by the indices of the two pairs at each wall.
-_SIDES = {"left": (1, 7), "right": (3, 5), "top": (0, 2), "bottom": (4, 6)}
 
 
-def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: ContactForces | None = None) -> Estimate:
+def summarise(problem: Problem, fit: Fit, verdict: Verdict, forces: ContactForces | None = None) -> Estimate:
     """Return the estimate from a fit and from measured contact forces, if any."""
     unknowns, poses = problem.unknowns, problem.window.poses
     finished, suspect = fit.finished, bool(verdict.model or verdict.sensor)
@@ -117,7 +115,6 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
         model="suspect" if verdict.model or verdict.added else "ok",
         sensor="suspect" if verdict.sensor else "ok",
         reasons=tuple(reasons),
-        lost=lost,
         apparent=(apparent[0], apparent[1])
         if all(state.known for state in states) and not np.allclose(spread, deviation[[GX, GY]])
         else None,
@@ -244,7 +241,7 @@ def _scatter(problem: Problem, fit: Fit, variance: Array) -> float:
 
 def _touched(fit: Fit) -> Array:
     """Return the time in s in contact with the less touched of two opposite walls, horizontal and vertical."""
-    left, right, top, bottom = (fit.point.contact[:, pads].sum() for pads in _SIDES.values())
+    left, right, top, bottom = (fit.point.contact[:, pads].sum() for pads in WALLS.values())
     return np.array([min(left, right), min(top, bottom)])
 
 
@@ -271,7 +268,7 @@ def _unseen(fit: Fit) -> Array:
     """
     square = np.zeros(2)
     seconds = fit.point.contact.sum(axis=0)
-    for side, pads in _SIDES.items():
+    for side, pads in WALLS.items():
         if seconds[list(pads)].min() < tuning.TOUCHED:
             square[GX if side in ("left", "right") else GY] += (0.5 * UNSTATED[f"turn_{side}"]) ** 2
     return np.sqrt(square)
@@ -342,7 +339,7 @@ def state_of(withdrawn: bool, observed: bool, rough: bool = False) -> State:
 
 
 def summarise_bounced(
-    unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: int, work: int, first: Fit | None = None
+    unknowns: Unknowns, poses: Poses, bounced: Bounced, work: int, first: Fit | None = None
 ) -> Estimate:
     """Return the estimate for a hard contact. It was found by comparing simulated motions with the measured motion.
 
@@ -413,7 +410,6 @@ def summarise_bounced(
         model="suspect" if model and not sensor else "ok",
         sensor="suspect" if sensor else "ok",
         reasons=tuple(reasons),
-        lost=lost,
         figures={
             "distance": bounced.distance,
             "path": bounced.path,
@@ -463,27 +459,25 @@ def priors(scene: Scene, load: Load, poses: Poses) -> dict[str, Interval]:
     return {"horizontal": normal[GX].above(0.0), "vertical": normal[GY].above(0.0), **numbers}
 
 
-def prior_of(unknowns: Unknowns, span: tuple[float, float], lost: int) -> Estimate:
+def prior_of(unknowns: Unknowns, span: tuple[float, float]) -> Estimate:
     """Return the prior as an estimate."""
     nominal, spread = unknowns.nominal(), unknowns.deviations()
     horizontal, vertical = (Interval.normal(nominal[i], spread[i]).above(0.0) for i in (GX, GY))
     psi = Interval.normal(nominal[SOFTNESS], spread[SOFTNESS])
-    return Estimate(
-        *span, horizontal, vertical, State.PRIOR, State.PRIOR, stiffness=_stiffness(unknowns, psi), lost=lost
-    )
+    return Estimate(*span, horizontal, vertical, State.PRIOR, State.PRIOR, stiffness=_stiffness(unknowns, psi))
 
 
-def not_observable(unknowns: Unknowns, poses: Poses, lost: int, reasons: tuple[str, ...]) -> Estimate:
+def not_observable(unknowns: Unknowns, poses: Poses, reasons: tuple[str, ...]) -> Estimate:
     """Return the prior as an estimate whose clearances are not observable."""
-    nothing, unseen = prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost), State.NOT_OBSERVABLE
+    nothing, unseen = prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1]))), State.NOT_OBSERVABLE
     return nothing.having(nothing.clearances, (unseen, unseen), reasons=reasons)
 
 
 def without_fit(
-    unknowns: Unknowns, poses: Poses, lost: int, reason: str = "no motion of the model is near the measured motion"
+    unknowns: Unknowns, poses: Poses, reason: str = "no motion of the model is near the measured motion"
 ) -> Estimate:
     """Return the prior as a withdrawn estimate."""
-    nothing, withdrawn = prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost), State.WITHDRAWN
+    nothing, withdrawn = prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1]))), State.WITHDRAWN
     return nothing.having(nothing.clearances, (withdrawn, withdrawn), model="suspect", reasons=(reason,))
 
 
