@@ -123,7 +123,7 @@ def test_the_demo_starts_with_the_compiled_estimator_and_ends_when_each_sample_i
     def watching() -> Iterator[tuple[Watch, Callable[[], None]]]:
         yield watch, look
 
-    monkeypatch.setattr("plow_twin.demo.demo._process", process)
+    monkeypatch.setattr("plow_twin.demo.demo.Child", process)
     monkeypatch.setattr("plow_twin.demo.demo._watching", watching)
     assert _run("real", 15.0, tmp_path, Console(quiet=True), True, None) == (watch, 15000)
     assert events[:5] == ["main", "ready 0", "ready 0", "ready 1", "excitation_publisher"]
