@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from figure_checks import check_figure, kept_figures
-from record_support import paper_sample, record_run
+from record_support import STEP_NS, paper_entries, paper_sample, record_run
 from scenes import ROOT, preset
 
 from plow_twin import simulate, simulate_many
 from plow_twin.cli.app import run
 from plow_twin.model.scene import Mark
 from plow_twin.scene_file import dump_scene, load_scene
+from plow_twin.stream.journal import PartOfPose, Pose
 from plow_twin.study.calibration.calibrate import Calibration, Search, calibrate
 from plow_twin.study.calibration.objective import RecordingObjective, TargetObjective
 from plow_twin.study.calibration.pose_recording import PoseRecording, load_poses
@@ -248,3 +249,40 @@ def test_a_fitted_scene_is_written_and_read_unchanged(tmp_path: Path) -> None:
     scene = with_parameters(preset("paper"), {**values, "contact.law": "exact_restitution"})
     (tmp_path / "fit.yaml").write_text(dump_scene(scene))
     assert load_scene(tmp_path / "fit.yaml") == scene
+
+
+def test_measured_poses_of_a_run_are_fitted_instead_of_the_computed_motion(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    samples = [paper_sample(index) for index in range(600)]
+    # the sensor was switched on before the load, and one of its poses has no angle
+    poses = [Pose(sample.stamp_ns - 10 * STEP_NS, (1e-3, 2e-3, 3e-3)) for sample in samples[::20]]
+    poses[5] = PartOfPose(poses[5].stamp_ns, (0, 1), (9e-3, 9e-3))
+    record_run(tmp_path / "run", [entry for pair in zip(samples[::20], poses, strict=True) for entry in pair])
+    measured = load_poses(tmp_path / "run")
+    assert not measured.computed and len(measured.t) == len(poses) - 2 and measured.t[0] == pytest.approx(0.01)
+    np.testing.assert_allclose(measured.q, np.tile((1e-3, 2e-3, 3e-3), (len(measured.t), 1)))
+
+    # without measured poses, or with missing entries, the command says so
+    file = record_run(tmp_path / "alone", samples).file
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(file.read_bytes()[:-1000])
+    arguments = ["study", "calibrate", "paper", "--unknown", "contact.stiffness=9e6:1e7", "--starts", "1", "--screen"]
+    arguments += ["2", "--population", "5", "--generations", "0", "--out", str(tmp_path / "fit"), "-q", "--recording"]
+    assert run([*arguments, str(cut)]) == 3
+    err = capsys.readouterr().err
+    assert "truncated" in err and "the fit is to the motion that the twin computed" in err
+
+
+def test_a_recording_that_is_not_one_motion_from_the_start_is_refused(tmp_path: Path) -> None:
+    record_run(tmp_path / "run", paper_entries(200))
+    with pytest.raises(StudyError, match=r"got 1 changes of motion or model \(Reset\)"):
+        load_poses(tmp_path / "run")
+    # a simulation from 0 to a date would not end
+    table = tmp_path / "dates.csv"
+    table.write_text("t,x,y,theta\n1700000000,0,0,0\n1700000001,0,0,0\n")
+    with pytest.raises(StudyError, match="expected the time since the scene's start"):
+        load_poses(table)
+    table.write_text("t,x,y,theta\n0,0,0,0\n1,0,0\n")
+    with pytest.raises(StudyError, match="data row 2: got '1', '0', '0', expected numbers in all"):
+        load_poses(table)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from plow_twin.cli.console import DONE, output_console, progress, table
-from plow_twin.cli.options import FILE, FOLDER, NEW_FILE, POSITIVE, quiet_option
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, output_console, progress, say_error, say_lost, table
+from plow_twin.cli.options import EXISTING, FOLDER, NEW_FILE, POSITIVE, quiet_option
 from plow_twin.cli.study_options import set_option, study_scene, usage_errors
 from plow_twin.scene_file.presets import config_folder
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @click.command(
     short_help="Fit unknown parameters to published figures or to a recorded motion.",
-    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, scene or targets.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, scene or targets, 3 done, but the recording has losses.",
 )
 @click.argument("scene")
 @click.option(
@@ -43,8 +43,9 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--recording",
-    type=FILE,
-    help="Motion to fit: .csv, .parquet or .npz with t, x, y, theta, or a recording of the node (.mcap).",
+    type=EXISTING,
+    help="Motion to fit: .csv, .parquet or .npz with t, x, y, theta, or a run of plow_twin, whose measured poses are "
+    "used if there are any.",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the random numbers.")
 @click.option("--starts", type=click.IntRange(1), default=8, show_default=True, help="Number of random starts.")
@@ -88,6 +89,7 @@ def calibrate(
     """
     from plow_twin.study.calibration.calibrate import Search
     from plow_twin.study.calibration.fit import write_fit
+    from plow_twin.study.calibration.objective import RecordingObjective
     from plow_twin.study.calibration.unknowns import Space, check_usable, parse_unknown
 
     if plot is not None:
@@ -109,7 +111,7 @@ def calibrate(
         _plot(fit, space, objective, f"Calibration of {scene} to {source}, drawn {datetime.now(UTC):%Y-%m-%d}", plot)
     if not quiet:
         _show(fit, space, out)
-    return DONE
+    return DONE_WITH_LOSS if isinstance(objective, RecordingObjective) and objective.recording.losses else DONE
 
 
 def _merged(proposed: Sequence[str], given: Sequence[str]) -> tuple[str, ...]:
@@ -163,8 +165,14 @@ def _objective(
     if recording is not None:
         poses = load_poses(recording)
         check_poses(poses.t, poses.q, model, recording)
+        say_lost(recording, poses.losses)
+        if poses.computed:
+            say_error(
+                f"plow-twin: {recording}: got no measured pose, so the fit is to the motion that the twin computed"
+            )
         if poses.load is not None:
-            model = replace(model, loads=(poses.load,))
+            marks = {key: mark for key, mark in model.marks.items() if not key.startswith("loads")}
+            model = replace(model, loads=(poses.load,), marks=marks)
         objective = RecordingObjective(model, poses, options["tol"] or 1e-8, workers)
         return model, objective, f"the motion {recording.name}", ()
     path = config_folder() / "paper_targets.yaml" if target == "paper" else Path(target)

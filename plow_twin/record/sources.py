@@ -427,12 +427,16 @@ def read_columns(path: Path, names: Sequence[str]) -> NDArray[np.float64]:
     if not set(names) <= set(columns.names):
         raise RecordingError(f"{path}: got the {columns}, expected {', '.join(names)}")
     places = [columns.names.index(name) for name in names]
-    try:
-        return np.array([[float(row[place]) for place in places] for row in rows], float).reshape(-1, len(names))
-    except RecordingError:
-        raise
-    except (IndexError, ValueError) as error:
-        raise RecordingError(f"{path}: {error}, expected numbers in all of the columns {', '.join(names)}") from error
+    numbers: list[list[float]] = []
+    for row in rows:
+        try:
+            numbers.append([float(row[place]) for place in places])
+        except (IndexError, ValueError):
+            raise RecordingError(
+                f"{path}: data row {len(numbers) + 1}: got {', '.join(map(repr, row))}, expected numbers in all of the "
+                f"columns {', '.join(names)}"
+            ) from None
+    return np.array(numbers, float).reshape(-1, len(names))
 
 
 def _table_rows(path: Path) -> Iterator[list[str]]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 from zipfile import BadZipFile
@@ -13,18 +13,23 @@ from numpy.typing import NDArray
 
 from plow_twin.errors import ExcessError, RecordingError
 from plow_twin.model.scene import Table
+from plow_twin.record.reader import RunReader
 from plow_twin.record.recording import read_recording
 from plow_twin.record.sources import Columns, read_columns
 from plow_twin.run.ensemble import Ensemble
+from plow_twin.stream.journal import Loss, Reset, Restore, SetModel, SetWear
 from plow_twin.study.parameters import StudyError
 
 Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]
 
 COLUMNS: Final = ("t", "x", "y", "theta")
 #: Largest size [B] of the unpacked data of an archive.
 _LARGEST_ARCHIVE: Final = 2**28
 #: Largest number of rows of a simulated motion.
 _MOST_ROWS: Final = 20_000
+#: Smallest time [s] that is treated as a date. Smaller times, before the year 2001, count from an arbitrary start.
+_DATES_S: Final = 1e9
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,10 @@ class PoseRecording:
     source: str = ""
     #: The recorded load, which replaces the loads of the scene.
     load: Table | None = None
+    #: Whether the poses are those that the twin computed, and not measured poses.
+    computed: bool = False
+    #: Numbers of missing messages of a run by topic.
+    losses: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def output_dt(self) -> float:
@@ -65,17 +74,19 @@ class PoseRecording:
 
 
 def load_poses(path: Path) -> PoseRecording:
-    """Read the columns t, x, y, theta from a .csv, .parquet or .npz file, or the poses of a run from an .mcap file.
+    """Read the columns t, x, y, theta from a .csv, .parquet or .npz file, or the poses of a run.
 
-    An .npz file may contain `q`, shape (n, 3), instead of the three columns. Raise `StudyError` if the file cannot be
-    read, or its rows cannot be used.
+    An .npz file may contain `q`, shape (n, 3), instead of the three columns. A run is a folder or an .mcap file. Its
+    measured poses are used if there are any, otherwise the poses that the twin computed. Raise `StudyError` if the file
+    cannot be read, or its rows cannot be used.
     """
-    readers: dict[str, Callable[[Path], tuple[Array, Array, Table | None]]]
-    readers = {".csv": _read_csv, ".parquet": _read_csv, ".npz": _read_npz, ".mcap": _read_mcap}
-    if path.suffix not in readers:
-        raise StudyError(f"recording: got {path.name!r}, expected .csv, .parquet, .npz or .mcap")
+    readers: dict[str, Callable[[Path], PoseRecording]]
+    readers = {".csv": _read_csv, ".parquet": _read_csv, ".npz": _read_npz, ".mcap": _read_run}
+    suffix = ".mcap" if path.is_dir() else path.suffix
+    if suffix not in readers:
+        raise StudyError(f"recording: got {path.name!r}, expected a run, or .csv, .parquet, .npz or .mcap")
     try:
-        t, q, load = readers[path.suffix](path)
+        poses = readers[suffix](path)
     except ExcessError:
         raise
     except RecordingError as error:
@@ -84,6 +95,7 @@ def load_poses(path: Path) -> PoseRecording:
         raise StudyError(f"{path}: {error.strerror or error}") from None
     except (ValueError, AttributeError, MemoryError, BadZipFile, EOFError) as error:  # `np.load` can raise EOFError
         raise StudyError(f"{path}: {error}") from None
+    t, q = poses.t, poses.q
     if t.ndim != 1 or q.shape != (len(t), 3) or len(t) < 2:
         raise StudyError(f"{path}: got t {t.shape} and q {q.shape}, expected (n,) and (n, 3) with n >= 2")
     bad = ~(np.isfinite(t) & np.isfinite(q).all(axis=1))
@@ -91,33 +103,63 @@ def load_poses(path: Path) -> PoseRecording:
         raise StudyError(f"{path}: row {int(np.flatnonzero(bad)[0])}: expected finite numbers")
     if t[0] < 0.0 or (np.diff(t) <= 0.0).any():
         raise StudyError(f"{path}: t: got {t[0]:g} .. {t[-1]:g}, expected increasing times from 0 on [s]")
-    return PoseRecording(t, q, str(path), load)
+    if t[-1] >= _DATES_S:
+        raise StudyError(f"{path}: t: got {t[0]:.10g} .. {t[-1]:.10g}, expected the time since the scene's start [s]")
+    return poses
 
 
-def _read_csv(path: Path) -> tuple[Array, Array, None]:
+def _read_csv(path: Path) -> PoseRecording:
     table = read_columns(path, COLUMNS)
-    return table[:, 0], table[:, 1:], None
+    return PoseRecording(table[:, 0], table[:, 1:], str(path))
 
 
-def _read_npz(path: Path) -> tuple[Array, Array, None]:
+def _read_npz(path: Path) -> PoseRecording:
     with np.load(path, allow_pickle=False) as archive:
         size = sum(member.file_size for member in archive.zip.infolist())
         if size > _LARGEST_ARCHIVE:
             raise ExcessError(f"{path}: unpacks to {size >> 20} MiB, expected at most {_LARGEST_ARCHIVE >> 20} MiB")
         names = list(archive.files)
         if "q" in names and "t" in names:
-            return np.asarray(archive["t"], float), np.asarray(archive["q"], float), None
+            return PoseRecording(np.asarray(archive["t"], float), np.asarray(archive["q"], float), str(path))
         if not set(COLUMNS) <= set(names):
             raise ValueError(f"got the {Columns(tuple(names))}, expected {', '.join(COLUMNS)}")
-        return np.asarray(archive["t"], float), np.column_stack([archive[name] for name in COLUMNS[1:]]), None
+        q = np.column_stack([archive[name] for name in COLUMNS[1:]])
+        return PoseRecording(np.asarray(archive["t"], float), q, str(path))
 
 
-def _read_mcap(path: Path) -> tuple[Array, Array, Table | None]:
-    """Read the poses that the node published (`head_state`), and the load samples that the node used."""
+def _read_run(path: Path) -> PoseRecording:
+    """Read the poses of a run, and the load samples that the twin used."""
+    _check_one_motion(path)
     recording = read_recording(path)
-    (stamps, poses), (sampled, wrench) = recording["head_state"].numpy(), recording["excitation"].numpy()
+    sampled, wrench = _by_stamp(*recording["excitation"].numpy())
+    stamps, poses = recording["head_pose"].numpy()
+    whole = np.isfinite(poses).all(axis=1)
+    computed = not whole.any()
+    stamps, poses = _by_stamp(*recording["head_state"].numpy()) if computed else _by_stamp(stamps[whole], poses[whole])
     origin = recording.header.origin_ns
     if origin is None:
-        origin = int(min(np.append(sampled, stamps), default=0))
+        origin = int(next((times[0] for times in (sampled, stamps) if len(times)), 0))
     load = Table("recorded", 1e-9 * (sampled - origin).astype(float), wrench) if len(wrench) else None
-    return 1e-9 * (stamps - origin).astype(float), poses[:, :3], load
+    during = stamps >= origin  # a sensor may send before the load begins
+    t = 1e-9 * (stamps[during] - origin).astype(float)
+    return PoseRecording(t, poses[during, :3], str(path), load, computed, recording.losses())
+
+
+def _by_stamp(stamp_ns: Stamps, values: Array) -> tuple[Stamps, Array]:
+    """Return rows in order of their stamps. Of rows with equal stamps, the newest replaces the others."""
+    stamps, from_end = np.unique(stamp_ns[::-1], return_index=True)
+    return stamps, values[::-1][from_end]
+
+
+def _check_one_motion(path: Path) -> None:
+    """Check that the motion is continuous from the initial state of the scene on, as a simulation is."""
+    breaks = (Loss, Reset, Restore, SetModel, SetWear)
+    found = [
+        type(entry).__name__
+        for batch in RunReader(path).batches(outputs=False)
+        for entry in batch.entries.others.values()
+        if isinstance(entry, breaks)
+    ]
+    if found:
+        kinds = ", ".join(sorted(set(found)))
+        raise StudyError(f"{path}: got {len(found)} changes of motion or model ({kinds}), expected none")
