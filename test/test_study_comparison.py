@@ -317,3 +317,26 @@ def test_names_of_pads_are_complete_in_eighty_columns(runs: tuple[Run, Run], mon
     compare_verb._show(comparison)
     row = r"│ bottom_right_bottom │ +-99.9M │ +\+99.9M │ +\+100M │ +\+1234M │ +-100M │ +\+0.0M │"
     assert re.search(row, text.getvalue()) and "…" not in text.getvalue()
+
+
+def test_a_new_contact_and_equal_runs_are_named(
+    runs: tuple[Run, Run], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # a load that presses to one side first leaves pads without contact
+    pressed = record_run(tmp_path / "pressed", (Sample(paper_sample(i).stamp_ns, (6e4, 0.0, 0.0)) for i in range(4000)))
+    copy = record_run(tmp_path / "again", (Sample(paper_sample(i).stamp_ns, (6e4, 0.0, 0.0)) for i in range(4000)))
+    folders = [str(run.folder) for run in (pressed, copy, runs[1])]
+    arguments = ["compare", *folders, "--window", "0.25", "--workers", "1"]
+    assert cli([*arguments, "--json", "--out", str(tmp_path / "out")]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["equal"] == ["again"] and not any(facts["appeared"]["again"].values())
+    new = facts["appeared"]["tuesday"]
+    without = [pair for pair in PAIR_NAMES if facts["groups"]["pressed"]["pairs"][pair]["in_contact"]["mean"] == 0.0]
+    touched = [pair for pair in without if facts["groups"]["tuesday"]["pairs"][pair]["in_contact"]["mean"] > 0.0]
+    assert touched and all("peak" in new[pair] for pair in touched)
+    page = (tmp_path / "out" / "compare.html").read_text(encoding="utf-8")
+    assert "<td>new</td>" in page and "All means are the same" in page
+    assert cli(arguments) == 0
+    printed = capsys.readouterr().out
+    assert "again equals pressed: all means are the same" in printed and "tuesday equals" not in printed
+    assert re.search(rf"│ {touched[0]} +│ +new │", printed)

@@ -125,9 +125,13 @@ def _show(comparison: Comparison) -> None:
         names = {"dissipation": "energy", "in_contact": "in contact"}
         quantities = [names.get(quantity, quantity) for quantity in next(iter(by_pair.values()))]
         view = table(f"{name} compared with {first}: change of the means [%]", "pad", *quantities)
+        appeared = comparison.appeared(name)
         for pair, by_quantity in by_pair.items():
-            view.add_row(pair, *map(_text, by_quantity.values()))
+            cells = ("new" if key in appeared[pair] else _text(change) for key, change in by_quantity.items())
+            view.add_row(pair, *cells)
         console.print(view)
+        if comparison.equal(name):
+            console.print(f"{name} equals {first}: all means are the same", highlight=False)
         changes = (f"{axis} {_text(change)}" for axis, change in comparison.clearance_changes[name].items())
         console.print(f"clearance [%]: {', '.join(changes)}", highlight=False)
     console.print(_KEY, highlight=False)
@@ -137,8 +141,8 @@ def _show(comparison: Comparison) -> None:
 _SIGNS: Final = {"chance": "", "machine": "M", "load": "L", "load or machine": "?"}
 _KEY: Final = (
     "M: the machine changed; L: the load changed; ?: the machine or the load changed; no letter: the change may be "
-    "random. All numbers of a table are tested together, so that one letter in twenty is random. Contact is the share "
-    "of samples with force."
+    "random. All numbers of a table are tested together, so that one letter in twenty is random. new: zero in the "
+    "first group only; -: zero in both groups, or too few windows. Contact is the share of samples with force."
 )
 
 

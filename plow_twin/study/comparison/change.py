@@ -26,7 +26,7 @@ _LEVEL: Final = 0.05
 #: Number of windows drawn at once, which limits the memory.
 _AT_ONCE: Final = 2**21
 #: Largest relative difference that is attributed to rounding errors.
-_ROUNDING: Final = 1e-12
+ROUNDING: Final = 1e-12
 #: Largest distance between the starts of two windows, in window lengths, for which the windows are neighbours.
 _NEXT: Final = 1.5
 
@@ -158,7 +158,7 @@ def _tested(differences: Array, mean: Array, fewest: int) -> tuple[Array, Array,
     share, spread = drawn[0], differences[1:].std(axis=0, ddof=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         chance = 2.0 * student.sf(np.abs(differences[0] / spread), fewest - 1)
-    chance[np.abs(share) <= _ROUNDING] = 1.0
+    chance[np.abs(share) <= ROUNDING] = 1.0
     return share, low, high, false_discovery_control(chance) if len(chance) else chance
 
 

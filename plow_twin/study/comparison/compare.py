@@ -14,7 +14,7 @@ import numpy as np
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.recording import read_recording
-from plow_twin.study.comparison.change import Change, Drawn, changes, points, with_neighbours
+from plow_twin.study.comparison.change import ROUNDING, Change, Drawn, changes, points, with_neighbours
 from plow_twin.study.comparison.windows import FULL, QUANTITIES, Windows, windows_of
 
 #: Smallest stamp [ns] that is treated as a date. Smaller stamps, before the year 2001, count from an
@@ -40,6 +40,26 @@ class Comparison:
     scenes: list[str] = field(default_factory=list)
     #: Reasons to doubt the comparison.
     notes: list[str] = field(default_factory=list)
+
+    def appeared(self, group: str) -> dict[str, list[str]]:
+        """Return for each pair the quantities that are 0 in the first group and positive in this group.
+
+        Their relative change is not defined, so `changes` contains None.
+        """
+        first, later = next(iter(self.groups.values())), self.groups[group]
+        new = {
+            name: (first.pairs[name].mean(axis=0) == 0.0) & (later.pairs[name].mean(axis=0) > 0.0)
+            for name in QUANTITIES
+        }
+        return {pair: [name for name in QUANTITIES if new[name][place]] for place, pair in enumerate(PAIR_NAMES)}
+
+    def equal(self, group: str) -> bool:
+        """Return whether the means of load, quantities and clearances of this group equal those of the first group."""
+        first, later = (
+            np.concatenate((windows.load.mean(axis=0), _cells(windows).mean(axis=0)))
+            for windows in (next(iter(self.groups.values())), self.groups[group])
+        )
+        return bool(np.allclose(first, later, rtol=ROUNDING, atol=0.0))
 
     def facts(self) -> dict[str, Any]:
         """Return all results as plain values for JSON."""
@@ -71,6 +91,8 @@ class Comparison:
                 for name, by_pair in self.changes.items()
             },
             "clearance_changes": {name: _facts(by_axis) for name, by_axis in self.clearance_changes.items()},
+            "appeared": {name: self.appeared(name) for name in self.changes},
+            "equal": [name for name in self.changes if self.equal(name)],
         }
 
 
