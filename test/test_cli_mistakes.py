@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from plow_twin.cli.app import run as cli
+from plow_twin.record.chunks import MAGIC
 from plow_twin.scene_file.presets import scene_path
 
 TIMES = np.arange(0.0, 20.0, 0.01)
@@ -22,6 +23,7 @@ LOAD, POSE = ("t", "fx", "fy", "m"), ("t", "x", "y", "theta")
 ALL = (*LOAD, *POSE[1:])
 CALIBRATE = ["study", "calibrate", "paper", "--unknown", "clearance.horizontal_m=0.02:0.03", "--out", "fit"]
 CALIBRATE += ["--recording"]
+LIMITS = ["--limit-horizontal", "35", "--limit-vertical", "40"]
 MAP = ["--map", "own.yaml", "--scene", "paper"]
 
 
@@ -59,6 +61,8 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
             Path(name).write_text("")
         Path("own.yaml").write_text("excitation: {topic: own}\nhead_pose: {topic: own}\n")
         Path("misspelt.yaml").write_text("excitations: {topic: own}\n")
+        Path("begun.mcap").write_bytes(MAGIC[:3])
+        Path("run.mcap").write_bytes(MAGIC + bytes(range(256)))
         Path("knots.yaml").write_text("excitation: {topic: own, unit: {fx: knots}}\n")
     return folder
 
@@ -115,6 +119,14 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["export", "taken", "--to", "csv", "--out", "out"], 1, "taken"),
         (["export", "own.csv", "--to", "xls", "--out", "out"], 2, "is not one of 'csv', 'parquet', 'npz'"),
         (["dashboard", "own.csv"], 1, "own.csv: not an MCAP file"),
+        (["forecast", "begun.mcap", *LIMITS], 1, "begun.mcap: truncated before its first message"),
+        (
+            ["live", "run.mcap", "--scene", "paper"],
+            1,
+            "run.mcap: got an MCAP recording, expected a table; plow-twin an",
+        ),
+        (["setup", "run.mcap"], 1, "run.mcap: got an MCAP recording, expected a table; plow-twin analyse"),
+        (["simulate", "run.mcap", "--t-end", "1"], 2, "a readable scene file (it is an MCAP recording)"),
     ],
 )
 def test_a_mistake_in_a_command_is_reported_in_a_message(

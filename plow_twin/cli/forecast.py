@@ -165,7 +165,8 @@ def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
     from plow_twin.scene_file import load_scene
 
     path = Path(name)
-    reader = RunReader(path) if path.is_dir() else own_run(path) if path.exists() else None
+    run = path.is_dir() or path.suffix == ".mcap"
+    reader = RunReader(path) if run else own_run(path) if path.exists() else None
     if reader is None:
         return load_scene(name), None, {}
     scene, newest = left_by(reader)

@@ -399,12 +399,14 @@ def open_mcap(path: Path) -> IO[bytes]:
         stream = path.open("rb")
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-    if stream.read(len(MAGIC)) != MAGIC:
+    begin = stream.read(len(MAGIC))
+    if begin != MAGIC:
         stream.close()
-        if path.stat().st_size == 0:
+        if MAGIC.startswith(begin):
             # an empty table is not a recording that a killed recorder has left
             kind = RecordingError if path.suffix == ".mcap" else ForeignRecordingError
-            raise kind(f"{path}: empty: its recorder was killed before it wrote anything")
+            state = "truncated before its first message" if begin else "empty"
+            raise kind(f"{path}: {state}: its recorder was killed before it wrote anything")
         table = path.suffix.lower() in _TABLES
         more = "; plow-twin live makes a recording of a table, and commands with --map read a table" if table else ""
         raise ForeignRecordingError(f"{path}: not an MCAP file (its first bytes are not {MAGIC!r}){more}")

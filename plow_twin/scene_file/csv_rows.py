@@ -41,20 +41,29 @@ def tables(folder: Path) -> list[Path]:
     return [files[name] for name in sorted(files)]
 
 
-#: First bytes of files that may be mistaken for CSV files.
+_EXPORT: Final = "UTF-8 (export a spreadsheet as CSV UTF-8)"
+_RECORDING: Final = "a table; plow-twin analyse and plow-twin info read recordings"
+#: First bytes of files that may be mistaken for text: the kind of the file, and what is expected instead.
 _OTHERS: Final = {
-    b"\xff\xfe": "UTF-16 text",
-    b"\xfe\xff": "UTF-16 text",
-    b"PK\x03\x04": "a workbook or another ZIP file",
-    b"\x1f\x8b": "a file compressed by gzip",
+    b"\xff\xfe": ("UTF-16 text", _EXPORT),
+    b"\xfe\xff": ("UTF-16 text", _EXPORT),
+    b"PK\x03\x04": ("a workbook or another ZIP file", _EXPORT),
+    b"\x1f\x8b": ("a file compressed by gzip", _EXPORT),
+    b"\x89MC": ("an MCAP recording", _RECORDING),
+    b"SQLite format 3": ("a recording of rosbag2", _RECORDING),
 }
 
 
+def kind_of(begin: bytes) -> str:
+    """Return the kind of a file with these first bytes if it is not a text file, otherwise an empty text."""
+    return next((kind for first, (kind, _) in _OTHERS.items() if begin.startswith(first)), "")
+
+
 def check_text(begin: bytes) -> None:
-    """Raise a `csv.Error` if the first bytes are those of UTF-16 text, a workbook or an archive."""
-    for first, kind in _OTHERS.items():
+    """Raise a `csv.Error` if the first bytes are those of UTF-16 text, a workbook, an archive or a recording."""
+    for first, (kind, expected) in _OTHERS.items():
         if begin.startswith(first):
-            raise csv.Error(f"got {kind}, expected UTF-8 (export a spreadsheet as CSV UTF-8)")
+            raise csv.Error(f"got {kind}, expected {expected}")
 
 
 def delimiter_of(header: str) -> str:

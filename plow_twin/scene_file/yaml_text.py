@@ -16,6 +16,7 @@ from typing import Any, Final
 import yaml
 
 from plow_twin.errors import Problem
+from plow_twin.scene_file.csv_rows import kind_of
 
 try:  # libyaml is ten times faster for recorded tables, but PyYAML may be built without it
     from yaml import CSafeDumper as _Dumper
@@ -77,9 +78,13 @@ def read_yaml(path: Path, name: str, sections: str) -> tuple[Any, list[Problem]]
         if len(data) > LARGEST_FILE:
             return None, [Problem("file", str(path), f"at most {LARGEST_FILE >> 20} MiB of YAML")]
         text = data.decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8"
-        return None, [Problem("file", str(path), f"a readable {name} file ({reason})")]
+    except OSError as error:
+        return None, [Problem("file", str(path), f"a readable {name} file ({error.strerror})")]
+    except UnicodeDecodeError:
+        kind = kind_of(data)
+        return None, [
+            Problem("file", str(path), f"a readable {name} file ({f'it is {kind}' if kind else 'not UTF-8'})")
+        ]
     return load_yaml(text, name, sections, most_values=MOST_VALUES)
 
 
