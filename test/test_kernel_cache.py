@@ -88,6 +88,23 @@ def test_code_of_other_sources_is_removed(tmp_path: Path) -> None:
     assert old.load("signature") is None
 
 
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+@pytest.mark.parametrize("damage", ["empty", "zeros", "half", "bit"])
+def test_a_damaged_file_is_compiled_and_written_again(suffix: str, damage: str, tmp_path: Path) -> None:
+    """After a loss of power, each command would otherwise end with an error of `pickle`, or run damaged code."""
+    cache_file(tmp_path, "sources").save("signature", "code")
+    (path,) = tmp_path.glob(f"*.{suffix}")
+    whole = path.read_bytes()
+    flipped = bytes(byte ^ (16 * (place == len(whole) - 3)) for place, byte in enumerate(whole))
+    path.write_bytes(
+        {"empty": b"", "zeros": bytes(len(whole)), "half": whole[: len(whole) // 2], "bit": flipped}[damage]
+    )
+    file = cache_file(tmp_path, "sources")
+    assert file.load("signature") is None
+    file.save("signature", "code")
+    assert cache_file(tmp_path, "sources").load("signature") == "code"
+
+
 def test_an_inner_kernel_is_copied_into_each_entry_and_has_no_machine_code(tmp_path: Path) -> None:
     """Separate compilation of such a kernel, in addition to its callers, would take a third of the time.
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import glob
 import hashlib
+import pickle
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -145,22 +146,43 @@ def kept(function: Callable[..., Any], **options: Any) -> Any:
 
 
 def share(cache_file: Any) -> None:
-    """Make numba's disk cache of a function safe for processes that compile at the same time.
+    """Make numba's disk cache of a function safe for processes that compile at the same time, and for damaged files.
 
     Numba numbers the files of machine code, and writes its index before the files, so two processes could store the
     code of one signature under another signature. Here the name of a file is a hash of its content, and the file is
     written before the index. If two processes write the index at the same time, one entry is lost and compiled again.
 
+    Files that were not on the disk at a loss of power are empty or filled with zeros afterwards. An entry whose index
+    cannot be read, or whose code does not have the hash in its name, is compiled and written again.
+
     Parameters
     ----------
     cache_file : numba.core.caching.IndexDataCacheFile
-        Cache file of the function. Its method `save` is replaced.
+        Cache file of the function. Its methods `save`, `load` and `_load_index` are replaced.
     """
     stem = cache_file._index_name.removesuffix("nbi")
+    read_index = cache_file._load_index
+
+    def name_of(code: bytes) -> str:
+        return f"{stem}{hashlib.blake2b(code, digest_size=8).hexdigest()}.nbc"
+
+    def load_index() -> dict[Any, str]:
+        try:
+            return dict(read_index())
+        except Exception:  # `pickle` raises errors of any type for damaged data
+            return {}
+
+    def load(key: Any) -> Any:
+        name = cache_file._load_index().get(key)
+        try:
+            code = b"" if name is None else Path(cache_file._data_path(name)).read_bytes()
+        except OSError:
+            return None
+        return pickle.loads(code) if name == name_of(code) else None
 
     def save(key: Any, data: Any) -> None:
         code = cache_file._dump(data)
-        name = f"{stem}{hashlib.blake2b(code, digest_size=8).hexdigest()}.nbc"
+        name = name_of(code)
         with cache_file._open_for_write(cache_file._data_path(name)) as file:
             file.write(code)
         overloads = cache_file._load_index()
@@ -172,7 +194,7 @@ def share(cache_file: Any) -> None:
         overloads[key] = name
         cache_file._save_index(overloads)
 
-    cache_file.save = save
+    cache_file.save, cache_file.load, cache_file._load_index = save, load, load_index
 
 
 def kept_on_disk() -> bool:
