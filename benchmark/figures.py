@@ -171,6 +171,19 @@ def follow_sum() -> str:
     return table(head, rows)
 
 
+def follow_latency() -> str:
+    """Return the CPU times of live samples with an event, without following and with it."""
+    with (RESULTS / "follow_latency.csv").open(newline="", encoding="utf-8") as file:
+        rows = {(row["contact"], row["follow"], row["event"]): row for row in csv.DictReader(file)}
+    lines = []
+    for event in dict.fromkeys(event for _, _, event in rows):
+        line = [event]
+        for follow, key in (("off", "all_ms"), ("full", "first_ms"), ("full", "all_ms"), ("full", "later_ms")):
+            line.append(", ".join(f"{float(rows[contact, follow, event][key]):.2g}" for contact in ("soft", "hard")))
+        lines.append(line)
+    return table(["event", "`off`: all", "`full`: until the forces", "`full`: all", "`full`: largest later"], lines)
+
+
 def siconos() -> str:
     """Return a table that compares this solver with two references of Siconos for the slider of the literature."""
     with (RESULTS / "siconos.csv").open(newline="", encoding="utf-8") as file:
@@ -199,7 +212,7 @@ def _in_unit(row: dict[str, str], key: str) -> str:
 FIGURES: dict[str, Callable[[], str]] = {
     "machine": machine, "speed": speed, "located": located, "work": work, "missed": missed,
     "random_scenes": random_scenes, "siconos": siconos, "lives": life_table, "lives_sum": life_sum,
-    "month": month_table, "follow": follow_table, "follow_sum": follow_sum,
+    "month": month_table, "follow": follow_table, "follow_sum": follow_sum, "follow_latency": follow_latency,
     **estimate_pages.FIGURES, **measured_pages.FIGURES,
     "measured_sum": measured_sum, "replay": replay, "tuning": tuning_sensitivity.table,
     **{

@@ -24,6 +24,7 @@ from plow_twin import Clearance, Initial, Twin, Wear, simulate
 from plow_twin.estimate.follow import Follower, follower
 from plow_twin.estimate.followed import follow
 from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.members import Ensemble
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.live import diagnostics, parameters
 from plow_twin.live.estimation import problems
@@ -37,6 +38,7 @@ from plow_twin.ros.messages import set_stamp
 from plow_twin.run.batch import TwinBatch
 from plow_twin.scene_file import dump_scene
 from plow_twin.solve.state import FOLLOWED, ROW, WITH_INTERVALS
+from plow_twin.stream.driven import PREPARATION_S
 from plow_twin.stream.journal import (
     Digest,
     Entry,
@@ -218,9 +220,11 @@ def test_without_an_estimate_poses_do_not_move_the_median_twin(truth: Truth, bef
         live.take(_in_turn(machine, 0.0, begin))
         if before != "nothing":
             live.take([_known(truth), *_in_turn(machine, begin, 1.5)])
-            live.take([_known(truth, State.WITHDRAWN)] if before == "withdrawn" else [OTHER])
+            # the twins follow the prior from `PREPARATION_S` after the withdrawal
+            withdrawn = [_known(truth, State.WITHDRAWN), *_in_turn(machine, 1.5, 1.53)]
+            live.take(withdrawn if before == "withdrawn" else [OTHER])
             live.published.clear()
-        live.take(later(machine, begin if before == "nothing" else 1.5, end))
+        live.take(later(machine, {"nothing": begin, "withdrawn": 1.53}.get(before, 1.5), end))
     followed, nominal = with_poses.column("force"), without.column("force")
     assert with_poses.twin.poses.used > without.twin.poses.used + 100
     assert _error(followed, nominal) < 1e-9
@@ -230,9 +234,9 @@ def test_without_an_estimate_poses_do_not_move_the_median_twin(truth: Truth, bef
 def test_wear_continues_from_its_depth_and_widens_the_estimate(truth: Truth) -> None:
     wear = Wear(2e-11, 0.015, 2.0, initial_depth_m=(1e-3,) * 8)
     live = Live(replace(truth.nominal, wear=wear))
-    live.take(_in_turn(truth, 0.0, 2.0))
+    live.take(_in_turn(truth, 0.0, 1.97))
     before = live.session.wear_depth
-    live.take([_known(truth), *_in_turn(truth, 2.0, 2.011)])
+    live.take([_known(truth), *_in_turn(truth, 1.97, 2.011)])
     assert (live.session.wear_depth >= before).all() and before.min() >= 1e-3
     at_first = live.clearance()
     assert at_first[0, 0] == pytest.approx(truth.clearance[0], abs=2e-6)
@@ -391,6 +395,71 @@ def test_twins_that_catch_up_later_give_the_same_bits(truth: Truth) -> None:
 def _late(truth: Truth, t: float) -> list[Sample]:
     first, second = _samples(truth, t - 1e-6, t + 0.0101)[:2]
     return [replace(first, stamp_ns=(first.stamp_ns + second.stamp_ns) // 2)]
+
+
+def _at_1_khz(truth: Truth, begin: float, end: float) -> list[Sample]:
+    t = np.arange(begin, end - 1e-6, 1e-3)
+    wrench = np.stack([np.interp(t, truth.load.t, column) for column in truth.load.wrench.T], axis=1)
+    return [Sample(_stamp(now), (fx, fy, m)) for now, (fx, fy, m) in zip(t.tolist(), wrench.tolist(), strict=True)]
+
+
+def test_twins_of_an_estimate_are_drawn_in_pieces(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
+    draw_piece, prepare, pieces, compiled = Ensemble.draw_piece, Follower._prepare, [0], [0]
+
+    def counted(ensemble: Ensemble) -> bool:
+        more = draw_piece(ensemble)
+        pieces[-1] += more
+        return more
+
+    def made(twins: TwinBatch, *args: Any, **kwargs: Any) -> None:
+        compiled[-1] += kwargs.get("compiled") is None
+        init(twins, *args, **kwargs)
+
+    init = TwinBatch.__init__
+    monkeypatch.setattr(Ensemble, "draw_piece", counted)
+    monkeypatch.setattr(TwinBatch, "__init__", made)
+    entries: list[Entry] = [_known(truth), _known(truth, State.WITHDRAWN), OTHER]
+    digests = []
+    for prepares in (True, False):
+        monkeypatch.setattr(Follower, "_prepare", prepare if prepares else lambda follower: None)
+        live = Live(truth.nominal)
+        live.take(_at_1_khz(truth, 0.0, 0.1))
+        for begin, entry in zip((0.1, 0.2, 0.3), entries, strict=True):
+            pieces[:], compiled[:] = [0], [0]
+            live.take([entry])
+            for sample in _at_1_khz(truth, begin, begin + 0.1):
+                live.take([sample])
+                live.session.catch_up()
+                pieces.append(0)
+                compiled.append(0)
+            assert sum(pieces) >= 4
+            # no sample has the work of two pieces, and none compiles the scenes of all twins with another piece
+            assert (max(pieces[1:]) == 1) == prepares and not any(compiled)
+        digests.append(live.twin.digest())
+    assert digests[0] == digests[1]
+
+
+def test_the_median_twin_of_a_changed_model_goes_on_alone_until_others_join_it(truth: Truth) -> None:
+    live, alone = Live(truth.nominal), Live(truth.nominal, "parameters")
+    for one in (live, alone):
+        one.take([*_at_1_khz(truth, 0.0, 0.1), OTHER, *_at_1_khz(truth, 0.1, 0.2)])
+    followed, due = live.column("followed"), 100 + round(1e3 * PREPARATION_S)
+    assert (followed[:100] == WITH_INTERVALS).all() and (followed[due:] == WITH_INTERVALS).all()
+    assert (followed[100 : due - 1] == FOLLOWED).all()
+    assert _error(live.column("force"), alone.column("force")) < 1e-6
+    width = live.column("force_high")[due:] - live.column("force_low")[due:]
+    assert (width >= 0.0).all() and width.any()
+    assert _again(live.journal, truth.nominal).twin.digest() == live.twin.digest()
+
+
+def test_members_with_overdamped_contact_need_no_other_kernel(truth: Truth) -> None:
+    """Some of the drawn dampings are so large that the kernel of implicit steps would be compiled in the live twin."""
+    twin = Follower(truth.nominal, 128)
+    for drawn in range(20):
+        twin.drawn = drawn
+        twin._draw("", 0.0, np.zeros(len(PAIR_NAMES)))
+        assert twin._ensemble.others is not None
+        assert all(member.parts.implicit is None for member in twin._ensemble.others._compiled)
 
 
 def test_penetrations_of_members_do_not_depend_on_the_centre_of_mass(truth: Truth) -> None:

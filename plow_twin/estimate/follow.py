@@ -42,7 +42,7 @@ from plow_twin.model.scene import Scene
 from plow_twin.run.advance import Advance
 from plow_twin.run.twin import Advanced
 from plow_twin.solve.state import ROW
-from plow_twin.stream.driven import MOST_MEASURED, Learned, PoseCounts
+from plow_twin.stream.driven import MOST_MEASURED, PREPARATION_S, Learned, PoseCounts
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
@@ -108,6 +108,20 @@ class _Behind(NamedTuple):
     begins: bool
 
 
+class _Draft(NamedTuple):
+    """Members that are drawn, perhaps not all yet, from `text`, the JSON of an estimate (empty for the prior)."""
+
+    text: str
+    #: the draw's number, which determines the random numbers
+    drawn: int
+    estimate: Estimate
+    ensemble: Ensemble
+
+    def fits(self, text: str, drawn: int, members: int) -> bool:
+        """Return whether these are the members that would be drawn."""
+        return (self.text, self.drawn, self.ensemble.count) == (text, drawn, members)
+
+
 class Follower:
     """A twin under sampled loads that follows one machine by means of measured poses and estimates.
 
@@ -123,6 +137,8 @@ class Follower:
         Tolerance of the solver, as for `Twin`.
     seed : int
         Seed of the random numbers.
+    alone : bool
+        Whether the first member is alone until the further members have been drawn, `PREPARATION_S` later.
 
     Raises
     ------
@@ -135,7 +151,9 @@ class Follower:
     #: number of advances that `max_evaluations` has cut short, always 0 for a follower
     bounded = 0
 
-    def __init__(self, scene: Scene, members: int = MEMBERS, *, tol: float = TOLERANCE, seed: int = 0) -> None:
+    def __init__(
+        self, scene: Scene, members: int = MEMBERS, *, tol: float = TOLERANCE, seed: int = 0, alone: bool = False
+    ) -> None:
         if members != 1 and members < FEWEST:
             raise ArgumentError(f"members: got {members}, expected 1 or at least {FEWEST}")
         self.scene, self.tol = scene, tol
@@ -157,14 +175,20 @@ class Follower:
         self.poses = PoseCounts()
         #: number of times that members were drawn, and model time in s of the latest draw from an estimate
         self.drawn, self._since = 0, 0.0
-        self._draw("", 0.0, self._unworn())
+        #: members that are drawn in pieces for a later use, and model time in s of the latest piece
+        self._draft: _Draft | None = None
+        self._prepared = 0.0
+        self._draw("", 0.0, self._unworn(), alone=alone)
         #: compiled terms of the nominal scene, as in `Twin`; the draw decides whether members have further terms
         self.signature: tuple[bool, ...] = self._ensemble.first.signature
         self._drop_measurements()
 
     def _drop_measurements(self) -> None:
-        #: poses and estimates in order of time: time in s, sequence number, and the pose or the estimate (JSON)
+        #: poses and estimates in order of time: time in s, sequence number, and the pose or the estimate (JSON). An
+        #: empty text stands for the members that the first member lacks.
         self._due: list[tuple[float, int, list[float] | str]] = []
+        if self._alone:
+            self._due.append((self.time + PREPARATION_S, 0, ""))
         #: times of recently used poses
         self._used: deque[float] = deque()
         self._noise_rows: deque[Array] = deque(maxlen=_NOISE_ROWS[1])
@@ -173,18 +197,50 @@ class Follower:
         wear = self.scene.wear
         return np.zeros(PAIR_COUNT) if wear is None else np.array(wear.initial_depth_m, dtype=np.float64)
 
-    def _draw(self, text: str, time: float, worn: Array) -> None:
-        self._text = text
+    def _draw(self, text: str, time: float, worn: Array, *, alone: bool = False) -> None:
+        """Draw members at the time `time` [s] from an estimate (JSON; empty for the prior), or only the first one."""
+        self._prepared = time
+        draft, self._draft = self._draft, None
+        members = 1 if alone else self._members
+        if draft is None or not draft.fits(text, self.drawn, members):
+            draft = self._begin_draft(text, self.drawn, members, worn)
+        draft.ensemble.start_at(time)
+        self._text, self._ensemble, self._present_estimate = text, draft.ensemble, draft.estimate
         #: the estimate that the members follow; None for the prior
-        self.estimate = Estimate.from_dict(json.loads(text)) if text else None
+        self.estimate = draft.estimate if text else None
         self._load_share = _load_share(text)
-        self._present_estimate = self._prior if self.estimate is None else _whole(self.estimate, self._prior)
-        rng = np.random.default_rng([self._seed, self.drawn])
-        # errors of an uncertain load would distort learned parameters
-        learns = not self._load_share.any()
-        self._ensemble = Ensemble(self.scene, self._present_estimate, self._members, rng, time, self.tol, worn, learns)
         self._ensemble.set_travel_speed(self._speed)
         self._note_clearance()
+
+    def _begin_draft(self, text: str, drawn: int, members: int, worn: Array) -> _Draft:
+        estimate = _whole(Estimate.from_dict(json.loads(text)), self._prior) if text else self._prior
+        rng = np.random.default_rng([self._seed, drawn])
+        # errors of an uncertain load would distort learned parameters
+        learns = not _load_share(text).any()
+        ensemble = Ensemble(self.scene, estimate, members, rng, None, self.tol, worn, learns)
+        return _Draft(text, drawn, estimate, ensemble)
+
+    def _prepare(self) -> None:
+        """Draw a piece of the members that the next waiting estimate will need.
+
+        This changes only when the work is done. Members with wear are not prepared, because they are drawn with the
+        wear at the time of their first use.
+        """
+        self._prepared = self.time
+        latest = self.time + PREPARATION_S
+        waiting = next((item for when, _, item in self._due if when <= latest and isinstance(item, str)), None)
+        text = None if waiting is None or self.scene.wear is not None else self._text_after(waiting)
+        if text is None:
+            self._draft = None
+            return
+        if self._draft is None or not self._draft.fits(text, self.drawn + 1, self._members):
+            self._draft = self._begin_draft(text, self.drawn + 1, self._members, self._unworn())
+        self._draft.ensemble.draw_piece()
+
+    @property
+    def _alone(self) -> bool:
+        """Whether the first member waits for the further members."""
+        return self._ensemble.others is None and self._members > 1
 
     # -- as a `Twin` -------------------------------------------------------------------------------------------------
 
@@ -225,7 +281,7 @@ class Follower:
 
     def like(self, scene: Scene) -> Follower:
         """Return a follower of a scene with the settings and the counters of this follower."""
-        follower = Follower(scene, self._members, tol=self.tol, seed=self._seed)
+        follower = Follower(scene, self._members, tol=self.tol, seed=self._seed, alone=True)
         follower.every_row, follower.defers = self.every_row, self.defers
         follower.poses = self.poses
         return follower
@@ -235,6 +291,8 @@ class Follower:
         begin, before = _time.perf_counter(), self.snapshot()
         self.advance(self.time + 1e-6)
         self._ensemble.start_from(self._ensemble, self._wrench)
+        if self._ensemble.others is not None:
+            self._ensemble.others.warm_up()
         self.restore(before)
         if may_rub(self.scene) and not kept_on_disk():  # the estimating process could not pass on its kernels later
             compile_friction(self.scene, self.tol)
@@ -272,7 +330,7 @@ class Follower:
             raise ArgumentError(f"wrench: got {wrench!r}, expected finite numbers of shape ({len(t)}, 3)")
         alone = self._begins and len(t) == len(self._ends) == 1 and not len(digest_after)
         if self.defers and alone and rows is not None:
-            failed = self._advance_first(t, wrench, rows, _YES if self.steered else _NO, _YES)
+            failed = self._advance_first(t, wrench, rows, _NO if self._ensemble.others is None else _YES, _YES)
             if failed:
                 self.catch_up()
             return Advanced(failed, [])
@@ -317,14 +375,17 @@ class Follower:
             return
         if behind.begins:
             self._ensemble.begin_span()
-        self._ensemble.advance_others(*behind[:-1])
-        ends = behind.wrench.min(axis=0), behind.wrench.max(axis=0)
-        self._range = np.stack([np.minimum(self._range[0], ends[0]), np.maximum(self._range[1], ends[1])])
+        t, wrench, rows, wanted, ends, _ = behind
+        self._ensemble.advance_others(t, wrench, rows, wanted & (not self._alone), ends)
+        least, most = wrench.min(axis=0), wrench.max(axis=0)
+        self._range = np.stack([np.minimum(self._range[0], least), np.maximum(self._range[1], most)])
         if math.floor(self.time * _KNOWN_HZ) != self._cell:
             self._note_clearance()
         while self._due and self._due[0][0] <= self.time:
             when, _, measured = self._due.pop(0)
             self._use(when, measured)
+        if self._due and self.time > self._prepared:
+            self._prepare()
 
     def _stop(self, t: Array, begin: int, digest_after: Container[int]) -> int:
         end = min(begin + _CALL, len(t))
@@ -366,7 +427,12 @@ class Follower:
         self.catch_up()
         self.drawn += 1
         worn = self._unworn() if wear_depth is None else np.array(wear_depth, dtype=np.float64)
-        self._draw("", t, worn)
+        if self._alone and np.array_equal(worn, self._ensemble.worn_before):
+            self._ensemble.start_at(t)
+            self._draft, self._prepared = None, t
+            self._note_clearance()
+        else:
+            self._draw("", t, worn, alone=True)
         self._drop_measurements()
         self._wrench = np.zeros(3)
         self._span_start = t
@@ -398,7 +464,7 @@ class Follower:
             "due": self._due, "used": list(self._used), "speed": self._speed, "cell": self._cell,
             "span": self._span_start, "since": self._since, "worn": self._ensemble.worn_before.tolist(),
             "random": random, "outlying": self._ensemble.outlying, "range": self._range.tolist(),
-            "poses": self.poses, "sizes": [len(blob) for blob in blobs],
+            "poses": self.poses, "alone": self._alone, "sizes": [len(blob) for blob in blobs],
         }  # fmt: skip
         head = json.dumps(facts).encode()
         return b"".join([_LENGTH.pack(len(head)), head, *blobs])
@@ -417,10 +483,10 @@ class Follower:
             blobs.append(data[begin : begin + size])
             begin += size
         worn, self._speed = np.array(facts["worn"]), float(facts["speed"])
-        drawn = facts["drawn"], facts["members"], facts["estimate"], facts["worn"]
-        if drawn != (self.drawn, self._members, self._text, self._ensemble.worn_before.tolist()):
+        drawn = facts["drawn"], facts["members"], facts["estimate"], facts["worn"], facts["alone"]
+        if drawn != (self.drawn, self._members, self._text, self._ensemble.worn_before.tolist(), self._alone):
             self.drawn, self._members = int(facts["drawn"]), int(facts["members"])
-            self._draw(facts["estimate"], 0.0, worn)
+            self._draw(facts["estimate"], 0.0, worn, alone=bool(facts["alone"]))
         self.added, self._cell, self._span_start = int(facts["added"]), int(facts["cell"]), float(facts["span"])
         self._since, self.poses = float(facts["since"]), PoseCounts(*facts["poses"])
         self._due = [(float(when), int(number), measured) for when, number, measured in facts["due"]]
@@ -464,12 +530,18 @@ class Follower:
         if not isinstance(measured, str):
             self._use_pose(measured[0], np.array(measured[1:]))
             return
+        text = self._text_after(measured)
+        if text is not None:
+            self._begin_anew(text)
+
+    def _text_after(self, measured: str) -> str | None:
+        """Return the estimate (JSON; empty for the prior) from which `measured` lets members be drawn, or None."""
+        if not measured:
+            return self._text if self._alone else None
         result = Estimate.from_dict(json.loads(measured))
         if State.WITHDRAWN in (result.horizontal_state, result.vertical_state):
-            if self.estimate is not None:
-                self._begin_anew("")
-        elif self._is_replaced_by(result):
-            self._begin_anew(measured)
+            return "" if self.estimate is not None else None
+        return measured if self._is_replaced_by(result) else None
 
     def _is_replaced_by(self, estimate: Estimate) -> bool:
         new = (estimate.horizontal_state, estimate.vertical_state)
@@ -487,8 +559,13 @@ class Follower:
         """Return the estimate, the steering and the counts, which `learn` sets after a change of the motion.
 
         The harmonics of the load in the estimate wait for `begin_at`, because their phases depend on the model time,
-        which began at the stamp `origin_ns` [ns].
+        which began at the stamp `origin_ns` [ns]. Waiting estimates are used at once, for the change would drop them.
         """
+        self.catch_up()
+        waiting = [item for item in self._due if isinstance(item[2], str)]
+        self._due = [item for item in self._due if item not in waiting]
+        for when, _, measured in waiting:
+            self._use(when, measured)
         return Learned(_waiting(self._text, origin_ns), self.steered, self.poses)
 
     def learn(self, learned: Learned) -> None:
@@ -510,11 +587,11 @@ class Follower:
             self._begin_anew(json.dumps(facts))
 
     def _begin_anew(self, text: str) -> None:
-        before = self._ensemble
+        before, joins = self._ensemble, self._alone and text == self._text
         self.drawn += 1
         self._since = self.time
         self._draw(text, self.time, self.wear_depth)
-        self._ensemble.start_from(before, self._wrench)
+        self._ensemble.start_from(before, self._wrench, joins=joins)
 
     def follow_parameters(self) -> None:
         """Continue from the state of the median twin with a single twin that poses do not move."""
@@ -523,7 +600,7 @@ class Follower:
         self._begin_anew(self._text)
 
     def _use_pose(self, t: float, q: Array) -> None:
-        if not self.steered or any(abs(t - used) < APART_S for used in self._used):
+        if self._ensemble.others is None or any(abs(t - used) < APART_S for used in self._used):
             return
         newest = not self._used or t > max(self._used)
         self._used.append(t)

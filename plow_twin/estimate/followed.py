@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -130,6 +130,8 @@ class _Steps:
         #: numbers of rows on the grid of `dt`, of added poses and of added gaps
         self._count = self._poses_added = self._gaps_added = 0
         self._span = span
+        #: number of draws of the members so far
+        self._drawn = self._follower.drawn
         self.taken_over: list[TakenOver] = []
         self.spans: list[Span] = []
 
@@ -141,6 +143,9 @@ class _Steps:
             if first:
                 self._add_poses(self._stamps[part][-1])
             yield from self._advance(part, dt)
+            if self._follower.drawn != self._drawn:
+                self._drawn = self._follower.drawn
+                self.taken_over[-1] = replace(self.taken_over[-1], taken=True)
             if self._span is not None and self._follower.time >= (len(self.spans) + 1) * self._span:
                 self.spans.append(self._follower.span())
             self._add_gaps(float(self._load.t[part][-1]))
@@ -188,9 +193,10 @@ class _Steps:
         result, following = estimate_window(
             self._scene, window.load, window.pose, window.lost, self._guess, window.gaps
         )
-        bounds, before = (window.start_ns, window.end_ns, window.samples, window.poses), self._follower.drawn
+        bounds = window.start_ns, window.end_ns, window.samples, window.poses
         self._session.apply(Estimated(*bounds, self._guess, (0.0,) * 6, json.dumps(result.as_dict())))
-        self.taken_over.append(TakenOver(self._follower.time, result, self._follower.drawn != before))
+        # twins are drawn `PREPARATION_S` later
+        self.taken_over.append(TakenOver(self._follower.time, result, taken=False))
         self._guess = following
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import compress
 from typing import Any, Final
@@ -27,11 +27,12 @@ from plow_twin.estimate.forces import FEWEST, amplitudes_of, draw_biases, draw_s
 from plow_twin.estimate.learned import Learner, biases_of, numbers_of, with_numbers
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.unknowns import QUANTITIES
-from plow_twin.model.geometry import penetration_rows, penetrations_at_centre, states_of, wall_distances
+from plow_twin.model.geometry import factors_of, penetration_rows, penetrations_at_centre, wall_distances
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import DOF_NAMES, Friction, Gravity, Scene, Wear, fastest_travel, variants
 from plow_twin.run.batch import TwinBatch
 from plow_twin.run.twin import Twin
+from plow_twin.solve.compiled_scene import compile_scene, compile_scenes, options
 from plow_twin.solve.state import ADVANCE, FOLLOWED, WITH_INTERVALS
 from plow_twin.stream.driven import MOST_STEPS
 from plow_twin.stream.outputs import clearances
@@ -48,13 +49,15 @@ _MOST_OUTLYING: Final = 5
 #: Lower bound on the number of members that adopt parameters in one call. A call costs as much as three members.
 _AT_ONCE: Final = 8
 _ALL: Final = slice(None)
+#: Accuracy of the share by which a pose is scaled, by definition: of a clearance of 100 mm, it is a nanometre.
+_SHARE: Final = 1e-8
+#: Distance of a share from its linear interpolation over a unit of the share. It was chosen for fewest passes.
+_CURVED: Final = 0.1
 #: Smallest probability of a difference that members have, by definition of the median probability model.
 _PROBABLE: Final = 0.5
 #: Lower bound on the friction coefficient of a member, because all members must have the same terms.
 _LEAST_FRICTION: Final = 1e-3
 _THETA: Final = DOF_NAMES.index("theta")
-#: Indices of cos(theta), sin(theta), X and Y in the state of the solver, derived from its layout.
-_PLACES: Final = (5, 6, 0, 1)
 
 
 class Ensemble:
@@ -70,8 +73,9 @@ class Ensemble:
         Number of twins.
     rng : numpy.random.Generator
         Generator of the random numbers.
-    start : float
-        Time in s of the scene's initial state.
+    start : float or None
+        Time in s of the scene's initial state. With None, the members are not drawn yet: `draw_piece` draws a part of
+        them, and `start_at` must be called before the ensemble is used.
     tol : float
         Tolerance of the solver.
     worn : ndarray, shape (8,)
@@ -81,13 +85,28 @@ class Ensemble:
     """
 
     def __init__(
-        self, scene: Scene, estimate: Estimate, members: int, rng: np.random.Generator, start: float, tol: float,
+        self, scene: Scene, estimate: Estimate, members: int, rng: np.random.Generator, start: float | None, tol: float,
         worn: Array, learns: bool = True,
     ) -> None:  # fmt: skip
+        self.count = members
+        self._pieces = self._draw(scene, estimate, members, rng, tol, worn, learns)
+        if start is not None:
+            self.start_at(start)
+
+    def draw_piece(self) -> bool:
+        """Draw the next of five parts, and return whether there was a part left."""
+        return next(self._pieces, False)
+
+    def _draw(
+        self, scene: Scene, estimate: Estimate, members: int, rng: np.random.Generator, tol: float, worn: Array,
+        learns: bool,
+    ) -> Iterator[bool]:  # fmt: skip
+        """Draw the members, and yield True after each part."""
         differ = rubs(scene, estimate)
         if differ:
             scene = replace(scene, friction=scene.friction or Friction(0.0))
         scenes, gain = draw_scenes(scene, estimate, members, rng) if members > 1 else ([scene], np.ones((1, 3)))
+        yield True
         scenes[0], gain[0] = middle_of(scene, estimate)
         if differ:
             scenes = _with_friction(scenes, estimate, rng)
@@ -102,19 +121,32 @@ class Ensemble:
             self.moved_before = np.where([[state.known] for state in states], widening(scene, worn)[:, None], 0.0)
             scenes = _worn(scenes, replace(scene.wear, initial_depth_m=tuple(worn.tolist())), self.moved_before)
         #: the first member, which is advanced alone so that its forces are available first
-        self.first = Twin(scenes[0], tol=tol, excitation="sampled", start=start, max_steps=MOST_STEPS)
-        self.others = TwinBatch(scenes[1:], tol=tol, start=start, max_steps=MOST_STEPS) if members > 1 else None
+        self.first = Twin(scenes[0], tol=tol, excitation="sampled", max_steps=MOST_STEPS)
+        yield True
+        self.others: TwinBatch | None = None
+        if members > 1:
+            compiled = compile_scenes(scenes[1:], tol, sampled=True, kind=options(scenes[1]))
+            yield True
+            stiff = [member.parts.implicit is not None for member in compiled[1]]
+            if any(stiff) and compile_scene(scenes[0], tol, sampled=True).parts.implicit is None:
+                # a live twin has no time to compile the kernel of overdamped contacts, which are improbable here
+                contact = scenes[0].contact
+                rest = [
+                    replace(scene, contact=contact) if is_stiff else scene
+                    for scene, is_stiff in zip(scenes[1:], stiff, strict=True)
+                ]
+                scenes = [scenes[0], *rest]
+                compiled = compile_scenes(rest, tol, sampled=True, kind=options(rest[0]))
+                yield True
+            self.others = TwinBatch(scenes[1:], tol=tol, max_steps=MOST_STEPS, compiled=compiled)
+            yield True
         self._scene, self._gain, self._rng, self._speed = scene, gain, rng, 0.0
         self._numbers = numbers_of(scenes, gain, draw_biases(estimate, members, rng))
-        # index of the next member that adopts learned parameters, and number of members that are due
         learns = learns and self._steers_first and members > 1
-        self._learner = Learner.of(self._numbers.copy(), start) if learns else None
-        self._turn, self._waiting = 0, 0.0
+        self._learner = Learner.of(self._numbers.copy(), 0.0) if learns else None
         # harmonics that the measured load lacks, and their amplitudes of each member in N, N, N m, shape (m, k, 3)
         self._harmonics = estimate.load_harmonics
         self._amplitude = amplitudes_of(estimate, members, rng)
-        # load error of each member in N, N, N m, and its time in s
-        self._load_off, self._drifted = np.zeros((members, 3)), start
         self._walls = np.repeat(penetration_rows(scene)[None], members, axis=0)
         self._walls[:, 4] = penetrations_at_centre(scene, wall_distances(scenes))
         self._clearance = _clearance_of(scenes)
@@ -124,19 +156,36 @@ class Ensemble:
             scene.contact.exponent,
         )
         self._pressed = tuning.PRESSED * scene.head.mass_kg * Gravity().acceleration_m_s2
+        # whether each degree of freedom is free
+        self._free = np.array(scene.free)
+
+    def start_at(self, t: float) -> None:
+        """Draw all further parts, and set all members to the initial state of the scene at the time `t` [s]."""
+        while self.draw_piece():
+            pass
+        members = self.count
+        self.first.reset(t)
+        if self.others is not None:
+            self.others.reset(t)
+        # index of the next member that adopts learned parameters, and number of members that are due
+        self._turn, self._waiting = 0, 0.0
+        if self._learner is not None:
+            self._learner.time = t
+        # load error of each member in N, N, N m, and its time in s
+        self._load_off, self._drifted = np.zeros((members, 3)), t
         self.good = np.ones(members, dtype=bool)
         #: force, and peak and impulse of the span, of each pair of each member
         self._sums = np.zeros((members, 3, PAIR_COUNT))
         self._peak, self._impulse = self._sums[:, 1], self._sums[:, 2]
         #: sum of the squared normalised innovations of each member
         self.square = np.zeros(members)
-        # whether each degree of freedom is free, and number of consecutive outliers
-        self._free = np.array(scene.free)
+        #: number of consecutive outliers
         self.outlying = 0
         # `_path`: recent times in s and poses (m, 3) in order of time
         # `_v`, `worn`, `_depth`: present rates (m, 3), wear depths (m, 8) and penetrations (m, 8)
-        self._path: deque[tuple[float, Array]] = deque([(start, np.tile(np.array(scene.initial.q), (members, 1)))])
-        self._v, self.worn = np.tile(np.array(scene.initial.v), (members, 1)), np.tile(worn, (members, 1))
+        initial = self._scene.initial
+        self._path: deque[tuple[float, Array]] = deque([(t, np.tile(np.array(initial.q), (members, 1)))])
+        self._v, self.worn = np.tile(np.array(initial.v), (members, 1)), np.tile(self.worn_before, (members, 1))
         self._depth = self._penetration(self._path[-1][1])
         #: newest rows of all members, from which `settle` copies the state
         self._newest: Rows | None = None
@@ -264,15 +313,18 @@ class Ensemble:
             out[axis] = values[order[np.searchsorted(share, [0.5, 0.05, 0.95]).clip(0, len(order) - 1)]]
         return out
 
-    def start_from(self, before: Ensemble, wrench: Array) -> None:
+    def start_from(self, before: Ensemble, wrench: Array, *, joins: bool = False) -> None:
         """Start from the state of the members `before`, under the load `wrench`.
+
+        If `joins` is set, further members join the first member, whose state does not change.
 
         The poses are scaled to the clearances. Measured poses move the second member under a prior, and the first
         member under an estimate. If an estimate replaces a prior, the new first member therefore starts at the pose of
         the old second member, and vice versa.
         """
         before.settle()
-        from_ = np.where(before.good, np.arange(len(before.good)), int(np.argmax(before.good)))[: len(self.good)]
+        from_ = np.where(before.good, np.arange(len(before.good)), int(np.argmax(before.good)))
+        from_ = np.resize(from_, len(self.good))
         if self._steers_first and not before._steers_first and len(before.good) > 1 and before.good[1]:
             from_[0] = 1
         if before._steers_first and not self._steers_first and before.good[0]:
@@ -283,9 +335,11 @@ class Ensemble:
         self.first.advance(self.first.time, loads[0])
         if self.others is not None:
             self.others.set_wrench(loads[1:])
-        self._path = deque((t, q[from_] * share) for t, q in before._path)
+        self._path = _scaled(before._path, from_, share)
         self._sums[1:], self._sums[0] = before._sums[from_[1:]], before._sums[0]
         self._move_toward(self._path[-1][1], before._v[from_], before._force(before._depth)[from_])
+        if joins:
+            self.first = before.first
         if self._learner is not None and before._learner is not None:
             self._learner.take_over(before._learner)
             self._take_numbers(np.arange(len(self.good)))
@@ -312,14 +366,35 @@ class Ensemble:
         """Move members toward the poses `q` until a pair would bear much more than `force` [N], shape (m, 8)."""
         which = np.arange(len(q)) if which is None else which
         q, v, force = q[which], v[which], force[which]
+        share, bound = np.ones(len(q)), np.flatnonzero(~self._allowed(q, force, which))
+        if len(bound):
+            share[bound] = self._largest_share(q[bound], force[bound], which[bound])
+        self._put(which, self._nearer(q, share), v)
+
+    def _largest_share(self, q: Array, force: Array, which: NDArray[np.int64]) -> Array:
+        """Return the largest share, (m,), by which poses may be scaled so that no pair bears much more than `force`.
+
+        The share lies between `low` and `high`. Each pass tries their middle, and both sides of the share at which a
+        pair would reach the force if its penetration were linear in the share.
+        """
+        limit = ((force + self._pressed) / self._stiffness[which, None]) ** (1.0 / self._exponent)
         low, high = np.zeros(len(q)), np.ones(len(q))
-        free = self._allowed(q, force, which)
-        low[free] = 1.0
-        for _ in range(40) if not free.all() else ():
-            share = 0.5 * (low + high)
-            allowed = self._allowed(self._nearer(q, share), force, which)
-            low, high = np.where(allowed, share, low), np.where(allowed, high, share)
-        self._put(which, self._nearer(q, low), v)
+        while (high - low).max() > _SHARE:
+            ends = self._penetrations(q, np.stack([low, high]), which)
+            growth, reached = ends[1] - ends[0], ends[1] >= limit
+            part = np.divide(limit - ends[0], growth, out=np.ones_like(growth), where=reached & (growth > 0.0))
+            width = high - low
+            cut, curved = low + width * part.min(axis=1).clip(0.0, 1.0), np.maximum(_CURVED * width**2, 0.5 * _SHARE)
+            tried = np.stack([cut - curved, cut + curved, 0.5 * (low + high)]).clip(low, high)
+            allowed = (self._penetrations(q, tried, which) < limit).all(axis=2)
+            low = np.where(allowed, tried, low).max(axis=0)
+            high = np.where(allowed, high, tried).min(axis=0)
+        return low
+
+    def _penetrations(self, q: Array, share: Array, which: NDArray[np.int64]) -> Array:
+        """Return the penetrations in m, shape (k, m, 8), at the poses `q`, (m, 3), scaled by shares, (k, m)."""
+        places = self._nearer(np.tile(q, (len(share), 1)), share.ravel())
+        return self._penetration(places, np.tile(which, len(share))).reshape(*share.shape, PAIR_COUNT)
 
     def _nearer(self, q: Array, share: Array) -> Array:
         """Return poses that are scaled toward the middle by `share`, shape (m,), in the free directions."""
@@ -455,7 +530,7 @@ class Ensemble:
         from_ = np.arange(len(self.good))
         from_[lost] = np.resize(good_members, len(lost))
         share = self._shares(self._room()[from_])
-        self._path = deque((t, q[from_] * share) for t, q in self._path)
+        self._path = _scaled(self._path, from_, share)
         self._move_toward(self._path[-1][1], self._v[from_], self._force(self._depth)[from_], lost)
 
     def _force(self, depth: Array, which: NDArray[np.int64] | slice = _ALL) -> Array:
@@ -479,9 +554,7 @@ class Ensemble:
 
     def _penetration(self, q: Array, which: NDArray[np.int64] | slice = _ALL) -> Array:
         """Return the penetration of each pair in m, shape (m, 8), for some members at poses `q`, shape (m, 3)."""
-        state = states_of(self._scene, np.concatenate([q, np.zeros_like(q)], axis=1))
-        body = np.concatenate([state[:, _PLACES], np.ones((len(q), 1))], axis=1)
-        depth: Array = np.einsum("mi,mij->mj", body, self._walls[which]) - self.worn[which]
+        depth: Array = np.einsum("mi,mij->mj", factors_of(self._scene, q), self._walls[which]) - self.worn[which]
         return depth
 
     def twins(self) -> list[bytes]:
@@ -527,6 +600,12 @@ class Ensemble:
         self.set_twins(blobs[:2])
         self._path = deque(zip(times.tolist(), path.reshape(-1, count, 3), strict=True))
         self._rng.bit_generator.state = random
+
+
+def _scaled(path: Iterable[tuple[float, Array]], from_: NDArray[np.int64], share: Array) -> deque[tuple[float, Array]]:
+    """Return a path with the poses of the members `from_`, shape (m,), scaled by `share`, shape (m, 3)."""
+    times, poses = zip(*path, strict=True)
+    return deque(zip(times, np.stack(poses)[:, from_] * share, strict=True))
 
 
 def _bytes(rows: Rows) -> NDArray[np.uint8]:

@@ -232,6 +232,20 @@ def states_of(scene: Scene, states: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([state_of(scene, row[:3], row[3:]) for row in states]).reshape(-1, STATE_SIZE)
 
 
+def factors_of(scene: Scene, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the factors c, s, X, Y and 1 of `penetration_rows` at the poses `q`, shape (m, 3); shape (m, 5)."""
+    factors = np.ones((len(q), 5))
+    if scene.head.carries != "walls":
+        state = states_of(scene, np.concatenate([q, np.zeros_like(q)], axis=1))
+        factors[:, :2], factors[:, 2:4] = state[:, 5:7], state[:, :2]
+        return factors
+    x, y, theta = q.T
+    c, s = np.cos(theta), np.sin(theta)
+    rx, ry = scene.head.com_offset_m
+    factors[:, 0], factors[:, 1], factors[:, 2], factors[:, 3] = c, s, c * x + s * y + rx, -s * x + c * y + ry
+    return factors
+
+
 def largest_angle(scene: Scene) -> float:
     """Return the largest angle in rad, up to 45 degrees, to which the frame can turn in an unworn cavity."""
     radius = corner_radius(scene)

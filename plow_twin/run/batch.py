@@ -76,6 +76,8 @@ class TwinBatch:
         Largest number of steps of an advance of one twin (see `Twin`).
     max_wall_s : float
         Largest wall-clock time in s of a call that advances the twins.
+    compiled : tuple, optional
+        Result of `compile_scenes` for the same scenes and tolerance, if they have been compiled before.
 
     Raises
     ------
@@ -102,13 +104,14 @@ class TwinBatch:
         workers: int = 1,
         max_steps: int = DEFAULT_BUDGET,
         max_wall_s: float = MOST_SECONDS,
+        compiled: tuple[NDArray[np.void], list[CompiledScene]] | None = None,
     ) -> None:
         check_limits(max_steps, max_wall_s)
         if not scenes:
             raise ArgumentError("scenes: got no scene, expected at least one")
         self.scenes = tuple(scenes)
         self.tol = tol
-        self._params, self._compiled = compile_scenes(scenes, tol, sampled=True, kind=options(scenes[0]))
+        self._params, self._compiled = compiled or compile_scenes(scenes, tol, sampled=True, kind=options(scenes[0]))
         terms = _merge(self._compiled)
         self._stick = terms.stick
         self._states = new_records(state_type(self._compiled[0].parts.terms), len(scenes))
@@ -141,6 +144,19 @@ class TwinBatch:
     def signature(self) -> tuple[bool, ...]:
         """Terms of the equations, as in `Twin.signature`. Batches with equal terms share their compiled code."""
         return _signature(self._workers[0].parts, self.scenes[0])
+
+    def warm_up(self) -> None:
+        """Compile every kernel that the twins may need, or load it from the disk cache. The twins are unchanged.
+
+        Twins in lanes need the kernel of a twin without lanes only for rare steps.
+        """
+        saved = self.snapshot()
+        self.advance(self.time + 1e-6)
+        self.restore(saved)
+        worker, times, member = self._workers[0], np.array([self.time]), slice(0, 1)
+        line = self._ends(self._samples_before()[:, None], member)
+        records = self._params[member], self._states[member].copy()
+        worker.advance(*records, 0, 1, times, line, self._max_steps, np.zeros((1, 1), ROW))
 
     def set_wrench(self, wrench: ArrayLike) -> None:
         """Set the initial samples of the load. The load is interpolated linearly between samples.

@@ -18,6 +18,8 @@ from plow_twin.solve.state import TOTALS, Terms, new_records
 _SLICE: Final = 256
 
 _Array = NDArray[np.float64]
+#: Compiled code by the types of the records and by the terms, which determine the types of all arguments.
+_entries: dict[tuple[object, ...], Callable[..., bool]] = {}
 
 
 class LaneTwins:
@@ -76,6 +78,7 @@ class LaneTwins:
         """
         self._place[:], self.stale = 0, False
         terms = self._terms
+        flags = terms.viscous, terms.hysteretic, *forces(terms), terms.rest
         while True:
             self._progress[:] = self._start
             samples = Samples(
@@ -83,11 +86,13 @@ class LaneTwins:
                 self._progress, self._other,
             )  # fmt: skip
             arguments = (
-                samples, terms.viscous, terms.hysteretic, *forces(terms), terms.rest, self._order, self._lanes,
-                self._work, self._max_steps, _SLICE,
+                samples, *flags, self._order, self._lanes, self._work, self._max_steps, _SLICE,
             )  # fmt: skip
             if self._kernel is None:
-                self._kernel = for_arguments(advance_lanes, arguments)
+                key = self._params.dtype, states.dtype, flags
+                if key not in _entries:
+                    _entries[key] = for_arguments(advance_lanes, arguments)
+                self._kernel = _entries[key]
             pace.run(self._kernel, arguments)
             if self._progress[OTHERS] == 0:
                 return

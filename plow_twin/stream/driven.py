@@ -17,6 +17,9 @@ Array = NDArray[np.float64]
 #: Largest number of measured poses that are stored for a repeated computation of the motion. It is reached after ten
 #: seconds at 1 kHz.
 MOST_MEASURED: Final = 10_000
+#: Time in s from an estimate, or a change of the model, until the twins drawn from it are used. It spreads the work of
+#: the draw over 20 samples at 1 kHz.
+PREPARATION_S: Final = 0.02
 #: Number of steps after which an advance of a live twin fails. They take two to three seconds, in which the node
 #: answers no request. A motion with impacts needs up to 2,000 steps a second, with contacts of 1e7 to 1e18 N/m.
 MOST_STEPS: Final = 2_000_000
@@ -101,7 +104,10 @@ class Following(Driven, Protocol):
         """
 
     def add_estimate(self, text: str, t: float, start: float = ...) -> None:
-        """Add an estimate (JSON) with effect from model time `t` [s]; its window begins at `start` [s]."""
+        """Add an estimate (JSON) with effect from model time `t` [s]; its window begins at `start` [s].
+
+        In the last `PREPARATION_S` before `t`, its twins are drawn in pieces.
+        """
 
     def learned(self, origin_ns: int | None) -> Learned:
         """Return the part of the state that `learn` sets. `origin_ns` is the stamp of model time 0, if there is any."""

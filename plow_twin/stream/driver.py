@@ -301,7 +301,6 @@ class Driver:
 
         Raise `ArgumentError` if a change is impossible while the twin runs. The twin is unchanged.
         """
-        self.session.check_model(changes)
         if dict(changes) != self.session.changes:
             self.session.apply(journal.SetModel(stamp_ns, json.dumps(dict(changes))))
 

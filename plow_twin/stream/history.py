@@ -31,18 +31,18 @@ class History:
         self._span_ns = span_ns
         self._cell_ns = max(1, span_ns // SNAPSHOTS)
         self._snapshots: list[tuple[int, bytes]] = []
+        #: snapshots that will not be used. Each sample frees one, because a sample has no time to free all.
+        self._dropped: list[tuple[int, bytes]] = []
         #: stamp of the first sample of each cell [ns]
         self._kept_ns: list[int] = []
         #: largest stamp [ns] that `_kept_ns` has contained; after `rewind`, old stamps are dropped only if newer stamps
         #: follow
         self._newest_kept_ns: int | None = None
-        self._samples: list[Sample] = []
-        self._stamps_ns: list[int] = []
+        #: applied samples in order of their stamps: stamps [ns], shape (n,), and loads, shape (n, 3)
+        self._samples: deque[tuple[NDArray[np.int64], NDArray[np.float64]]] = deque()
         self._travels: list[Travel] = []
         #: stamps [ns] of samples that follow a held load
         self._resumed_ns: list[int] = []
-        #: applied samples as arrays, which `_make_samples` converts to `Sample` objects when they are needed
-        self._later: deque[tuple[NDArray[np.int64], NDArray[np.float64]]] = deque()
         self._due = True
 
     @property
@@ -63,27 +63,31 @@ class History:
     @property
     def newest_sample_ns(self) -> int | None:
         """Stamp of the newest stored sample [ns], or None."""
-        if self._later:
-            return int(self._later[-1][0][-1])
-        return self._stamps_ns[-1] if self._stamps_ns else None
+        return self._samples[-1][0].item(-1) if self._samples else None
 
     def __contains__(self, stamp_ns: int) -> bool:
-        self._make_samples()
-        index = bisect_left(self._stamps_ns, stamp_ns)
-        return self._stamps_ns[index : index + 1] == [stamp_ns]
+        if stamp_ns <= (self._snapshots[0][0] if self._snapshots else 0):
+            return False
+        for stamps_ns, _ in reversed(self._samples):
+            if stamps_ns.item(0) <= stamp_ns:
+                return stamp_ns in stamps_ns
+        return False
 
     def clear(self) -> None:
         """Drop everything."""
-        self._snapshots, self._samples, self._travels = [], [], []
-        self._kept_ns, self._stamps_ns, self._resumed_ns = [], [], []
-        self._later.clear()
+        self._dropped += self._snapshots
+        self._snapshots, self._travels = [], []
+        self._kept_ns, self._resumed_ns = [], []
+        self._samples.clear()
         self._newest_kept_ns, self._due = None, True
 
     def add(self, stamps_ns: NDArray[np.int64], wrench: NDArray[np.float64]) -> None:
         """Add applied samples: stamps [ns], shape (n,), and wrenches, shape (n, 3). They must not change later."""
         if not self._span_ns:
             return
-        self._later.append((stamps_ns, wrench))
+        if self._dropped:
+            self._dropped.pop()
+        self._samples.append((stamps_ns, wrench))
         last_ns = self._kept_ns[-1] if self._kept_ns else None
         if last_ns is not None and stamps_ns.item(-1) // self._cell_ns == last_ns // self._cell_ns:
             return  # fast path for most samples
@@ -118,21 +122,21 @@ class History:
             old += 1
         if old:
             del self._snapshots[:old]
-            while self._later and self._later[0][0][-1] <= self._snapshots[0][0]:
-                self._later.popleft()
-            kept = bisect_right(self._stamps_ns, self._snapshots[0][0])
-            del self._samples[:kept], self._stamps_ns[:kept]
+            while self._samples and self._samples[0][0][-1] <= self._snapshots[0][0]:
+                self._samples.popleft()
             self._travels = [travel for travel in self._travels if travel.stamp_ns >= self._snapshots[0][0]]
 
-    def _make_samples(self) -> None:
-        oldest_ns = self._snapshots[0][0] if self._snapshots else 0
-        for stamps_ns, wrench in self._later:
-            recent = stamps_ns > oldest_ns
-            rows = [(row[0], row[1], row[2]) for row in wrench[recent].tolist()]
-            stamps = stamps_ns[recent].tolist()
-            self._samples += [Sample(stamp, row) for stamp, row in zip(stamps, rows, strict=True)]
-            self._stamps_ns += stamps
-        self._later.clear()
+    def _pop_samples(self, after_ns: int) -> list[Sample]:
+        """Remove all samples after a stamp, and return them."""
+        parts: list[list[Sample]] = []
+        while self._samples and self._samples[-1][0].item(-1) > after_ns:
+            stamps_ns, wrench = self._samples.pop()
+            first = int(np.searchsorted(stamps_ns, after_ns, side="right"))
+            if first:
+                self._samples.append((stamps_ns[:first], wrench[:first]))
+            rows = zip(stamps_ns[first:].tolist(), wrench[first:].tolist(), strict=True)
+            parts.append([Sample(stamp_ns, (fx, fy, m)) for stamp_ns, (fx, fy, m) in rows])
+        return [sample for part in reversed(parts) for sample in part]
 
     def add_travel(self, travel: Travel) -> None:
         """Add an applied travel speed; it replaces a speed with the same stamp."""
@@ -174,15 +178,13 @@ class History:
 
     def rewind(self, stamp_ns: int) -> tuple[bytes, list[Sample], list[Travel]]:
         """Go back to the last snapshot before `stamp_ns`; return the snapshot and the later samples and speeds."""
-        self._make_samples()
         while self._snapshots[-1][0] >= stamp_ns:
             self._snapshots.pop()
         for stamps_ns in (self._kept_ns, self._resumed_ns):
             del stamps_ns[bisect_left(stamps_ns, stamp_ns) :]
         reached_ns, data = self._snapshots[-1]
-        kept = bisect_right(self._stamps_ns, reached_ns)
-        samples, travels = self._samples[kept:], [item for item in self._travels if item.stamp_ns >= reached_ns]
-        del self._samples[kept:], self._stamps_ns[kept:]
+        samples = self._pop_samples(reached_ns)
+        travels = [item for item in self._travels if item.stamp_ns >= reached_ns]
         self._travels = [item for item in self._travels if item.stamp_ns < reached_ns]
         return data, samples, travels
 

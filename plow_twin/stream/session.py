@@ -23,7 +23,7 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import check_travel_speed
 from plow_twin.solve.samples import model_times
 from plow_twin.stream import journal, outputs
-from plow_twin.stream.driven import MOST_MEASURED, Driven, Following
+from plow_twin.stream.driven import MOST_MEASURED, PREPARATION_S, Driven, Following
 from plow_twin.stream.history import History
 from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
 from plow_twin.stream.outputs import NONE, NOTHING, ONLY_ROW, Outputs, Published, Rows, Stock
@@ -188,6 +188,7 @@ class Session:
         A `Digest` or a `Loss` describes the journal from which it was read. It is neither applied nor emitted. Raise
         `ValueError` if the stamp is older than all stored states, or a number is not finite. The motion is unchanged.
         """
+        changed: Driven | None = None
         match entry:
             case journal.Sample():
                 return self.apply_samples([entry]).rows[-1:]
@@ -197,6 +198,8 @@ class Session:
                 return None
             case journal.Travel(_, speed):
                 check_travel_speed(self.twin.scene, speed)
+            case journal.SetModel(_, changes):
+                changed = self._changed_twin(read_changes(changes))
         self.emit(entry)
         match entry:
             case journal.Travel():
@@ -212,7 +215,8 @@ class Session:
                 if self.stamp_ns is not None:
                     self._follow(self.stamp_ns, entry)
             case journal.SetModel(_, changes):
-                self._change_model(read_changes(changes))
+                assert changed is not None
+                self._change_model(changed, read_changes(changes))
             case journal.Restore(_, data):
                 self._restore_motion(data)
             case journal.Pose(stamp_ns) | journal.PartOfPose(stamp_ns):
@@ -435,7 +439,8 @@ class Session:
             return
         time = (stamp_ns - self.origin_ns) * 1e-9
         if isinstance(entry, journal.Estimated):
-            self.following.add_estimate(entry.result, time, (entry.start_ns - self.origin_ns) * 1e-9)
+            start = (entry.start_ns - self.origin_ns) * 1e-9
+            self.following.add_estimate(entry.result, time + PREPARATION_S, start)
         else:
             self.following.add_pose(time, journal.whole_pose(entry), known)
         measured, earliest_ns, reached_ns = self._measured, self.history.earliest_ns, self.stamp_ns or 0
@@ -627,9 +632,9 @@ class Session:
             self.following.begin_at(origin_ns)
         return origin_ns
 
-    def _change_model(self, changes: dict[str, float]) -> None:
+    def _change_model(self, twin: Driven, changes: dict[str, float]) -> None:
         before, speed = self.twin, 0.0 if self.held else self.travel_speed_m_s
-        self._use(self._changed_twin(changes))
+        self._use(twin)
         self._carry(before)
         self.changes = changes
         if self._wears:
