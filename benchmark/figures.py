@@ -178,8 +178,8 @@ def follow_latency() -> str:
     lines = []
     for event in dict.fromkeys(event for _, _, event in rows):
         line = [event]
-        for follow, key in (("off", "all_ms"), ("full", "first_ms"), ("full", "all_ms"), ("full", "later_ms")):
-            line.append(", ".join(f"{float(rows[contact, follow, event][key]):.2g}" for contact in ("soft", "hard")))
+        for mode, key in (("off", "all_ms"), ("full", "first_ms"), ("full", "all_ms"), ("full", "later_ms")):
+            line.append(", ".join(f"{float(rows[contact, mode, event][key]):.2g}" for contact in ("soft", "hard")))
         lines.append(line)
     return table(["event", "`off`: all", "`full`: until the forces", "`full`: all", "`full`: largest later"], lines)
 

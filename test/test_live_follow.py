@@ -634,8 +634,11 @@ def test_a_real_node_publishes_the_forces_of_its_machine(tmp_path: Path) -> None
         }
         assert value(probe.status[-1], "follow") == "prior"
         _play(probe, send, poses, truth, 0.0, 13.0, by_topic["contact_forces"])
-        probe.until(lambda: value(probe.status[-1], "follow") == "estimate", "an estimate that is taken over", 100.0)
-        _play(probe, send, poses, truth, 13.0, 17.0, by_topic["contact_forces"])
+        probe.until(lambda: value(probe.status[-1], "horizontal") == "estimated", "an estimate", 100.0)
+        # twins are drawn from the estimate while samples arrive
+        _play(probe, send, poses, truth, 13.0, 13.5, by_topic["contact_forces"])
+        probe.until(lambda: value(probe.status[-1], "follow") == "estimate", "an estimate that is taken over")
+        _play(probe, send, poses, truth, 13.5, 17.0, by_topic["contact_forces"])
         probe.until(lambda: _seconds(by_topic["force_intervals"][-1]) > 16.98, "the last forces")
         assert probe.figures("follow")["members"] == str(MEMBERS)
         assert running.twin.stop() == 0

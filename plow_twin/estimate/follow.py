@@ -207,7 +207,7 @@ class Follower:
         draft.ensemble.start_at(time)
         self._text, self._ensemble, self._present_estimate = text, draft.ensemble, draft.estimate
         #: the estimate that the members follow; None for the prior
-        self.estimate = draft.estimate if text else None
+        self.estimate = Estimate.from_dict(json.loads(text)) if text else None
         self._load_share = _load_share(text)
         self._ensemble.set_travel_speed(self._speed)
         self._note_clearance()

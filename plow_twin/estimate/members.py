@@ -419,13 +419,12 @@ class Ensemble:
         since = self.first.time - self._drifted
         self._drift(load_error)
         state = np.concatenate([self._v, *path, self._load_off], axis=1)
-        use = self._used()
-        if not self._steers_first and use[1:].any():
-            use = use & (np.arange(len(use)) > 0)
-        about, centred_poses = state - state[use].mean(axis=0), predicted - predicted[use].mean(axis=0)
-        freedom = max(int(use.sum()) - 1, 1)
-        scatter = centred_poses[use].T @ centred_poses[use] / freedom + np.diag(noise[finite] ** 2)
-        center = _difference(q, predicted[use].mean(axis=0), finite)
+        use = self._steering()
+        own_state, own_poses = state[use], predicted[use]
+        middle = own_poses.mean(axis=0)
+        centred_poses, freedom = own_poses - middle, max(len(own_poses) - 1, 1)
+        scatter = centred_poses.T @ centred_poses / freedom + np.diag(noise[finite] ** 2)
+        center = _difference(q, middle, finite)
         if (np.abs(center) <= tuning.OUTLYING * np.sqrt(np.diag(scatter))).all():
             self.outlying = 0
         else:
@@ -435,24 +434,32 @@ class Ensemble:
         white = self._rng.standard_normal((len(predicted), len(finite)))
         white[0] = 0.0
         if self._learner is not None:
-            self._learner.add(self._numbers[use], centred_poses[use], center, noise[finite])
+            self._learner.add(self._numbers[use], centred_poses, center, noise[finite])
         differences = _difference(q, predicted, finite)
         # limit the influence of a single wrong pose
         most = tuning.OUTLYING * noise[finite]
         self.square += ((differences.clip(-most, most) / noise[finite]) ** 2).sum(axis=1)
-        weight = np.linalg.solve(scatter, centred_poses[use].T @ about[use] / freedom)
+        weight = np.linalg.solve(scatter, centred_poses.T @ (own_state - own_state.mean(axis=0)) / freedom)
         weight[:, ~np.tile(self._free, len(path) + 2)] = 0.0
         moved = state + (differences + noise[finite] * white) @ weight
         v, places = moved[:, :3], moved[:, 3:-3].reshape(len(moved), -1, 3).transpose(1, 0, 2)
         allowed = np.flatnonzero(self._allowed(places[-1], self._force(self._depth)))
         allowed = allowed[allowed >= 1 - self._steers_first]
+        path[:, allowed] = places[:, allowed]
         for place, index in enumerate(range(after - 1, len(times))):
-            self._path[index][1][allowed] = places[place, allowed]
+            self._path[index] = times[index], path[place]
         self._load_off[allowed] = moved[allowed, -3:]
         self._put(allowed, places[-1, allowed], v[allowed])
         self._recover()
         self._learn(since)
         return True
+
+    def _steering(self) -> slice | NDArray[np.bool_]:
+        """Return the indices of the members whose scatter corrects all; under a prior, without the first member."""
+        use = self._used()
+        if not self._steers_first and use[1:].any():
+            return slice(1, None) if use[1:].all() else use & (np.arange(len(use)) > 0)
+        return _ALL if use.all() else use
 
     def _drift(self, load_error: Array) -> None:
         """Advance the load errors as Ornstein-Uhlenbeck processes, without noise for the first member."""
