@@ -193,7 +193,7 @@ def main() -> None:
     rows = []
     for title, stiffness in (("soft", (3e6, 3e8)), ("hard", (1e9, 1e11))):
         truth = draw(replace(GROUPS["plain"], stiffness=stiffness, periods=2.2), 71003)
-        for follow in ("off", "parameters", "full"):
+        for follow in ("off", "full"):
             for name, event in EVENTS.items():
                 times = measured(truth, follow, event)
                 ordinary = times.whole[round(_FIRST / _STEP) :]
