@@ -179,7 +179,8 @@ def follow_latency() -> str:
     for event in dict.fromkeys(event for _, _, event in rows):
         line = [event]
         for mode, key in (("off", "all_ms"), ("full", "first_ms"), ("full", "all_ms"), ("full", "later_ms")):
-            line.append(", ".join(f"{float(rows[contact, mode, event][key]):.2g}" for contact in ("soft", "hard")))
+            values = [float(rows[contact, mode, event][key]) for contact in ("soft", "hard")]
+            line.append(", ".join(f"{value:#.3g}".rstrip(".") for value in values))
         lines.append(line)
     return table(["event", "`off`: all", "`full`: until the forces", "`full`: all", "`full`: largest later"], lines)
 
