@@ -14,9 +14,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, cast
 
-import numpy as np
-from numpy.typing import NDArray
-
 from plow_twin.errors import ArgumentError
 from plow_twin.live.inputs import Inputs
 from plow_twin.live.parameters import MODEL, ParameterError, Settings, model_changes, outside
@@ -29,7 +26,7 @@ from plow_twin.record.alarms import alarms_of
 from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.record.times import EPOCH_S
 from plow_twin.record.wear_state import scene_identity
-from plow_twin.stream.driver import Arrival, Driver, Policy
+from plow_twin.stream.driver import Arrival, Block, Driver, Policy
 from plow_twin.stream.health import Periods
 from plow_twin.stream.intake import Verdict
 from plow_twin.stream.journal import Entry, Gaps, Mark, Parameter, Pose, pose_entry
@@ -178,7 +175,7 @@ class Runtime:
 
     @property
     def reads_at_once(self) -> bool:
-        """Whether `step_series` may be used: only samples advance the time, and the motion is not sent."""
+        """Whether `step` can use a `Block`: only samples advance the time, and the motion is not sent."""
         return self._front.follows_samples and not self._front.sends_motion
 
     @property
@@ -326,41 +323,32 @@ class Runtime:
             value_limits(settings.limit_gap or pose_limits(self.scene).largest[0], settings.limit_gap_rate),
         )
 
-    def step(self, arrived: list[Arrival]) -> Iterator[Outgoing]:
-        """Use samples in the order of arrival, and yield each message as soon as it is computed."""
+    def step(self, arrived: list[Arrival] | Block) -> Iterator[Outgoing]:
+        """Use samples in the order of arrival, and yield each message as soon as it is computed.
+
+        A `Block` may be passed only if `reads_at_once` is true.
+        """
         if self.waits_for_clock:
             self.start()
         if self.waits_for_clock:
             # samples are stored, because the player of a recording may send the first samples before `/clock`
-            room = self.settings.input_depth - len(self._early)
-            self._early += arrived[:room]
-            for stamp_ns, wrench in arrived[max(room, 0) :]:
-                self.driver.intake.refuse(Verdict.NO_CLOCK, stamp_ns, wrench)
+            for stamp_ns, wrench in arrived:
+                if len(self._early) < self.settings.input_depth:
+                    self._early.append((stamp_ns, wrench))
+                else:
+                    self.driver.intake.refuse(Verdict.NO_CLOCK, stamp_ns, wrench)
             return
-        if self._early:
-            arrived, self._early = self._early + arrived, []
-        self.publishing.received_ns = now_ns = time.monotonic_ns()
-        for published in self.driver.samples(arrived, now_ns):
-            yield from self.publishing.messages(published)
-        self._advanced(len(arrived))
-
-    def step_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64]) -> Iterator[Outgoing]:
-        """Use stamps [ns], shape (n,), and loads [N, N, N m], shape (n, 3), in one call with the results of `step`.
-
-        `reads_at_once` must be true.
-        """
-        if self.waits_for_clock or self.publishing.watch is not None or self.settings.record_ring:
+        if self._early or self.publishing.watch is not None or self.settings.record_ring:
             # a watcher must receive each publication, and the ring of the recorder needs the state directly after the
-            # sample of an alarm, so the samples are used one by one
-            yield from self.step(list(zip(stamps.tolist(), map(tuple, wrench.tolist()), strict=True)))
-            return
+            # sample of an alarm, so the samples of a block are used one by one
+            arrived, self._early = [*self._early, *arrived], []
         self.publishing.received_ns = now_ns = time.monotonic_ns()
-        for applied in self.driver.series(stamps, wrench, now_ns):
+        for applied in self.driver.samples(arrived, now_ns):
             if isinstance(applied, Series):
                 yield from self.publishing.series(applied, self._journal_series)
             else:
                 yield from self.publishing.messages(applied)
-        self._advanced(len(stamps))
+        self._advanced(len(arrived))
 
     def _journal_series(self, series: Series) -> None:
         if self.recording:

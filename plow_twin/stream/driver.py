@@ -10,9 +10,10 @@ import json
 import math
 from bisect import insort
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from operator import attrgetter
 from typing import Final
 
 import numpy as np
@@ -23,7 +24,7 @@ from plow_twin.stream import journal
 from plow_twin.stream.failures import Failures
 from plow_twin.stream.health import RealTimeFactor
 from plow_twin.stream.intake import NS_PER_S, Intake, Verdict
-from plow_twin.stream.outputs import NOTHING, Published, Rows
+from plow_twin.stream.outputs import NONE, NOTHING, Published, Rows
 from plow_twin.stream.session import Series, Session
 from plow_twin.stream.silences import Silences
 from plow_twin.stream.steps import Steps
@@ -65,6 +66,28 @@ class Policy:
     hold_limit_s: float = 60.0
     #: number of consecutive failed advances after which the model is reset (see `Failures.wants_restart`); 0: never
     failure_limit: int = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Samples that have arrived and may be applied together: `stamps` [ns], shape (n,), and `wrench`, shape (n, 3)."""
+
+    stamps: NDArray[np.int64]
+    wrench: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def __getitem__(self, place: int) -> Arrival:
+        fx, fy, moment = self.wrench[place].tolist()
+        return self.stamps.item(place), (fx, fy, moment)
+
+    def __iter__(self) -> Iterator[Arrival]:
+        return map(self.__getitem__, range(len(self)))
+
+    def part(self, begin: int, end: int) -> Block:
+        """Return the samples with indices from `begin` to `end` - 1."""
+        return Block(self.stamps[begin:end], self.wrench[begin:end])
 
 
 class Driver:
@@ -116,65 +139,52 @@ class Driver:
         self._policy = policy
         self.silences.timeout_s = policy.excitation_timeout_s
 
-    def samples(self, arrived: Iterable[Arrival], now_ns: int) -> Iterator[Published]:
+    def samples(self, arrived: Sequence[Arrival] | Block, now_ns: int) -> Iterator[Published | Series]:
         """Judge samples in order of arrival, advance to the accepted samples, and yield the publications.
 
-        The caller must send each publication before it requests the next publication, so that a recording contains the
+        The caller must send each publication before it requests the next item, so that a recording contains the
         publications in order. If the stamp of a sample jumps, the sample waits until the next sample arrives or a
         silence begins.
+
+        Plausible samples of a `Block` are applied in one call, which is faster, and yielded as a `Series`. The caller
+        must journal and publish the series before it requests the next item.
         """
         run: list[journal.Sample] = []
-        for stamp_ns, wrench in arrived:
-            if self.every_sample and not run and self._may_go_on(stamp_ns, wrench):  # fast path for most samples
-                self.intake.accept(stamp_ns, wrench)
-                self.newest_ns, self._received_ns, self._zeroed = stamp_ns, now_ns, False
-                self.silences.add_one(stamp_ns)
-                yield from self._apply([journal.Sample(stamp_ns, wrench)], now_ns)
-                continue
-            for settled in self._steps.settle(stamp_ns, wrench, now_ns, self.session.stamp_ns):
-                yield from self._use_samples(run, *settled[:2], now_ns)
-        if run or self.newest_ns is None:
-            yield from self._use(run, now_ns)
-
-    def series(
-        self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], now_ns: int
-    ) -> Iterator[Published | Series]:
-        """Use n samples like `samples`, but faster; `stamps` [ns] has the shape (n,), and `wrench` (n, 3).
-
-        Plausible samples are applied together and yielded as a `Series`. The caller must journal and publish the series
-        before it requests the next item. A sample that needs more checks is processed as in `samples`.
-        """
-        run: list[journal.Sample] = []
-        goes_on = self.intake.go_on(stamps, wrench)
-        ends = np.append(np.flatnonzero(~goes_on) + 1, len(stamps))
-        place = 0
-        while place < len(stamps):
-            arrival: Arrival = stamps.item(place), tuple(wrench[place].tolist())
-            if run and self._may_go_on(*arrival):
+        place, block = 0, arrived if isinstance(arrived, Block) else None
+        ends = NONE if block is None else 1 + np.flatnonzero(~self.intake.go_on(block.stamps, block.wrench))
+        while place < len(arrived):
+            end, arrival = place + 1, arrived[place]
+            goes_on = (block is not None or self.every_sample) and self._may_go_on(*arrival)
+            if goes_on and run:
                 yield from self._use(run, now_ns)
-            if run or not self._may_go_on(*arrival):
+                goes_on = self._may_go_on(*arrival)
+            if not goes_on:
                 for settled in self._steps.settle(*arrival, now_ns, self.session.stamp_ns):
                     yield from self._use_samples(run, *settled[:2], now_ns)
-                place += 1
-                continue
-            end = int(ends[np.searchsorted(ends, place, side="right")])
-            here = slice(place, end)
-            applied = self.session.apply_series(stamps[here], wrench[here], each=self.every_sample)
-            if applied is None:
-                rows = zip(stamps[here].tolist(), map(tuple, wrench[here].tolist()), strict=True)
-                yield from self.samples(rows, now_ns)
+            elif block is not None:
+                end = min([*ends[ends > place][:1].tolist(), len(block)])
+                yield from self._use_together(block.part(place, end), now_ns)
             else:
-                newest_ns, newest = stamps.item(end - 1), tuple(wrench[end - 1].tolist())
-                self.intake.accept(newest_ns, newest, end - place)
-                self.newest_ns, self._received_ns, self._zeroed = newest_ns, now_ns, False
-                self.silences.add(stamps[here])
-                self._advanced(now_ns)
-                self.failed.end()
-                self.state = StreamState.RUNNING
-                yield applied
+                self._accept(*arrival, now_ns)
+                self.silences.add_one(arrival[0])
+                yield from self._apply([journal.Sample(*arrival)], now_ns)
             place = end
         if run or self.newest_ns is None:
             yield from self._use(run, now_ns)
+
+    def _use_together(self, block: Block, now_ns: int) -> Iterator[Published | Series]:
+        series = self.session.apply_series(block.stamps, block.wrench, each=self.every_sample)
+        if series is None:
+            yield from self.samples(list(block), now_ns)
+            return
+        self._accept(*block[-1], now_ns, len(block))
+        self.silences.add(block.stamps)
+        self._succeeded(now_ns)
+        yield series
+
+    def _accept(self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int, count: int = 1) -> None:
+        self.intake.accept(stamp_ns, wrench, count)
+        self.newest_ns, self._received_ns, self._zeroed = stamp_ns, now_ns, False
 
     def _may_go_on(self, stamp_ns: int, wrench: tuple[float, float, float]) -> bool:
         reached_ns = self.session.stamp_ns
@@ -187,7 +197,7 @@ class Driver:
 
         If the sample cannot be judged or applied together with the others, the others are applied first.
         """
-        late = bool(run) and self._is_late(run[0])
+        late = bool(run) and self._is_late(run[0].stamp_ns)
         # if the stamp does not rise, `run` must be applied before the sample can be judged as late or as a jump back
         if run and not late and stamp_ns <= run[-1].stamp_ns:
             yield from self._use(run, now_ns)
@@ -206,7 +216,7 @@ class Driver:
             self.newest_ns = stamp_ns
         self.silences.add_one(stamp_ns)
         self._received_ns, self._zeroed = now_ns, False
-        insort(run, journal.Sample(stamp_ns, wrench), key=lambda sample: sample.stamp_ns)
+        insort(run, journal.Sample(stamp_ns, wrench), key=attrgetter("stamp_ns"))
 
     def due(self) -> Published:
         """Return the publication of all advances since the last publication."""
@@ -341,9 +351,9 @@ class Driver:
         self.failed.end()
         self.session.close()
 
-    def _is_late(self, sample: journal.Sample) -> bool:
+    def _is_late(self, stamp_ns: int) -> bool:
         reached_ns = self.session.stamp_ns
-        return reached_ns is not None and sample.stamp_ns <= reached_ns
+        return reached_ns is not None and stamp_ns <= reached_ns
 
     def _judge(self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int) -> Verdict:
         session = self.session
@@ -391,16 +401,20 @@ class Driver:
     def _apply(self, samples: Sequence[journal.Sample], now_ns: int) -> Iterator[Published]:
         applied = self.session.apply_samples(samples, each=self.every_sample)
         self.rolled_back += applied.late
-        self._advanced(now_ns)
         if applied.failed:
+            self._advanced(now_ns)
             self._judge_rows(applied.rows)
         else:
-            self.failed.end()
-            self.state = StreamState.RUNNING
+            self._succeeded(now_ns)
         if len(applied.published.rows):
             yield applied.published
         # a restart is journalled after the publication, because a replay publishes nothing of the motion before it
         self._restart_after_failures()
+
+    def _succeeded(self, now_ns: int) -> None:
+        self._advanced(now_ns)
+        self.failed.end()
+        self.state = StreamState.RUNNING
 
     def _advance(self, entry: journal.Hold | journal.Unload, now_ns: int, state: StreamState) -> Published:
         rows = self.session.apply(entry)

@@ -14,10 +14,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.stream.journal import Sample, Travel
+from plow_twin.stream.journal import Travel
 
 #: Number of cells in the stored time.
 SNAPSHOTS: Final = 100
+#: Stamps [ns], shape (n,), and wrenches, shape (n, 3), of samples.
+Samples = tuple[NDArray[np.int64], NDArray[np.float64]]
+NO_SAMPLES: Final[Samples] = np.zeros(0, np.int64), np.zeros((0, 3))
 
 
 class History:
@@ -38,11 +41,11 @@ class History:
         #: largest stamp [ns] that `_kept_ns` has contained; after `rewind`, old stamps are dropped only if newer stamps
         #: follow
         self._newest_kept_ns: int | None = None
-        #: applied samples in order of their stamps: stamps [ns], shape (n,), and loads, shape (n, 3)
-        self._samples: deque[tuple[NDArray[np.int64], NDArray[np.float64]]] = deque()
         self._travels: list[Travel] = []
         #: stamps [ns] of samples that follow a held load
         self._resumed_ns: list[int] = []
+        #: applied samples, as they were added
+        self._samples: deque[Samples] = deque()
         self._due = True
 
     @property
@@ -68,16 +71,13 @@ class History:
     def __contains__(self, stamp_ns: int) -> bool:
         if stamp_ns <= (self._snapshots[0][0] if self._snapshots else 0):
             return False
-        for stamps_ns, _ in reversed(self._samples):
-            if stamps_ns.item(0) <= stamp_ns:
-                return stamp_ns in stamps_ns
-        return False
+        found = next((stamps_ns for stamps_ns, _ in reversed(self._samples) if stamps_ns[0] <= stamp_ns), NO_SAMPLES[0])
+        return stamp_ns in found
 
     def clear(self) -> None:
         """Drop everything."""
         self._dropped += self._snapshots
-        self._snapshots, self._travels = [], []
-        self._kept_ns, self._resumed_ns = [], []
+        self._snapshots, self._travels, self._kept_ns, self._resumed_ns = [], [], [], []
         self._samples.clear()
         self._newest_kept_ns, self._due = None, True
 
@@ -126,18 +126,6 @@ class History:
                 self._samples.popleft()
             self._travels = [travel for travel in self._travels if travel.stamp_ns >= self._snapshots[0][0]]
 
-    def _pop_samples(self, after_ns: int) -> list[Sample]:
-        """Remove all samples after a stamp, and return them."""
-        parts: list[list[Sample]] = []
-        while self._samples and self._samples[-1][0].item(-1) > after_ns:
-            stamps_ns, wrench = self._samples.pop()
-            first = int(np.searchsorted(stamps_ns, after_ns, side="right"))
-            if first:
-                self._samples.append((stamps_ns[:first], wrench[:first]))
-            rows = zip(stamps_ns[first:].tolist(), wrench[first:].tolist(), strict=True)
-            parts.append([Sample(stamp_ns, (fx, fy, m)) for stamp_ns, (fx, fy, m) in rows])
-        return [sample for part in reversed(parts) for sample in part]
-
     def add_travel(self, travel: Travel) -> None:
         """Add an applied travel speed; it replaces a speed with the same stamp."""
         if not self._span_ns:
@@ -176,17 +164,24 @@ class History:
         place = bisect_left(self._resumed_ns, stamp_ns)
         return max(self._resumed_ns[place - 1] if place else 0, self.oldest_ns or 0)
 
-    def rewind(self, stamp_ns: int) -> tuple[bytes, list[Sample], list[Travel]]:
+    def rewind(self, stamp_ns: int) -> tuple[bytes, Samples, list[Travel]]:
         """Go back to the last snapshot before `stamp_ns`; return the snapshot and the later samples and speeds."""
         while self._snapshots[-1][0] >= stamp_ns:
             self._snapshots.pop()
         for stamps_ns in (self._kept_ns, self._resumed_ns):
             del stamps_ns[bisect_left(stamps_ns, stamp_ns) :]
         reached_ns, data = self._snapshots[-1]
-        samples = self._pop_samples(reached_ns)
+        later = [NO_SAMPLES]
+        while self._samples and self._samples[-1][0][-1] > reached_ns:
+            stamps, wrench = self._samples.pop()
+            first = stamps.searchsorted(reached_ns, "right")
+            later.append((stamps[first:], wrench[first:]))
+            if first:
+                self._samples.append((stamps[:first], wrench[:first]))
         travels = [item for item in self._travels if item.stamp_ns >= reached_ns]
         self._travels = [item for item in self._travels if item.stamp_ns < reached_ns]
-        return data, samples, travels
+        stamps, wrench = map(np.concatenate, zip(*reversed(later), strict=True))
+        return data, (stamps, wrench), travels
 
 
 class RecentStamps:

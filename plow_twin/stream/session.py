@@ -24,7 +24,7 @@ from plow_twin.model.scene import check_travel_speed
 from plow_twin.solve.samples import model_times
 from plow_twin.stream import journal, outputs
 from plow_twin.stream.driven import MOST_MEASURED, PREPARATION_S, Driven, Following
-from plow_twin.stream.history import History
+from plow_twin.stream.history import NO_SAMPLES, History, Samples
 from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
 from plow_twin.stream.outputs import NONE, NOTHING, ONLY_ROW, Outputs, Published, Rows, Stock
 from plow_twin.stream.snapshot import SessionState, split_changes, with_changes
@@ -235,17 +235,13 @@ class Session:
     def parts(self, samples: Sequence[journal.Sample], *, each: bool = False) -> Iterator[Sequence[journal.Sample]]:
         """Yield parts of samples, whose stamps must not fall, for `apply_samples`.
 
-        Each part must be applied before the next part is requested.
-
-        A late sample and all samples after it form one part. A part without a late sample ends at the next digest or,
-        if `each` is set, after one sample.
+        Each part must be applied before the next part is requested. A late sample and all samples after it form one
+        part. A part without a late sample ends at the next digest or, if `each` is set, after one sample.
         """
         while samples:
-            count = 1
+            count = 1 if each else DIGEST_INTERVAL - self._advances % DIGEST_INTERVAL
             if self._is_late(samples[0].stamp_ns):
                 count = len(samples)
-            elif not each:
-                count = DIGEST_INTERVAL - self._advances % DIGEST_INTERVAL
             yield samples[:count]
             samples = samples[count:]
 
@@ -262,11 +258,13 @@ class Session:
             self._check_late(first_ns)
         for sample in samples:
             self.emit(sample)
+        stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
+        wrench = np.array([sample.wrench for sample in samples])
         if late:
-            applied = self._recompute(first_ns, samples)
+            applied = self._recompute(first_ns, (stamps, wrench))
             applied = applied._replace(published=self.outputs.pop() if each else NOTHING, late=late)
         else:
-            applied = self._run(samples, ONLY_ROW if each else NONE)
+            applied = self._run(stamps, wrench, ONLY_ROW if each else NONE)
             if each and applied.failed and not applied.published.rows["stamp_ns"][0]:
                 applied = applied._replace(published=NOTHING)
         self._count(len(samples))
@@ -286,7 +284,9 @@ class Session:
         digest_after = np.arange(first, count + 1, DIGEST_INTERVAL)
         taken = np.arange(count) if each else NONE
         try:
-            rows = self._advance(stamps, wrench, self._stock.new(count), taken, digest_after, undo=self.twin.snapshot())
+            rows = self._advance_part(
+                stamps, wrench, self._stock.new(count), taken, digest_after, undo=self.twin.snapshot()
+            )
         except _UndoneError:
             return None
         self._advances += count
@@ -323,12 +323,11 @@ class Session:
             raise ValueError(
                 f"stamp: got {stamps[0]} ns first, expected stamps after {self.stamp_ns} ns that do not decrease"
             )
-        advance = self._advance_in_pieces if self.held or self._travels else self._advance
-        applied = advance(stamps, wrench, rows, taken, digest_after)
+        applied = self._advance(stamps, wrench, rows, taken, digest_after)
         self._advances += len(stamps)
         return applied
 
-    def _advance_in_pieces(
+    def _advance(
         self,
         stamps: NDArray[np.int64],
         wrench: NDArray[np.float64],
@@ -337,6 +336,8 @@ class Session:
         digest_after: NDArray[np.int64],
     ) -> Applied:
         """Advance in parts, which end at a waiting travel speed or after a sample that follows a held load."""
+        if not (self.held or self._travels):
+            return self._advance_part(stamps, wrench, rows, taken, digest_after)
         if not np.isfinite(wrench).all():
             raise ValueError(f"wrench: got {wrench!r}, expected finite numbers")
         resumed, begin, count = self._resume_wear(), 0, len(stamps)
@@ -356,7 +357,8 @@ class Session:
             chosen = taken[(taken >= begin) & (taken < end)] - begin
             part_digest_after = digest_after[(digest_after > begin) & (digest_after <= end)] - begin
             out = None if rows is None else rows[part]
-            parts.append(self._advance(stamps[part], wrench[part], out, chosen, part_digest_after, resumed=resumed))
+            applied = self._advance_part(stamps[part], wrench[part], out, chosen, part_digest_after, resumed=resumed)
+            parts.append(applied)
             if resumed:
                 self._store_snapshot(resumed=True)
             begin, resumed = end, False
@@ -388,13 +390,10 @@ class Session:
         stamp_ns = self.stamp_ns if self.stamp_ns is not None else self.origin_ns or 0
         return journal.Snapshot(stamp_ns, state.pack())
 
-    def _run(self, samples: Sequence[journal.Sample], taken: NDArray[np.int64] = NONE) -> Applied:
-        stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
-        wrench = np.array([sample.wrench for sample in samples])
-        advance = self._advance_in_pieces if self.held or self._travels else self._advance
-        return advance(stamps, wrench, self._stock.new(len(samples)), taken, NONE)
+    def _run(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], taken: NDArray[np.int64] = NONE) -> Applied:
+        return self._advance(stamps, wrench, self._stock.new(len(stamps)), taken, NONE)
 
-    def _advance(
+    def _advance_part(
         self,
         stamps: NDArray[np.int64],
         wrench: NDArray[np.float64],
@@ -402,16 +401,18 @@ class Session:
         taken: NDArray[np.int64],
         digest_after: NDArray[np.int64],
         *,
+        stored: bool = True,
         resumed: bool = False,
         undo: bytes | None = None,
     ) -> Applied:
-        """Advance to samples without other entries between them. `resumed` marks the first sample after a held load.
+        """Advance without other entries between the stamps.
 
-        If an advance fails and the snapshot `undo` is given, restore the twin from it and raise `_UndoneError`.
+        `stored` marks samples, which the history stores, and `resumed` the first sample after a held load. If an
+        advance fails and the snapshot `undo` is given, restore the twin from it and raise `_UndoneError`.
         """
         origin_ns = self._begin(int(stamps[0])) if self.origin_ns is None else self.origin_ns
         # no state is saved at the stamp of a speed, because a late sample may change the load there
-        if self.history.is_due and not resumed and self.stamp_ns in (None, self.history.newest_sample_ns):
+        if self.history.is_due and stored and not resumed and self.stamp_ns in (None, self.history.newest_sample_ns):
             before_ns = int(stamps[0]) - 1 if self.stamp_ns is None else self.stamp_ns
             self.history.add_snapshot(before_ns, self.snapshot().data, kept=False)
         if self.following is not None:
@@ -423,14 +424,15 @@ class Session:
             self.twin.restore(undo)
             raise _UndoneError
         self.origin_ns, self.stamp_ns = origin_ns, stamps.item(-1)
-        self.history.add(stamps, wrench)
+        if stored:
+            self.history.add(stamps, wrench)
         if rows is None:
             self.wear_depth = self.twin.wear_depth
             return Applied(_NO_ROWS, NOTHING, digests, failed)
         self._row = rows
         if self.twin.max_evaluations is not None:
             self._largest_error_m = max(self._largest_error_m, float(rows["error_estimate"].max()))
-        return Applied(rows, self.outputs.add(rows, stamps, taken), digests, failed)
+        return Applied(rows, self.outputs.add(rows, stamps, taken, held=self.held), digests, failed)
 
     def _follow(
         self, stamp_ns: int, entry: journal.Pose | journal.PartOfPose | journal.Estimated, known: float = -math.inf
@@ -464,7 +466,7 @@ class Session:
             share = (travel.stamp_ns - self.stamp_ns) / (stamp_ns - self.stamp_ns)
             load = self.twin.wrench
             on_the_way = (load + share * (wrench - load))[None]
-            self._move(np.array([travel.stamp_ns]), on_the_way, held=False)
+            self._move(travel.stamp_ns, on_the_way)
         self._set_speed(travel)
 
     def _is_late(self, stamp_ns: int) -> bool:
@@ -483,22 +485,24 @@ class Session:
             expected = f"at least {reached}" if oldest_ns is None else f"a stamp after {stored}"
             raise ValueError(f"stamp: got {stamp_ns} ns, expected {expected}")
 
-    def _recompute(self, stamp_ns: int, late: Sequence[journal.Sample], *travels: journal.Travel) -> Applied:
+    def _recompute(self, stamp_ns: int, late: Samples, *travels: journal.Travel) -> Applied:
         """Go back to a state before a late stamp, and compute the motion again with late samples and travel speeds.
 
         The next publication covers the motion from the earliest late stamp that was inserted since the previous
         publication.
         """
         corrected_ns = self.outputs.correct(stamp_ns, self.history.correction_limit_ns(stamp_ns))
-        again = self._rewind(corrected_ns, *travels)
-        earlier = [sample for sample in again if sample.stamp_ns < corrected_ns]
+        stamps, wrench = self._rewind(corrected_ns, *travels)
+        earlier = int(stamps.searchsorted(corrected_ns))
         if earlier:
-            self._run(earlier)
+            self._run(stamps[:earlier], wrench[:earlier])
             self._store_snapshot(kept=False)
         self.outputs.begin_correction()
-        return self._run(sorted([*again[len(earlier) :], *late], key=lambda sample: sample.stamp_ns))
+        stamps, wrench = np.append(stamps[earlier:], late[0]), np.append(wrench[earlier:], late[1], axis=0)
+        order = stamps.argsort(kind="stable")
+        return self._run(stamps[order], wrench[order])
 
-    def _rewind(self, stamp_ns: int, *more: journal.Travel) -> list[journal.Sample]:
+    def _rewind(self, stamp_ns: int, *more: journal.Travel) -> Samples:
         """Go back to the newest snapshot before `stamp_ns`; return the samples after the snapshot.
 
         The travel speeds after the snapshot and the speeds `more` are scheduled for their stamps again.
@@ -526,31 +530,20 @@ class Session:
         if self.stamp_ns is not None and stamp_ns < self.stamp_ns:
             raise ValueError(f"stamp: got {stamp_ns} ns, expected at least the time reached, {self.stamp_ns} ns")
         self.emit(entry)
-        if self.origin_ns is None:
-            self.origin_ns = self._begin(stamp_ns)
         if self._sampled:
             self._suspend_wear()
         while self._travels and self._travels[0].stamp_ns <= stamp_ns:
             travel = self._travels.pop(0)
             if not self._sampled and self.stamp_ns is not None and travel.stamp_ns > self.stamp_ns:
-                self._move(np.array([travel.stamp_ns]), _NO_LOAD, held=self.held)
+                self._move(travel.stamp_ns, _NO_LOAD)
             self._set_speed(travel)
         load = _NO_LOAD if isinstance(entry, journal.Unload) else self.twin.wrench[None]
-        rows = self._move(np.array([stamp_ns]), load, held=self.held)
+        rows = self._move(stamp_ns, load)
         self._count(1)
         return rows
 
-    def _move(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], *, held: bool) -> Rows:
-        assert self.origin_ns is not None
-        rows = self._stock.new(1)
-        if self.following is not None:
-            self.following.end_spans(NONE, begins=not self.outputs.waits)
-        self.twin.advance_rows(np.multiply(stamps - self.origin_ns, 1e-9), wrench, rows)
-        self.stamp_ns, self._row = int(stamps[0]), rows
-        if self.twin.max_evaluations is not None:
-            self._largest_error_m = max(self._largest_error_m, float(rows["error_estimate"][0]))
-        self.outputs.add(rows, stamps, NONE, held=held)
-        return rows
+    def _move(self, stamp_ns: int, wrench: NDArray[np.float64]) -> Rows:
+        return self._advance_part(np.array([stamp_ns]), wrench, self._stock.new(1), NONE, NONE, stored=False).rows
 
     def _suspend_wear(self) -> None:
         if not self.held:
@@ -582,7 +575,7 @@ class Session:
         elif newest_ns is None or oldest_ns is None or travel.stamp_ns >= newest_ns:
             self._set_speed(travel)
         else:
-            self._recompute(travel.stamp_ns, [], travel)
+            self._recompute(travel.stamp_ns, NO_SAMPLES, travel)
 
     def _set_speed(self, travel: journal.Travel) -> None:
         self.history.add_travel(travel)

@@ -16,14 +16,13 @@ from plow_twin.live.bridge.source import Messages
 from plow_twin.live.bridge.table import Table
 from plow_twin.live.inputs import OPTIONAL
 from plow_twin.live.load_model import LoadModel
-from plow_twin.live.publishing import Outgoing
 from plow_twin.live.runtime import Runtime
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.map_file import ROLES
 from plow_twin.record.mapping import Role, roles_by_topic
 from plow_twin.record.messages import Message
 from plow_twin.record.sources import Arrived
-from plow_twin.stream.driver import Arrival
+from plow_twin.stream.driver import Arrival, Block
 from plow_twin.stream.intake import Intake, Verdict
 from plow_twin.stream.journal import Spread
 
@@ -110,12 +109,12 @@ class Feeder:
             self._follow_time(stamp_ns)
         if self._at_once and len(samples) > 1:
             stamps, wrench = zip(*samples, strict=True)
-            self._forward(self._runtime.step_series(np.array(stamps, np.int64), np.array(wrench, np.float64)))
+            self._step(Block(np.array(stamps), np.array(wrench)))
         else:
-            self._forward(self._runtime.step(samples))
+            self._step(samples)
 
-    def _forward(self, outgoing: Iterable[Outgoing]) -> None:
-        for topic, message in outgoing:
+    def _step(self, arrived: list[Arrival] | Block) -> None:
+        for topic, message in self._runtime.step(arrived):
             self._send(topic, message)
 
     def _feed_table(self, table: Table) -> bool:
@@ -138,7 +137,7 @@ class Feeder:
         self._number += len(stamps)
         self._follow_times(stamps)
         order = [list(role.fields).index(name) for name in ROLES["excitation"]]
-        self._forward(self._runtime.step_series(stamps, np.ascontiguousarray(values[:, order])))
+        self._step(Block(stamps, np.ascontiguousarray(values[:, order])))
         return True
 
     def _follow_times(self, stamps: NDArray[np.int64]) -> None:
