@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Final
@@ -51,6 +52,11 @@ def read_secret(path: Path) -> str:
         expected = f"a password or token, at most {_LONGEST_SECRET} printable bytes"
         raise InputError([Problem("line 1", f"{len(line)} bytes", expected)], str(path))
     return text
+
+
+def secret(path: Path | None, variable: str) -> str:
+    """Return the secret in a file or, if `path` is None, in the environment variable `PLOW_TWIN_<variable>`."""
+    return os.environ.get(f"PLOW_TWIN_{variable}", "") if path is None else read_secret(path)
 
 
 def key_format(data: bytes) -> str:

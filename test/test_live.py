@@ -537,6 +537,17 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
     assert (report.samples, report.exit_code) == (300, 0)
 
 
+def test_a_screen_cannot_request_a_service_that_is_switched_off(tmp_path: Path) -> None:
+    settings = parameters.settings({"services_off": "mark"})
+    front = BridgeFront(
+        Files([_csv(tmp_path / "load.csv", 10)], follow=False), None, settings,
+        Preparation(settings).result(lambda: False), lambda name, part: None, pytest.fail,
+    )  # fmt: skip
+    services = Services(front.runtime, front.changed)
+    assert services.answer("mark", "new pads") == (False, "mark: switched off by the parameter services_off")
+    assert front.run(lambda: False) == [] and services.answer("acknowledge", "")[0]
+
+
 def test_an_alarm_is_reported_once_with_value_pad_threshold_and_time_and_acknowledged_without_ros(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

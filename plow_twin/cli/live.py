@@ -231,13 +231,14 @@ def _bridge(source: str, options: dict[str, Any], rate_hz: float) -> Bridge:
     from plow_twin.live.bridge.source import BridgeError
 
     if "://" in source:
-        from plow_twin.live.bridge.access import Access, password
+        from plow_twin.access import secret
+        from plow_twin.live.bridge.access import Access
 
         opcua = source.startswith("opc.tcp://")
         access = Access(
             source,
             user=options["user"],
-            password=password(options["password_file"], "OPCUA" if opcua else "MQTT"),
+            password=secret(options["password_file"], "OPCUA_PASSWORD" if opcua else "MQTT_PASSWORD"),
             ca=options["tls_ca"],
             certificate=options["tls_cert"],
             key=options["tls_key"],

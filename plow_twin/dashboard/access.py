@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import hmac
-import os
 import socket
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
 
-from plow_twin.access import is_address, is_loopback, read_secret
+from plow_twin.access import is_address, is_loopback, secret
 from plow_twin.errors import InputError, Problem
 
-#: Environment variable that contains the token if no token file is given.
-TOKEN_VARIABLE: Final = "PLOW_TWIN_DASHBOARD_TOKEN"
 _SHORTEST: Final = 16
 
 
@@ -49,11 +46,11 @@ class PageAccess:
             host, port = "", None
         if not host or port is None or parts.path or parts.username:
             raise DashboardError("--listen", listen, "HOST:PORT, such as 127.0.0.1:8070; port 0 selects a free port")
-        token = os.environ.get(TOKEN_VARIABLE, "").strip() if token_file is None else read_secret(token_file).strip()
+        token = secret(token_file, "DASHBOARD_TOKEN").strip()
         if token and (len(token) < _SHORTEST or not token.isascii() or not token.isprintable()):
             raise DashboardError("token", f"{len(token)} characters", f"at least {_SHORTEST} of ASCII, without spaces")
         if not token and not is_loopback(host):
-            expected = f"127.0.0.1, or a token: --token-file, or {TOKEN_VARIABLE} in the environment"
+            expected = "127.0.0.1, or a token: --token-file, or PLOW_TWIN_DASHBOARD_TOKEN in the environment"
             raise DashboardError("--listen", listen, expected)
         return cls(host, port, token)
 

@@ -16,14 +16,9 @@ from plow_twin.live.timer import Timer
 def open_screen(front: BridgeFront, access: PageAccess, source: str) -> Screen:
     """Open the screen of a twin that has not been started yet. The errors are those of `Screen`."""
     runtime = front.runtime
-    services = Services(runtime, front.changed)
-
-    def answer(action: str, text: str) -> tuple[bool, str]:
-        return services.acknowledge_alarms() if action == "acknowledge" else services.mark(text)
-
     facts = facts_of(runtime.scene, asdict(runtime.settings), source)
     load = (lambda: runtime.driver.session.twin.wrench) if facts["loads"] else None
-    screen = Screen(access, facts, answer, load, front.say_error)
+    screen = Screen(access, facts, Services(runtime, front.changed).answer, load, front.say_error)
     front.attach(screen.feed)
     front.timers.append(Timer(1.0 / RATE_HZ, screen.feed.turn))
     return screen

@@ -8,14 +8,12 @@ from functools import partial
 from typing import Any, Final
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
-from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import parameter_value_to_python
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import JointState
+from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
 from plow_twin.dashboard.access import DashboardError, PageAccess
@@ -31,10 +29,11 @@ from plow_twin.record.rows import poses_of
 from plow_twin.ros.connections import WithoutEvents
 from plow_twin.ros.main import make_executor
 from plow_twin.ros.messages import UNREADABLE, read_wrench
+from plow_twin.ros.publishers import CLASSES
 from plow_twin.ros.qos import DIAGNOSTICS, OUTPUTS, sensor_input
 from plow_twin.ros.start import ros
 from plow_twin.scene_file import load_scene
-from plow_twin.stream.topics import Cadence, names_of
+from plow_twin.stream.topics import TOPICS, Cadence, names_of
 
 #: Parameters of the node that the page shows.
 _SHOWN: Final = (
@@ -45,6 +44,7 @@ _SHOWN: Final = (
 _PATIENCE_S: Final = 5.0
 #: Depths of the queues for topics from which only the newest message is needed, or all messages.
 _NEWEST, _ALL = 1, 1000
+_TYPES: Final = {topic.name: topic.type for topic in TOPICS}
 
 
 class NodeWatch:
@@ -97,17 +97,15 @@ class NodeWatch:
     def listen(self, feed: Feed) -> None:
         """Pass all messages that arrive after this call to a feed."""
         self.feed = feed
-        best_effort = partial(QoSProfile, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self._subscribe(JointState, "contact_forces", best_effort(depth=_NEWEST), self._forces)
-        self._subscribe(JointState, "contact_peaks", best_effort(depth=_ALL), self._peaks)
-        self._subscribe(JointState, "peak_intervals", best_effort(depth=_ALL), self._points)
-        self._subscribe(Odometry, "head_state", best_effort(depth=_NEWEST), self._pose)
-        self._subscribe(JointState, "clearance", best_effort(depth=_NEWEST), self._clearance)
-        self._subscribe(JointState, "quality", OUTPUTS["quality"], self._quality)
-        for topic in names_of(Cadence.ESTIMATE):
-            self._subscribe(JointState, topic, OUTPUTS[topic], partial(self._said, topic))
-        for topic in names_of(Cadence.CHANGE):
-            self._subscribe(DiagnosticStatus, topic, OUTPUTS[topic], partial(self._said, topic))
+        newest, every = sensor_input(_NEWEST), sensor_input(_ALL)
+        self._subscribe("contact_forces", newest, self._forces)
+        self._subscribe("contact_peaks", every, self._peaks)
+        self._subscribe("peak_intervals", every, self._points)
+        self._subscribe("head_state", newest, self._pose)
+        self._subscribe("clearance", newest, self._clearance)
+        self._subscribe("quality", OUTPUTS["quality"], self._quality)
+        for topic in names_of(Cadence.ESTIMATE, Cadence.CHANGE):
+            self._subscribe(topic, OUTPUTS[topic], partial(self._said, topic))
         if self._source == "excitation":
             self.node.create_subscription(WrenchStamped, "excitation", self._load, sensor_input(_ALL), raw=True)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._diagnostics, DIAGNOSTICS)
@@ -131,11 +129,10 @@ class NodeWatch:
         self._executor.spin_until_future_complete(future, timeout_sec=_PATIENCE_S)
         return future.result() if future.done() else None
 
-    def _subscribe(self, kind: type, topic: str, quality: QoSProfile, take: Callable[[Any], None]) -> None:
+    def _subscribe(self, topic: str, quality: QoSProfile, take: Callable[[Any], None]) -> None:
         """Subscribe to an output, decoded to the classes that recordings use."""
-        message_type = plain.JointState.TYPE if kind is JointState else plain.DiagnosticStatus.TYPE
-        message_type = plain.Odometry.TYPE if kind is Odometry else message_type
-        self.node.create_subscription(kind, topic, lambda data: take(decode(data, message_type)), quality, raw=True)
+        kind = _TYPES[topic]
+        self.node.create_subscription(CLASSES[kind], topic, lambda data: take(decode(data, kind)), quality, raw=True)
 
     @property
     def _motion(self) -> Any:

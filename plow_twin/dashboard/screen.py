@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict
-from importlib.util import find_spec
 from typing import Any
 
 from plow_twin.access import in_url
@@ -28,12 +27,10 @@ class Screen(Beside):
         load: Callable[[], Array] | None = None,
         on_error: Callable[[str], object] = lambda text: None,
     ) -> None:
-        for name in ("starlette", "uvicorn", "websockets"):
-            if find_spec(name) is None:
-                raise ModuleNotFoundError(name, name=name)
         with listening(access) as page:
             port = int(page.getsockname()[1])
-            super().__init__("plow_twin.dashboard.server", asdict(access), (page.fileno(),))
+            needed = "starlette", "uvicorn", "websockets"
+            super().__init__("plow_twin.dashboard.server", asdict(access), needed, (page.fileno(),))
         self.url = f"http://{in_url(access.host)}:{port}/"
         self.feed = Feed(self.link, facts, answer, load, on_error, by_second=True)
 

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
-import signal
 import socket
 import sys
 from contextlib import suppress
@@ -25,6 +23,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from plow_twin.dashboard.access import PageAccess
+from plow_twin.dashboard.beside import join_twin
 from plow_twin.dashboard.board import Board
 from plow_twin.dashboard.link import Link
 
@@ -182,11 +181,9 @@ def main() -> None:
 
     The first message on the link contains the address and the token.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(_NICE)
-    end, listening = (socket.socket(fileno=int(number)) for number in sys.argv[1:3])
-    access = PageAccess(**json.loads(end.recv(_WISH)))
-    asyncio.run(serve(Link(end), listening, access))
+    link, access = join_twin(_NICE)
+    listening = socket.socket(fileno=int(sys.argv[2]))
+    asyncio.run(serve(link, listening, PageAccess(**access)))
 
 
 if __name__ == "__main__":

@@ -298,7 +298,7 @@ class Health:
     def input(self, runtime: Runtime) -> Part:
         """Return the part `input` about the samples that arrived, were used, and were dropped."""
         counted = counters(runtime.driver)
-        inputs, residual, age_s = runtime.inputs, runtime.residual(), runtime.newest_sample_age_s()
+        inputs, residual, age_s = runtime.inputs, runtime.residual(), runtime.age_s(runtime.driver.newest_ns)
         peak, wait_s = inputs.pop_queue_peak()
         values = {key: str(counted[key]) for key in KEYS["input"] if key in counted} | {
             "source": runtime.settings.excitation_source,
@@ -375,7 +375,7 @@ class Health:
         estimation = runtime.estimation
         if estimation is None:
             return OK, "not estimating", values
-        age_s = runtime.estimate_age_s()
+        age_s = runtime.age_s(estimation.end_ns)
         values |= {
             "ready": str(int(estimation.worker.ready)),
             "estimates": str(estimation.count),

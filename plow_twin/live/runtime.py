@@ -21,7 +21,7 @@ from plow_twin.live.publishing import Front, Outgoing, Publishing
 from plow_twin.live.service_names import mark_problem
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.wear_keeper import KeptWear, WearKeeper
-from plow_twin.model.scene import Scene, fastest_travel
+from plow_twin.model.scene import fastest_travel
 from plow_twin.record.alarms import alarms_of
 from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.record.times import EPOCH_S
@@ -112,7 +112,7 @@ class Runtime:
             made.pop_all()
         session = Session(
             prepared.twin,
-            on_entry=self._journal(),
+            on_entry=self._journal,
             rollback_span_s=settings.rollback_span,
             wear_depth=depth,
         )
@@ -127,10 +127,7 @@ class Runtime:
             settings.input_depth,
             settings.rollback_span,
             journaled=self.recording is not None,
-            jump_back_s=settings.jump_back,
-            jump_forward_s=settings.jump_forward,
             expected_rate_hz=settings.expected_rate,
-            limits=limits(settings, self.scene),
         )
         every_sample = settings.publish_mode == "on_sample"
         self.driver = Driver(session, self.inputs.intake, policy(settings), every_sample=every_sample)
@@ -191,15 +188,8 @@ class Runtime:
         newest = self.publishing.newest
         return None if newest is None else self.inputs.residual(newest["q"][0])
 
-    def newest_sample_age_s(self) -> float | None:
-        """Return the time since the stamp of the newest used sample [s], or None if it is unknown."""
-        return self._age_s(self.driver.newest_ns)
-
-    def estimate_age_s(self) -> float | None:
-        """Return the time since the end of the window of the last estimate [s], or None if it is unknown."""
-        return self._age_s(self.estimation.end_ns if self.estimation else None)
-
-    def _age_s(self, stamp_ns: int | None) -> float | None:
+    def age_s(self, stamp_ns: int | None) -> float | None:
+        """Return the time since a stamp [s], or None if it is unknown."""
         now_ns = self._front.now_ns()
         # a stamp that is not a date cannot be compared with a date
         if stamp_ns is None or stamp_ns < EPOCH_S * 1e9 <= now_ns:
@@ -301,10 +291,7 @@ class Runtime:
         """Apply a parameter that takes effect immediately."""
         self.settings = settings
         self.driver.policy = policy(settings)
-        self.driver.intake.limits = limits(settings, self.scene)
         self._set_limits(settings)
-        for intake in (self.driver.intake, self.driver.clock):
-            intake.jump_back_s, intake.jump_forward_s = settings.jump_back, settings.jump_forward
         if self.waits_for_clock:
             return  # the journal is not open, and `start` will apply the settings
         if name in MODEL:
@@ -314,12 +301,20 @@ class Runtime:
             self.driver.session.apply(Parameter(name, value))
 
     def _set_limits(self, settings: Settings) -> None:
-        pose = pose_limits(self.scene, settings.limit_pose, settings.limit_pose_rate)
+        for intake in (self.driver.intake, self.driver.clock):
+            intake.jump_back_s, intake.jump_forward_s = settings.jump_back, settings.jump_forward
+        self.driver.intake.limits = excitation_limits(
+            self.scene,
+            settings.limit_force,
+            settings.limit_moment,
+            settings.limit_force_rate,
+            settings.limit_moment_rate,
+        )
         travel = value_limits(settings.limit_travel, settings.limit_travel_rate)
         scene = changed_scene(self.scene, model_changes(settings))
         self.inputs.set_limits(
             Limits((min(settings.limit_travel, fastest_travel(scene.wear, scene.contact)),), travel.fastest),
-            pose,
+            pose_limits(self.scene, settings.limit_pose, settings.limit_pose_rate),
             value_limits(settings.limit_gap or pose_limits(self.scene).largest[0], settings.limit_gap_rate),
         )
 
@@ -349,12 +344,6 @@ class Runtime:
             else:
                 yield from self.publishing.messages(applied)
         self._advanced(len(arrived))
-
-    def _journal_series(self, series: Series) -> None:
-        if self.recording:
-            self.recording.series(series)
-        if self.estimation:
-            self.estimation.add_series(series)
 
     def _send(self, outgoing: Iterable[Outgoing]) -> None:
         for topic, message in outgoing:
@@ -407,18 +396,17 @@ class Runtime:
             raise ParameterError(found)
         return Estimation(self.settings, self.scene)
 
-    def _journal(self) -> Callable[[Entry], object]:
-        recording, estimation = self.recording, self.estimation
-        if estimation is None:
-            return recording.recorder.journal if recording else lambda entry: None
-        if recording is None:
-            return estimation.add
+    def _journal(self, entry: Entry) -> None:
+        if self.recording:
+            self.recording.recorder.journal(entry)
+        if self.estimation:
+            self.estimation.add(entry)
 
-        def both(entry: Entry) -> None:
-            recording.recorder.journal(entry)
-            estimation.add(entry)
-
-        return both
+    def _journal_series(self, series: Series) -> None:
+        if self.recording:
+            self.recording.series(series)
+        if self.estimation:
+            self.estimation.add_series(series)
 
     def add_travel(self, stamp_ns: int, speed_m_s: float) -> None:
         """Check and use a speed along the face."""
@@ -514,10 +502,3 @@ def _periods(settings: Settings) -> Periods | None:
 def policy(settings: Settings) -> Policy:
     """Return the policy for silences and failures from the parameters."""
     return Policy(settings.excitation_timeout, settings.hold_policy, settings.hold_limit, settings.failure_limit)
-
-
-def limits(settings: Settings, scene: Scene) -> Limits:
-    """Return the limits of the load from the parameters."""
-    return excitation_limits(
-        scene, settings.limit_force, settings.limit_moment, settings.limit_force_rate, settings.limit_moment_rate
-    )

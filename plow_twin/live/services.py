@@ -31,6 +31,10 @@ class Services:
         done: tuple[bool, str] = getattr(self, name)()
         return done
 
+    def answer(self, action: str, text: str) -> tuple[bool, str]:
+        """Answer the request `acknowledge` of an operator, or the request `mark` with a text."""
+        return self.call("acknowledge_alarms" if action == "acknowledge" else "mark", text)
+
     def mark(self, text: str | None = None) -> tuple[bool, str]:
         """Write a text to the journal, and the ring of the recorder (the last seconds of the run) to the disk.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from rclpy.node import Node
@@ -42,7 +41,7 @@ class RosFront:
         settings: Settings,
         changed: Callable[[], None],
         prepared: Prepared,
-        kept_wear: Mapping[str, KeptWear] = MappingProxyType({}),
+        kept_wear: Mapping[str, KeptWear],
     ) -> None:
         self._node = node
         self.name: str = node.get_fully_qualified_name()

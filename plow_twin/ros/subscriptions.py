@@ -46,7 +46,7 @@ class Subscriptions:
         front: Front,
         loop: InputLoop,
         turns: Turns,
-        elsewhere: Collection[str] = (),
+        elsewhere: Collection[str],
     ) -> None:
         self._elsewhere = elsewhere
         self._node, self._runtime, self._front, self._loop, self._turns = node, runtime, front, loop, turns

@@ -168,8 +168,8 @@ def record_topics(
     exclude: str | None,
     but: Iterable[str],
     stopped: Callable[[], bool],
-    on_started: Callable[[Path], object] = lambda folder: None,
-    on_trouble: Callable[[str], object] = lambda text: None,
+    on_started: Callable[[Path], object],
+    on_trouble: Callable[[str], object],
 ) -> Mapping[str, Any]:
     """Record topics to a new folder until `stopped` returns True.
 

@@ -191,7 +191,7 @@ def simulate(
 
     try:
         _run(compiled, motion, times, t_end, method, dt, watch)
-    except _StoppedError as stop:
+    except LimitError as stop:
         raise LimitError(str(stop), so_far(motion.rows, motion.time), motion.time) from None
     except KeyboardInterrupt:
         message = f"interrupted at t = {motion.time:.9g} s of {t_end:g} s"
@@ -205,10 +205,6 @@ def simulate(
     return replace(result, sensitivity=value)
 
 
-class _StoppedError(Exception):
-    """A limit of the run was reached."""
-
-
 class _Watch:
     """Checks limits and reports progress between slices of a run."""
 
@@ -219,7 +215,7 @@ class _Watch:
         self._begin = _time.perf_counter()
 
     def look(self, motion: Motion) -> None:
-        """Report progress, and raise `_StoppedError` if a limit is reached."""
+        """Report progress, and raise `LimitError` without a result if a limit is reached."""
         steps, wall = int(motion.state.steps), _time.perf_counter() - self._begin
         if self._on_progress is not None:
             self._on_progress(motion.time / self._t_end if self._t_end > 0.0 else 1.0)
@@ -227,10 +223,12 @@ class _Watch:
         if steps >= self.max_steps or wall >= self._max_wall_s:
             mode = motion.state.mode
             pairs = ", ".join(name for name, pair_mode in zip(PAIR_NAMES, mode, strict=True) if pair_mode != OFF)
-            raise _StoppedError(
+            raise LimitError(
                 f"{limit} reached at t = {motion.time:.9g} s of {self._t_end:g} s after {steps} steps and "
                 f"{wall:.1f} s; the last step was {float(motion.state.last_step_size):.3g} s long, in contact: "
-                f"{pairs or 'no pair'}"
+                f"{pairs or 'no pair'}",
+                None,
+                motion.time,
             )
 
 

@@ -12,7 +12,6 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from operator import lt
 from typing import Final
 
 import numpy as np
@@ -256,14 +255,8 @@ class Alarms:
         if not all(self.alarms[name].stays(found) for name, found in values.items() if name in self.alarms):
             return False
         rate, stamps_ns = 0.0, slow["stamp_ns"].tolist()
-        if stamps_ns:
-            *earlier, clearance = values["clearance"].max(axis=1).tolist()
-            if all(map(lt, stamps_ns, stamps_ns[1:])) and self._clearances and stamps_ns[0] > self._clearances[-1][0]:
-                self._clearances.extend(zip(stamps_ns, earlier, strict=False))
-            else:
-                for number in zip(stamps_ns, earlier, strict=False):
-                    self._growth(*number)
-            rate = self._growth(stamps_ns[-1], clearance)
+        for stamp_ns, clearance in zip(stamps_ns, values["clearance"].max(axis=1).tolist(), strict=True):
+            rate = self._growth(stamp_ns, clearance)
         # no level changes, so only the newest values matter
         newest = {name: float(found[-1].max()) for name, found in values.items() if len(found)}
         for name, value in (newest | ({"clearance_rate": rate} if stamps_ns else {})).items():

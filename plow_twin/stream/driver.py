@@ -113,7 +113,7 @@ class Driver:
         #: number of travel speeds that could not take effect at their stamps
         self.travel_misplaced = 0
         #: times of the latest resets by jumps of the clock, on the steady clock [ns]
-        self._resets_ns: deque[int] = deque()
+        self._resets_ns: deque[int] = deque(maxlen=_MOST_RESETS)
         #: time of the latest refused reset, on the steady clock [ns]
         self._unsteady_ns: int | None = None
         self._steps = Steps(intake)
@@ -301,9 +301,7 @@ class Driver:
 
     def restore(self, stamp_ns: int, snapshot: journal.Snapshot) -> None:
         """Return to the motion of a snapshot. The next sample is at the model time of the snapshot."""
-        self.failed.end()
-        self.session.apply(journal.Restore(stamp_ns, snapshot.data))
-        self._restart_stream()
+        self._restart_motion(journal.Restore(stamp_ns, snapshot.data))
         self._restart_stamps()
 
     def set_model(self, stamp_ns: int, changes: Mapping[str, float]) -> None:
@@ -322,9 +320,7 @@ class Driver:
         depth = tuple(float(value) for value in depth_m)
         if len(depth) != PAIR_COUNT or not all(0.0 <= value < math.inf for value in depth):
             raise ValueError(f"wear depth: got {list(depth_m)!r}, expected {PAIR_COUNT} finite depths >= 0 in m")
-        self.failed.end()
-        self.session.apply(journal.SetWear(stamp_ns, depth, reason))
-        self._restart_stream()
+        self._restart_motion(journal.SetWear(stamp_ns, depth, reason))
         self._restart_stamps()
 
     def unsteady(self, now_ns: int) -> bool:
@@ -363,9 +359,7 @@ class Driver:
         return verdict
 
     def _may_reset(self, now_ns: int) -> bool:
-        while self._resets_ns and now_ns - self._resets_ns[0] >= _RESET_WINDOW_NS:
-            self._resets_ns.popleft()
-        return len(self._resets_ns) < _MOST_RESETS
+        return len(self._resets_ns) < _MOST_RESETS or now_ns - self._resets_ns[0] >= _RESET_WINDOW_NS
 
     def _restart_model(self, stamp_ns: int, reason: str, now_ns: int | None) -> None:
         """Reset the model.
@@ -375,12 +369,12 @@ class Driver:
         """
         if now_ns is not None:
             self._resets_ns.append(now_ns)
-        self.failed.end()
-        self.session.apply(journal.Reset(stamp_ns, reason))
+        self._restart_motion(journal.Reset(stamp_ns, reason))
         self.resets += 1
-        self._restart_stream()
 
-    def _restart_stream(self) -> None:
+    def _restart_motion(self, entry: journal.Reset | journal.Restore | journal.SetWear) -> None:
+        self.failed.end()
+        self.session.apply(entry)
         self.newest_ns = self._counted_ns = None
         self.silences.restart()
         self.state = StreamState.WAITING

@@ -78,12 +78,10 @@ class Periods:
 
     def recent(self) -> tuple[float, float, float]:
         """Return mean, standard deviation and maximum of the times [s] since the last call; NaN without iterations."""
-        quantiles, self._recent = np.array(self._recent), []
-        return (
-            (float(quantiles.mean()), float(quantiles.std()), float(quantiles.max()))
-            if quantiles.size
-            else (math.nan,) * 3
-        )
+        periods, self._recent = np.array(self._recent), []
+        if not periods.size:
+            return math.nan, math.nan, math.nan
+        return float(periods.mean()), float(periods.std()), float(periods.max())
 
 
 class RealTimeFactor:

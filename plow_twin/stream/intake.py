@@ -233,7 +233,11 @@ class Intake:
         if ahead_ns > self.jump_forward_s * NS_PER_S:
             return Verdict.JUMP_FORWARD
         if ahead_ns > 0:
-            return Verdict.IMPLAUSIBLE if self._too_fast(stamp_ns, values) else Verdict.ACCEPTED
+            before_ns = self._newest_ns
+            if self.limits is None or before_ns is None:
+                return Verdict.ACCEPTED
+            kept = self.limits.keep(self._newest_values, values, (stamp_ns - before_ns) * 1e-9)
+            return Verdict.ACCEPTED if kept else Verdict.IMPLAUSIBLE
         # the stamp is compared with the newest stamp, because during a silence the model may have moved ahead of the
         # stamps
         if newest_ns - stamp_ns > self.jump_back_s * NS_PER_S:
@@ -245,8 +249,3 @@ class Intake:
     def _goes_on_from_before(self, stamp_ns: int) -> bool:
         before_ns = self._before_jump_ns
         return before_ns is not None and 0 < stamp_ns - before_ns <= self.jump_forward_s * NS_PER_S
-
-    def _too_fast(self, stamp_ns: int, values: Sequence[float]) -> bool:
-        if self.limits is None or self._newest_ns is None:
-            return False
-        return self.limits.too_fast(self._newest_values, values, (stamp_ns - self._newest_ns) * 1e-9)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from operator import gt, sub
+from operator import gt
 from typing import Final
 
 import numpy as np
@@ -33,8 +33,11 @@ class Limits:
         return any(map(gt, map(abs, values), self.largest))
 
     def keep(self, before: Sequence[float], values: Sequence[float], duration_s: float) -> bool:
-        """Return whether `values`, which follow `before` after `duration_s` [s], are finite and within all limits."""
-        for old, value, largest, fastest in zip(before, values, self.largest, self.fastest, strict=True):
+        """Return whether `values`, which follow `before` after `duration_s` [s], are finite and within all limits.
+
+        Values without a limit, such as the standard deviations of a pose, are ignored.
+        """
+        for old, value, largest, fastest in zip(before, values, self.largest, self.fastest, strict=False):
             if not (abs(value) <= largest and abs(value - old) <= fastest * duration_s):
                 return False
         return True
@@ -48,11 +51,6 @@ class Limits:
         with np.errstate(invalid="ignore"):  # inf - inf is NaN, and a comparison with NaN is False
             steady = np.abs(np.diff(values, axis=0)) <= np.array(self.fastest) * duration_s[:, None]
         return np.asarray((within & steady).all(axis=1))
-
-    def too_fast(self, before: Sequence[float], values: Sequence[float], duration_s: float) -> bool:
-        """Return whether a value has changed faster than its limit in `duration_s` [s]."""
-        most = [fastest * duration_s for fastest in self.fastest]
-        return any(map(gt, map(abs, map(sub, values, before)), most))
 
 
 def pose_limits(scene: Scene, displacement: float = 0.0, rate: float = 0.0) -> Limits:

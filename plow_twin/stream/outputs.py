@@ -22,6 +22,7 @@ from plow_twin.solve.state import ROW, WITH_INTERVALS
 from plow_twin.solve.totals import publish, publish_window, summary
 
 Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
 Rows = NDArray[np.void]
 
 #: Period of the slow parts [ns]; only the first publication in each period has a slow part.
@@ -94,7 +95,7 @@ class Published(NamedTuple):
         slow = self.slow[self.slow["row"] == index]
         return Published(self.rows[index : index + 1], _numbered_from(slow, index))
 
-    def of(self, index: NDArray[np.int64]) -> Published:
+    def of(self, index: Integers) -> Published:
         """Return the rows with the given indices, which must rise, and the slow parts of these rows."""
         slow = self.slow[np.isin(self.slow["row"], index)]
         slow["row"] = np.searchsorted(index, slow["row"])
@@ -197,7 +198,7 @@ class Outputs:
         values[_KNOWN] = shift
         self._shift = values if values.any() else None
 
-    def add(self, rows: Rows, stamps: NDArray[np.int64], taken: NDArray[np.int64], *, held: bool = False) -> Published:
+    def add(self, rows: Rows, stamps: Integers, taken: Integers, *, held: bool = False) -> Published:
         """Add advances to the window, and return the publications after some of them.
 
         `rows`, shape (n,), are the advances, and `stamps`, shape (n,), their stamps [ns]. A publication follows each
@@ -257,9 +258,9 @@ class Outputs:
         return not (self._waits or window["corrected"][0] or window["marked"][0])
 
     @property
-    def makes(self) -> NDArray[np.int64]:
+    def makes(self) -> Integers:
         """Number of touches of each pair so far, shape (8,)."""
-        makes: NDArray[np.int64] = self._window["makes"][0].copy()
+        makes: Integers = self._window["makes"][0].copy()
         return makes
 
     def restart(self) -> None:
@@ -306,6 +307,8 @@ class Outputs:
         slow = np.zeros(len(index), SLOW)
         slow["stamp_ns"], slow["row"] = stamps, index
         slow["clearance"], slow["wear_rate"] = self._clearance(wear_depth), growth / elapsed_s[:, None]
+        if self._shift is not None:
+            slow["clearance"] += self._shift
         followed = np.flatnonzero(rows["followed"][index])
         if followed.size:
             slow["clearance"][followed[:, None], _KNOWN] = rows["known_clearance"][index[followed]]
@@ -317,15 +320,12 @@ class Outputs:
         count = len(_CLEARANCES)
         clearance = np.empty((*wear_depth.shape[:-1], 3 * count))
         clearance[..., :count], clearance[..., count::2], clearance[..., count + 1 :: 2] = best, low, high
-        if self._shift is not None:
-            clearance += self._shift
         return clearance
 
     def modelled(self, wear_depth: Array) -> Array:
         """Return the clearances of the model without a shift, shape (6,) [m], in the order of `set_shift`."""
-        middle = clearances(self.scene, wear_depth)
-        low, high = (clearances(self.scene, points) for points in prior_points(self.scene, wear_depth))
-        return np.stack((middle, low, high), axis=1)[:2].ravel()
+        known: Array = self._clearance(wear_depth)[_KNOWN]
+        return known
 
     def state(self) -> bytes:
         """Return the exact state as bytes; state and later advances determine all later publications."""

@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import check_travel_speed
@@ -26,7 +25,7 @@ from plow_twin.stream import journal, outputs
 from plow_twin.stream.driven import MOST_MEASURED, PREPARATION_S, Driven, Following
 from plow_twin.stream.history import NO_SAMPLES, History, Samples
 from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
-from plow_twin.stream.outputs import NONE, NOTHING, ONLY_ROW, Outputs, Published, Rows, Stock
+from plow_twin.stream.outputs import NONE, NOTHING, ONLY_ROW, Array, Integers, Outputs, Published, Rows, Stock
 from plow_twin.stream.snapshot import SessionState, split_changes, with_changes
 
 #: Number of advances from one digest to the next.
@@ -67,15 +66,15 @@ class Series(NamedTuple):
     """Samples that were applied together and have not been journalled yet."""
 
     #: stamps [ns], shape (n,)
-    stamps: NDArray[np.int64]
+    stamps: Integers
     #: loads Fx, Fy [N] and M [N m], shape (n, 3)
-    wrench: NDArray[np.float64]
+    wrench: Array
     #: a row for each sample, or no rows
     published: Published
     #: the m digests
     digests: Sequence[str]
     #: number of samples before each digest, shape (m,)
-    digest_after: NDArray[np.int64]
+    digest_after: Integers
 
     def part(self, begin: int, end: int) -> Series:
         """Return the samples with indices from `begin` to `end` - 1, with their publications and digests."""
@@ -270,7 +269,7 @@ class Session:
         self._count(len(samples))
         return applied
 
-    def apply_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], *, each: bool) -> Series | None:
+    def apply_series(self, stamps: Integers, wrench: Array, *, each: bool) -> Series | None:
         """Apply samples together without emitting entries; the caller must journal the returned series.
 
         The result is None, without any change, if the samples must be applied one by one, for example because an
@@ -293,23 +292,18 @@ class Session:
         return Series(stamps, wrench, rows.published, rows.digests, digest_after)
 
     @property
-    def wear_depth(self) -> NDArray[np.float64]:
+    def wear_depth(self) -> Array:
         """Wear depth of each pad [m], shape (8,)."""
         if self._row is not None:
             self.wear_depth = self._row["wear_depth"][-1].copy()
         return self._wear_depth
 
     @wear_depth.setter
-    def wear_depth(self, wear_depth: NDArray[np.float64]) -> None:
+    def wear_depth(self, wear_depth: Array) -> None:
         self._wear_depth, self._row = wear_depth, None
 
     def advance(
-        self,
-        stamps: NDArray[np.int64],
-        wrench: NDArray[np.float64],
-        rows: Rows | None,
-        taken: NDArray[np.int64] = NONE,
-        digest_after: NDArray[np.int64] = NONE,
+        self, stamps: Integers, wrench: Array, rows: Rows | None, taken: Integers = NONE, digest_after: Integers = NONE
     ) -> Applied:
         """Advance to samples that are already in a journal, without emitting entries.
 
@@ -328,12 +322,7 @@ class Session:
         return applied
 
     def _advance(
-        self,
-        stamps: NDArray[np.int64],
-        wrench: NDArray[np.float64],
-        rows: Rows | None,
-        taken: NDArray[np.int64],
-        digest_after: NDArray[np.int64],
+        self, stamps: Integers, wrench: Array, rows: Rows | None, taken: Integers, digest_after: Integers
     ) -> Applied:
         """Advance in parts, which end at a waiting travel speed or after a sample that follows a held load."""
         if not (self.held or self._travels):
@@ -390,16 +379,16 @@ class Session:
         stamp_ns = self.stamp_ns if self.stamp_ns is not None else self.origin_ns or 0
         return journal.Snapshot(stamp_ns, state.pack())
 
-    def _run(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], taken: NDArray[np.int64] = NONE) -> Applied:
+    def _run(self, stamps: Integers, wrench: Array, taken: Integers = NONE) -> Applied:
         return self._advance(stamps, wrench, self._stock.new(len(stamps)), taken, NONE)
 
     def _advance_part(
         self,
-        stamps: NDArray[np.int64],
-        wrench: NDArray[np.float64],
+        stamps: Integers,
+        wrench: Array,
         rows: Rows | None,
-        taken: NDArray[np.int64],
-        digest_after: NDArray[np.int64],
+        taken: Integers,
+        digest_after: Integers,
         *,
         stored: bool = True,
         resumed: bool = False,
@@ -420,7 +409,7 @@ class Session:
         times = np.empty(len(stamps))
         model_times(stamps, origin_ns, times)
         failed, digests = self.twin.advance_rows(times, wrench, rows, digest_after)
-        if undo is not None and (failed or not _all_finite(rows)):
+        if undo is not None and rows is not None and (failed or not _all_finite(rows)):
             self.twin.restore(undo)
             raise _UndoneError
         self.origin_ns, self.stamp_ns = origin_ns, stamps.item(-1)
@@ -460,7 +449,7 @@ class Session:
             ]
             self.poses_dropped += 1
 
-    def _apply_waiting_travel(self, travel: journal.Travel, stamp_ns: int, wrench: NDArray[np.float64]) -> None:
+    def _apply_waiting_travel(self, travel: journal.Travel, stamp_ns: int, wrench: Array) -> None:
         self._travels.pop(0)
         if self.stamp_ns is not None and travel.stamp_ns > self.stamp_ns:
             share = (travel.stamp_ns - self.stamp_ns) / (stamp_ns - self.stamp_ns)
@@ -542,7 +531,7 @@ class Session:
         self._count(1)
         return rows
 
-    def _move(self, stamp_ns: int, wrench: NDArray[np.float64]) -> Rows:
+    def _move(self, stamp_ns: int, wrench: Array) -> Rows:
         return self._advance_part(np.array([stamp_ns]), wrench, self._stock.new(1), NONE, NONE, stored=False).rows
 
     def _suspend_wear(self) -> None:
@@ -604,7 +593,7 @@ class Session:
         self.history.clear()
         self._measured.clear()
 
-    def _restart(self, wear_depth: NDArray[np.float64]) -> None:
+    def _restart(self, wear_depth: Array) -> None:
         self._end_motion()
         self.wear_depth = wear_depth.copy()
         self.twin.reset(0.0, wear_depth=wear_depth)
@@ -689,8 +678,8 @@ class Session:
         self.held, self.travel_speed_m_s = state.held, state.travel_speed_m_s
 
 
-def _all_finite(rows: Rows | None) -> bool:
-    return rows is None or (Published(rows, NOTHING.slow).finite and bool(np.isfinite(rows["wear_depth"]).all()))
+def _all_finite(rows: Rows) -> bool:
+    return Published(rows, NOTHING.slow).finite and bool(np.isfinite(rows["wear_depth"]).all())
 
 
 def warm_up() -> None:

@@ -35,19 +35,15 @@ class Steps:
         """Add a sample; return the samples that the intake can judge now, in order of arrival."""
         jumped, jumps = self._jumped, self._intake.jumps(stamp_ns, reached_ns)
         arrival = stamp_ns, wrench, now_ns
-        if jumped is None or stamp_ns <= 0:  # a sample without a stamp gives no evidence about the clock
-            if not jumps:
-                return (arrival,)
-            self._jumped = arrival
-            return ()
-        if stamp_ns == jumped[0]:
-            self._intake.refuse(Verdict.DUPLICATE, stamp_ns, wrench)
-            return ()
-        self._jumped = None
-        if jumps and self._intake.near(stamp_ns, jumped[0]):
-            return jumped, arrival
-        self._intake.refuse(Verdict.STRAY, *jumped[:2])
-        self._strays_ns.append(now_ns)
+        if jumped is not None and stamp_ns > 0:  # a sample without a stamp gives no evidence about the clock
+            if stamp_ns == jumped[0]:
+                self._intake.refuse(Verdict.DUPLICATE, stamp_ns, wrench)
+                return ()
+            self._jumped = None
+            if jumps and self._intake.near(stamp_ns, jumped[0]):
+                return jumped, arrival
+            self._intake.refuse(Verdict.STRAY, *jumped[:2])
+            self._strays_ns.append(now_ns)
         if not jumps:
             return (arrival,)
         self._jumped = arrival
@@ -70,8 +66,6 @@ class Steps:
     def unsteady(self, now_ns: int) -> bool:
         """Return whether `_MOST_STRAYS` recent stamps were stray."""
         strays_ns = self._strays_ns
-        if not strays_ns:
-            return False
         if len(strays_ns) < _MOST_STRAYS or now_ns - strays_ns[-1] >= _WINDOW_NS:
             return False
         return strays_ns[-1] - strays_ns[0] < _WINDOW_NS

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from plow_twin.access import in_url, is_loopback, read_secret
+from plow_twin.access import in_url, is_loopback, secret
 from plow_twin.errors import InputError, Problem
 from plow_twin.scene_file.validation import TEXT, mapping, validate
 from plow_twin.scene_file.yaml_text import read_yaml
@@ -88,12 +87,9 @@ class Credentials:
         return str(path)
 
     def secret(self, section: str, key: str, variable: str) -> str:
-        """Return the first line of the stated file.
-
-        If no file is stated, return the environment variable `PLOW_TWIN_<variable>`.
-        """
+        """Return the secret in the stated file or, if no file is stated, in `PLOW_TWIN_<variable>`."""
         path = self.file(section, key)
-        return os.environ.get(f"PLOW_TWIN_{variable}", "") if path is None else read_secret(Path(path))
+        return secret(None if path is None else Path(path), variable)
 
 
 def mqtt_out(url: str, credentials: Credentials, *, plain: bool, sparkplug: str = "") -> list[OutputSpec]:

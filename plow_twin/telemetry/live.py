@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict
 
 from plow_twin.dashboard.facts import facts_of
@@ -16,13 +15,8 @@ from plow_twin.telemetry.outlet import Outlet
 def open_output(front: BridgeFront, output: OutputSpec, rate_hz: float, source: str) -> Outlet:
     """Open an output of a twin that has not been started yet. The errors are those of `Outlet`."""
     runtime = front.runtime
-    services = Services(runtime, front.changed)
-
-    def answer(action: str, text: str) -> tuple[bool, str]:
-        return services.call("acknowledge_alarms") if action == "acknowledge" else (False, "not possible here")
-
-    on_request: Callable[[str, str], tuple[bool, str]] | None = answer if output.may_acknowledge else None
-    outlet = Outlet(output, facts_of(runtime.scene, asdict(runtime.settings), source), on_request, front.say_error)
+    answer = Services(runtime, front.changed).answer if output.may_acknowledge else None
+    outlet = Outlet(output, facts_of(runtime.scene, asdict(runtime.settings), source), answer, front.say_error)
     front.attach(outlet.feed)
     front.more_parts[output.name] = outlet.part
     front.timers.append(Timer(1.0 / rate_hz, outlet.turn))

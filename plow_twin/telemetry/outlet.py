@@ -5,7 +5,6 @@ from __future__ import annotations
 import select
 import time
 from collections.abc import Callable
-from importlib.util import find_spec
 from typing import Any, Final
 
 from plow_twin.dashboard.beside import END_S, Beside
@@ -33,10 +32,7 @@ class Outlet(Beside):
         answer: Callable[[str, str], tuple[bool, str]] | None,
         on_error: Callable[[str], object],
     ) -> None:
-        for name in output.modules:
-            if not _is_there(name):
-                raise ModuleNotFoundError(name, name=name)
-        super().__init__("plow_twin.telemetry.process", {**output.first, "facts": facts})
+        super().__init__("plow_twin.telemetry.process", {**output.first, "facts": facts}, output.modules)
         self.name, self.address, self._on_error = output.name, output.address, on_error
         ended = f"the process of {output.address}", "nothing is sent there any more"
         self.feed = Feed(self.link, facts, answer, None, on_error, *ended)
@@ -78,11 +74,3 @@ class Outlet(Beside):
             select.select([self.link], [], [], 0.1)
             self.feed.receive()
         super().close()
-
-
-def _is_there(name: str) -> bool:
-    """Return whether a module can be imported, without importing it."""
-    try:
-        return find_spec(name) is not None
-    except ModuleNotFoundError:
-        return False

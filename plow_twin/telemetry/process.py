@@ -7,17 +7,13 @@ queued. If the queue is full, updates are dropped and counted, so that the twin 
 from __future__ import annotations
 
 import asyncio
-import json
-import os
-import signal
-import socket
-import sys
 from contextlib import suppress
 from dataclasses import asdict
 from importlib import import_module
 from typing import Any, Final
 
-from plow_twin.dashboard.link import LONGEST, Link
+from plow_twin.dashboard.beside import join_twin
+from plow_twin.dashboard.link import Link
 from plow_twin.errors import PlowTwinError
 from plow_twin.telemetry.output import Output
 from plow_twin.telemetry.values import Newest
@@ -81,12 +77,7 @@ async def _run(link: Link, first: dict[str, Any]) -> None:
 
 def main() -> None:
     """Serve an output over the link, whose file descriptor is the argument."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(_NICE)
-    end = socket.socket(fileno=int(sys.argv[1]))
-    end.setblocking(True)
-    data = end.recv(LONGEST)
-    asyncio.run(_run(Link(end), json.loads(data)))
+    asyncio.run(_run(*join_twin(_NICE)))
 
 
 if __name__ == "__main__":

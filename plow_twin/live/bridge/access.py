@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from plow_twin.access import read_secret
+from plow_twin.access import secret
 from plow_twin.errors import InputError
 from plow_twin.live.bridge.source import BridgeError
 from plow_twin.scene_file.validation import TEXT, mapping, validate
@@ -63,25 +62,16 @@ def host_and_port(access: Access, ports: Mapping[str, int], *, has_path: bool = 
     return parts.scheme, host, port
 
 
-def password(path: Path | None, source: str) -> str:
-    """Return the password for a source.
-
-    The password is the first line of a file or, if `path` is None, the environment variable
-    `PLOW_TWIN_<source>_PASSWORD`.
-    """
-    return os.environ.get(f"PLOW_TWIN_{source}_PASSWORD", "") if path is None else read_secret(path)
-
-
 def read_access(url: str, path: Path | None) -> Access:
     """Return the address of an OPC UA server with the credentials from a YAML file.
 
     The paths in the file are relative to the folder of the file.
     """
     if path is None:
-        return Access(url, password=password(None, "OPCUA"))
+        return Access(url, password=secret(None, "OPCUA_PASSWORD"))
     document, found = read_yaml(path, "credentials", _CREDENTIALS["description"])
     if problems := found or validate(document, _CREDENTIALS, "credentials"):
         raise InputError(problems, str(path))
     files: dict[str, Any] = {key: path.parent / document[key] for key in _FILES if key in document}
-    secret = password(files.pop("password_file", None), "OPCUA")
-    return Access(url, document.get("user", ""), secret, plain=document.get("plain", False), **files)
+    password = secret(files.pop("password_file", None), "OPCUA_PASSWORD")
+    return Access(url, document.get("user", ""), password, plain=document.get("plain", False), **files)

@@ -31,6 +31,7 @@ _REMEMBERED: Final = 256
 _LOOK_S: Final = 0.02
 _LOOK_FOR_FILES_S: Final = 0.2
 STDIN_TOPIC: Final = "stdin"
+_STDIN: Final = 0
 
 
 @dataclass
@@ -221,8 +222,7 @@ class Files(Bridge):
                 raise BridgeError(f"{tail.path}: got Parquet, which does not grow by lines; expected CSV for --follow")
             if not tail.path.parent.is_dir():
                 raise BridgeError(f"{tail.path.parent}: no such folder")
-        self._merged: Iterator[Arrived] | None = None
-        self._tables: Iterator[Messages] | None = None
+        self._messages: Iterator[Messages] = iter(())
         #: total size of the files, and number of bytes that have been read; with `follow`, the total size is 0
         self._size = self._done = 0
 
@@ -247,16 +247,13 @@ class Files(Bridge):
         if self.ends:
             self._size = sum(file.stat().st_size for tail in self._tails for file in tail.files())
             streams = [self._all(tail) for tail in self._tails]
-            if len(streams) == 1:
-                self._tables = streams[0]
-            else:
-                rows = [chain.from_iterable(stream) for stream in streams]
-                self._merged = merged(rows, lambda row: _sent_ns(row, stamp_ns))
+            rows = merged([chain.from_iterable(stream) for stream in streams], lambda row: _sent_ns(row, stamp_ns))
+            self._messages = streams[0] if len(streams) == 1 else iter(lambda: list(islice(rows, BATCH)), [])
 
     def poll(self, timeout_s: float) -> Messages:
         """Return the next messages."""
         if self.ends:
-            messages = next(self._tables, []) if self._tables is not None else list(islice(self._merged or (), BATCH))
+            messages = next(self._messages, [])
             self.finished = not len(messages)
             return messages
         give_up = time.monotonic() + timeout_s
@@ -312,13 +309,12 @@ def _sent_ns(row: Arrived, stamp_ns: StampOf[Arrived] | None) -> int | None:
 
 
 class StandardInput(Bridge):
-    """Lines from standard input or from another file descriptor."""
+    """Lines from standard input."""
 
-    def __init__(self, descriptor: int = 0) -> None:
-        if descriptor == 0 and sys.stdin is None:
+    def __init__(self) -> None:
+        if sys.stdin is None:
             raise BridgeError("-: got a closed standard input, expected lines")
         super().__init__(connected=True)
-        self._descriptor = descriptor
         self._lines, self._rows = Lines(), Rows()
         self._first: list[Arrived] = []
 
@@ -340,10 +336,10 @@ class StandardInput(Bridge):
 
     def _read(self, timeout_s: float) -> list[Arrived]:
         try:
-            ready, _, _ = select.select([self._descriptor], [], [], timeout_s)
+            ready, _, _ = select.select([_STDIN], [], [], timeout_s)
             if not ready:
                 return []
-            data = os.read(self._descriptor, _BLOCK)
+            data = os.read(_STDIN, _BLOCK)
         except OSError as error:
             raise BridgeError(f"-: standard input cannot be read: {error.strerror}") from error
         self.finished = not data
@@ -351,4 +347,4 @@ class StandardInput(Bridge):
         return list(Table(STDIN_TOPIC, lines, self._rows))
 
     def close(self) -> None:
-        """Do nothing, because the caller owns the descriptor."""
+        """Do nothing, because standard input stays open."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hmac
 import logging
-from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final
@@ -20,13 +19,13 @@ from cryptography import x509
 
 from plow_twin.access import key_format
 from plow_twin.dashboard.link import Link
-from plow_twin.live.bridge.opcua.security import read_certificate
+from plow_twin.live.bridge.opcua.security import application_uri, read_certificate
+from plow_twin.record.times import EPOCH
 from plow_twin.telemetry.opcua.conditions import Conditions
 from plow_twin.telemetry.opcua.model import Model
 from plow_twin.telemetry.output import State, TelemetryError
 from plow_twin.telemetry.values import Group, Newest, Value
 
-_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _POLICIES: Final = [
     ua.SecurityPolicyType.Aes256Sha256RsaPss_SignAndEncrypt,
     ua.SecurityPolicyType.Aes128Sha256RsaOaep_SignAndEncrypt,
@@ -139,8 +138,7 @@ class OpcUaServer:
             assert loaded is not None and own_key is not None
             if own_key.public_key() != loaded.public_key():
                 raise ValueError("the key does not belong to the certificate")
-            uri = _uri(loaded)
-            if uri:
+            if uri := application_uri(loaded):
                 await self._server.set_application_uri(uri)
             if self._trusted:
                 store = Trusted([Path(self._trusted)], [])
@@ -154,17 +152,10 @@ class OpcUaServer:
 
 
 def _data(value: Value, group: Group) -> ua.DataValue:
-    stamp = _EPOCH + timedelta(seconds=group.time_s) if group.time_s else datetime.now(UTC)
+    stamp = EPOCH + timedelta(seconds=group.time_s) if group.time_s else datetime.now(UTC)
     if value is None:
         return ua.DataValue(ua.Variant(), _UNKNOWN, stamp, datetime.now(UTC))
     kind = ua.VariantType.String if isinstance(value, str) else ua.VariantType.Double
     kind = ua.VariantType.Int32 if isinstance(value, int) else kind
     status = _HELD if group.held and isinstance(value, float) else _GOOD
     return ua.DataValue(ua.Variant(value, kind), status, stamp, datetime.now(UTC))
-
-
-def _uri(certificate: x509.Certificate) -> str:
-    with suppress(x509.ExtensionNotFound):
-        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-        return next(iter(names.get_values_for_type(x509.UniformResourceIdentifier)), "")
-    return ""

@@ -44,7 +44,7 @@ async def secure(client: Client, access: Access, host: str) -> None:
     server = _first(offered[policy.URI].ServerCertificate)
     _check_trust(x509.load_der_x509_certificate(server), read_certificate(access.ca), host, access)
     own = read_certificate(access.certificate)
-    client.application_uri = _application_uri(own, client.application_uri)
+    client.application_uri = application_uri(own) or client.application_uri
     try:
         key = await load_private_key(access.key, extension=_format(access.key))
         if key.public_key() != own.public_key():  # the server would not answer
@@ -123,7 +123,8 @@ def _hosts(certificate: x509.Certificate) -> list[str]:
     return [*names.get_values_for_type(x509.DNSName), *addresses]
 
 
-def _application_uri(certificate: x509.Certificate, otherwise: str) -> str:
+def application_uri(certificate: x509.Certificate) -> str:
+    """Return the first URI in a certificate, or an empty string."""
     names = _names(certificate)
     uris = names.get_values_for_type(x509.UniformResourceIdentifier) if names else []
-    return uris[0] if uris else otherwise
+    return uris[0] if uris else ""
