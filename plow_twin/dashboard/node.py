@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 
 from plow_twin.dashboard.access import DashboardError, PageAccess
 from plow_twin.dashboard.facts import facts_of
-from plow_twin.dashboard.feed import RATE_HZ, Feed
+from plow_twin.dashboard.feed import RATE_HZ, Feed, Motion
 from plow_twin.dashboard.screen import Screen
 from plow_twin.live.part import Part, part_of
 from plow_twin.live.timer import Timer
@@ -67,7 +67,7 @@ class NodeWatch:
             service: self.node.create_client(Trigger, f"{self.name}/{service}")
             for service in ("acknowledge_alarms", "mark")
         }
-        self.feed: Feed | None = None
+        self.feed: Feed  # `listen` sets the attribute
         self._source: str | None = None
         waited = 0.0
         while not self._ask.service_is_ready():
@@ -135,8 +135,7 @@ class NodeWatch:
         self.node.create_subscription(CLASSES[kind], topic, lambda data: take(decode(data, kind)), quality, raw=True)
 
     @property
-    def _motion(self) -> Any:
-        assert self.feed is not None
+    def _motion(self) -> Motion:
         return self.feed.motion
 
     def _forces(self, message: plain.JointState) -> None:
@@ -169,11 +168,9 @@ class NodeWatch:
             self._motion.add_load(np.array([wrench[1]]))
 
     def _said(self, topic: str, message: plain.Message) -> None:
-        assert self.feed is not None
         self.feed.part(topic, part_of(message))
 
     def _diagnostics(self, message: Any) -> None:
-        assert self.feed is not None
         for status in message.status:
             name, _, part = status.name.partition(": ")
             if name == self.name:

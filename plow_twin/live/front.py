@@ -56,14 +56,9 @@ class BridgeFront:
 
     Without the file `mapping`, columns are recognised by their names. `units` replaces units in the mapping, by name of
     the quantity (`t` for the time). `say` receives the status and the alarms when they change, and the diagnostics once
-    a second. `on_error` receives errors, from any thread.
-
-    Raises
-    ------
-    BridgeError
-        The source cannot be used, or the mapping assigns no load.
-    RecordingError, WearStateError, OSError
-        The mapping, the recording or the saved wear cannot be used.
+    a second. `on_error` receives errors, from any thread. Raise `BridgeError` if the source cannot be used or the
+    mapping assigns no load, and `RecordingError`, `WearStateError` or `OSError` if the mapping, the recording or the
+    saved wear cannot be used.
     """
 
     def __init__(
@@ -277,21 +272,13 @@ def _first_messages(bridge: Bridge) -> Iterator[Messages]:
 
 
 def roles_of(
-    bridge: Bridge,
-    mapping: Path | None,
-    source: str,
-    modelled: bool,
-    units: Mapping[str, str] = MappingProxyType({}),
+    bridge: Bridge, mapping: Path | None, source: str, modelled: bool, units: Mapping[str, str] = MappingProxyType({})
 ) -> dict[str, Role]:
     """Return the roles of the topics of a bridge.
 
     `source` is the parameter `excitation_source`, `modelled` states whether the mapping contains a load model, and
-    `units` replaces units in the mapping.
-
-    Raises
-    ------
-    BridgeError, RecordingError
-        The mapping is invalid, or it assigns no load although the parameter `excitation_source` requires a load.
+    `units` replaces units in the mapping. Raise `BridgeError` or `RecordingError` if the mapping is invalid, or assigns
+    no load although `source` requires a load.
     """
     if source == "tool_forces":
         raise BridgeError("excitation_source: got 'tool_forces', expected 'excitation' or 'scene' without ROS")

@@ -116,10 +116,7 @@ class LoadModel:
 def read_load_model(path: Path | None) -> LoadModel | None:
     """Return the load model in a mapping file, or None if the file has no load model.
 
-    Raises
-    ------
-    MapError
-        The file or the load model is invalid.
+    Raise `MapError` if the file or the load model is invalid.
     """
     entry = None if path is None else read_map_file(path).get(LOAD_MODEL)
     if path is None or entry is None:

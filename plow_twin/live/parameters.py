@@ -331,10 +331,7 @@ def _property(spec: Field[Any]) -> dict[str, Any]:
 def settings(values: Mapping[str, Any]) -> Settings:
     """Return the settings in which `values` replace the defaults.
 
-    Raises
-    ------
-    ParameterError
-        A value is invalid, or values contradict each other.
+    Raise `ParameterError` if a value is invalid, or if values contradict each other.
     """
     problems_found = problems(values)
     if problems_found:

@@ -52,14 +52,8 @@ class Runtime:
     """A configured twin, from configure to cleanup.
 
     No other runtime may use `prepared`. `kept_wear` is the wear of earlier runtimes of this process, by
-    `scene_identity`.
-
-    Raises
-    ------
-    RecordingError, WearStateError, OSError
-        The recording or the saved wear cannot be used.
-    ParameterError, ArgumentError
-        Parameters contradict each other or the scene.
+    `scene_identity`. Raise `RecordingError`, `WearStateError` or `OSError` if the recording or the saved wear cannot be
+    used, and `ParameterError` or `ArgumentError` if parameters contradict each other or the scene.
     """
 
     def __init__(
@@ -111,10 +105,7 @@ class Runtime:
             self.estimation = self._estimate()
             made.pop_all()
         session = Session(
-            prepared.twin,
-            on_entry=self._journal,
-            rollback_span_s=settings.rollback_span,
-            wear_depth=depth,
+            prepared.twin, on_entry=self._journal, rollback_span_s=settings.rollback_span, wear_depth=depth
         )
         catch_up = None
         if session.following is not None:

@@ -38,12 +38,8 @@ class KeptWear:
 class WearKeeper:
     """Storage for the wear of one head in one scene, in a folder.
 
-    Only a file that this object has read or written is replaced, because any other file may come from the user.
-
-    Raises
-    ------
-    WearStateError
-        The folder cannot be written to, or another twin uses it.
+    Only a file that this object has read or written is replaced, because any other file may come from the user. Raise
+    `WearStateError` if the folder cannot be written to, or if another twin uses it.
     """
 
     def __init__(self, folder: Path, head: str, scene: Scene) -> None:

@@ -41,12 +41,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
     """The ROS 2 node of the twin. Several nodes can use the same process and executor.
 
     While the solver is compiled, the node calls `stop_asked`, which returns True if a stop was requested. `options` are
-    those of `rclpy.node.Node`.
-
-    Raises
-    ------
-    ParameterError
-        Parameters are invalid. The error lists all of them.
+    those of `rclpy.node.Node`. Raise `ParameterError`, which lists all invalid parameters.
     """
 
     def __init__(
@@ -133,14 +128,16 @@ class TwinNode(WithoutEvents, LifecycleNode):
         # the garbage collector skips all existing objects while samples arrive
         gc.collect()
         gc.freeze()
-        self._configured().activate()
+        assert self._front is not None, "the node is configured"
+        self._front.activate()
         return self._entered("active")
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop using samples. The state of the model does not change."""
         super().on_deactivate(state)
         gc.unfreeze()
-        self._configured().deactivate()
+        assert self._front is not None, "the node is configured"
+        self._front.deactivate()
         return self._entered("inactive")
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -178,11 +175,6 @@ class TwinNode(WithoutEvents, LifecycleNode):
         else:
             response.success, response.message = self._front.answer(name)
         return response
-
-    def _configured(self) -> RosFront:
-        if self._front is None:
-            raise RuntimeError(f"lifecycle: got {self.lifecycle}, expected a configured node")
-        return self._front
 
     def _entered(self, lifecycle: str) -> TransitionCallbackReturn:
         self.lifecycle = lifecycle

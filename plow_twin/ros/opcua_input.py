@@ -26,11 +26,8 @@ class OpcUaInput:
 
     The parameters of the node contain the server, the mapping and the credentials. At the start and after a broken
     connection, the object waits for the server. The function `warn` receives a text for each problem of the connection.
-
-    Raises
-    ------
-    BridgeError, RecordingError, InputError, OSError
-        The address, the mapping or the credentials are invalid.
+    Raise `BridgeError`, `RecordingError`, `InputError` or `OSError` if the address, the mapping or the credentials are
+    invalid.
     """
 
     def __init__(self, runtime: Runtime, front: Front, warn: Callable[[str], None]) -> None:

@@ -53,12 +53,7 @@ class ParameterServer:
 
     `unconfigured` returns whether parameters that take effect on configure may change. `changed` receives the name and
     the value of a changed parameter that takes effect immediately. `refusals` returns the reasons why the twin cannot
-    use new settings.
-
-    Raises
-    ------
-    ParameterError
-        Initial values are invalid.
+    use new settings. Raise `ParameterError` if initial values are invalid.
     """
 
     def __init__(

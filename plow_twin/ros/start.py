@@ -16,12 +16,8 @@ class RosArgumentsError(PlowTwinError):
 def start_ros(arguments: Sequence[str] | None) -> None:
     """Initialize the default context of ROS with `arguments`, by default with the arguments of the process.
 
-    ROS installs no signal handlers, because the program handles signals itself.
-
-    Raises
-    ------
-    RosArgumentsError
-        The arguments for ROS are invalid.
+    ROS installs no signal handlers, because the program handles signals itself. Raise `RosArgumentsError` if the
+    arguments for ROS are invalid.
     """
     import rclpy
     from rclpy.signals import SignalHandlerOptions
@@ -45,10 +41,7 @@ def ros() -> Iterator[None]:
 def without_ros(arguments: Sequence[str]) -> list[str]:
     """Return the arguments of a command line that are not arguments for ROS.
 
-    Raises
-    ------
-    RosArgumentsError
-        The arguments for ROS are invalid.
+    Raise `RosArgumentsError` if the arguments for ROS are invalid.
     """
     from rclpy.utilities import remove_ros_args
 

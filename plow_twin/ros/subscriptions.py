@@ -40,13 +40,7 @@ class Subscriptions:
     """All subscriptions of a configured node. Inputs in `elsewhere` have no subscription."""
 
     def __init__(
-        self,
-        node: Node,
-        runtime: Runtime,
-        front: Front,
-        loop: InputLoop,
-        turns: Turns,
-        elsewhere: Collection[str],
+        self, node: Node, runtime: Runtime, front: Front, loop: InputLoop, turns: Turns, elsewhere: Collection[str]
     ) -> None:
         self._elsewhere = elsewhere
         self._node, self._runtime, self._front, self._loop, self._turns = node, runtime, front, loop, turns

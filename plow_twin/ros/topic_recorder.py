@@ -44,11 +44,10 @@ def _quality(profile: Any) -> _Quality:
     )
 
 
-def message_class(message_type: str) -> type:
+def message_class(message_type: str) -> Any:
     """Return the class of an installed message type."""
     package, folder, kind = message_type.split("/")
-    cls: type = getattr(import_module(f"{package}.{folder}"), kind)
-    return cls
+    return getattr(import_module(f"{package}.{folder}"), kind)
 
 
 class TopicRecorder:
@@ -239,7 +238,7 @@ def schema_of(message_type: str) -> str:
             package, _, kind = name.split("/")
             text = (Path(get_package_share_directory(package)) / "msg" / f"{kind}.msg").read_text(encoding="utf-8")
             definitions[name] = text
-            waiting += _used(text, package)
+            waiting += _parts_of(name)
     except (LookupError, OSError):
         return schema_text(message_type)
     first, *others = definitions.items()
@@ -247,15 +246,8 @@ def schema_of(message_type: str) -> str:
     return first[1] + "".join(f"\n{line}\nMSG: {name.replace('/msg/', '/')}\n{text}" for name, text in others)
 
 
-_BUILT_IN: Final = re.compile(r"(bool|byte|char|float32|float64|u?int(8|16|32|64)|w?string(<=\d+)?)$")
-
-
-def _used(text: str, package: str) -> list[str]:
-    used = []
-    for line in text.splitlines():
-        kind = line.split("#")[0].strip().partition(" ")[0].partition("[")[0]
-        if not kind or _BUILT_IN.match(kind):
-            continue
-        parts = kind.split("/")
-        used.append(f"{parts[0] if len(parts) > 1 else package}/msg/{parts[-1]}")
-    return used
+def _parts_of(message_type: str) -> list[str]:
+    """Return the message types of the fields of a message type."""
+    # an array or a sequence has the type of its items as `value_type`
+    kinds = (getattr(kind, "value_type", kind) for kind in message_class(message_type).SLOT_TYPES)
+    return ["/".join(kind.namespaced_name()) for kind in kinds if hasattr(kind, "namespaced_name")]

@@ -27,18 +27,7 @@ from plow_twin.solve.lanes.advance import Load
 from plow_twin.solve.lanes.record import fits_lanes
 from plow_twin.solve.method.implicit import new_implicit
 from plow_twin.solve.modes import settle_moved
-from plow_twin.solve.state import (
-    ADVANCE,
-    ROW,
-    SEGMENT,
-    TOTALS,
-    WORK,
-    Parts,
-    Terms,
-    new_records,
-    new_work,
-    state_type,
-)
+from plow_twin.solve.state import ADVANCE, ROW, SEGMENT, TOTALS, WORK, Parts, Terms, new_records, new_work, state_type
 
 __all__ = ["TwinBatch"]
 
@@ -518,13 +507,7 @@ def _kinds(compiled: Sequence[CompiledScene]) -> list[tuple[int, CompiledScene]]
 
 
 def _merge(compiled: Sequence[CompiledScene]) -> Terms:
-    """Return the terms that compiled code for all members needs.
-
-    Raises
-    ------
-    ArgumentError
-        Terms that cannot be merged differ between members.
-    """
+    """Return the merged terms of all members, or raise `ArgumentError` if terms that cannot be merged differ."""
     first = compiled[0]
     merged = first.parts.terms
     for index, member in _kinds(compiled):

@@ -66,10 +66,8 @@ class Pace:
     def run(self, work: Callable[..., bool], arguments: tuple[Any, ...] = ()) -> None:
         """Call `work` repeatedly until it returns True. Each call is a slice of the work.
 
-        Raises
-        ------
-        OutOfTimeError
-            The time limit was reached, or `stopped` was set during the call. `record` contains the progress.
+        Raise `OutOfTimeError` if the time limit was reached, or `stopped` was set during the call. `record` contains
+        the progress.
         """
         self._bytes[:] = self._start
         begin = _time.perf_counter()

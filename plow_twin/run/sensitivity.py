@@ -420,12 +420,7 @@ def free_places(scene: Scene) -> NDArray[np.int64]:
 
 
 def _displaced(
-    compiled: CompiledScene,
-    state: State,
-    moved: Array,
-    free: NDArray[np.int64],
-    before: Sequence[State],
-    work: Work,
+    compiled: CompiledScene, state: State, moved: Array, free: NDArray[np.int64], before: Sequence[State], work: Work
 ) -> list[State]:
     """Return a state, a shadow for each free coordinate, a shadow for each rate, and a shadow for each changed scene.
 

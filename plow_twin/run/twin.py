@@ -285,11 +285,7 @@ class Twin:
         return self._wrench.copy()
 
     def reset(
-        self,
-        t: float,
-        *,
-        wear_depth: ArrayLike | None = None,
-        pose: tuple[ArrayLike, ArrayLike] | None = None,
+        self, t: float, *, wear_depth: ArrayLike | None = None, pose: tuple[ArrayLike, ArrayLike] | None = None
     ) -> None:
         """Restart at model time `t` from the initial state of the scene or from a given state.
 
@@ -499,10 +495,7 @@ class Advanced(NamedTuple):
 def read_snapshot(data: bytes, dtype: np.dtype[np.void]) -> tuple[np.void, NDArray[np.float64], float]:
     """Return the state of type `dtype`, the wrench, shape (3,), and the travel speed [m/s] in a `Twin.snapshot`.
 
-    Raises
-    ------
-    ArgumentError
-        The data does not have the size of a snapshot.
+    Raise `ArgumentError` if the data does not have the size of a snapshot.
     """
     size = dtype.itemsize
     if len(data) != size + 32:

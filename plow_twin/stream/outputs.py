@@ -178,9 +178,8 @@ class Outputs:
         self._window = np.zeros(1, ROW)
         self._waits = 0
         self._stock = Stock()
-        #: stamp [ns] and wear depths [m] of the last slow part
-        self._slow_ns: int | None = None
-        self._slow_wear_depth = np.zeros(PAIR_COUNT)
+        #: stamp [ns] and wear depths [m] of the last slow part; the stamp is None before the first
+        self.slow_before: tuple[int | None, Array] = None, np.zeros(PAIR_COUNT)
         #: stamp from which the motion was computed again [ns], valid while the field `corrected` of the window is 1
         self._corrected_ns = 0
         #: if the motion was computed again: the window before that, unless all its advances were published
@@ -267,24 +266,15 @@ class Outputs:
         """Drop all unpublished data; the numbers of touches do not change."""
         self._clear()
         self._window["corrected"] = 0
-        self._slow_ns = self._before = None
+        self.slow_before, self._before = (None, self.slow_before[1]), None
 
     def _clear(self) -> None:
         for name in ("impulse", "peak", "measured_peak", "samples"):
             self._window[name] = 0
         self._waits = 0
 
-    @property
-    def slow_before(self) -> tuple[int | None, Array]:
-        """Stamp [ns] and wear depths [m] of the last published slow part; the stamp is None before the first."""
-        return self._slow_ns, self._slow_wear_depth
-
-    @slow_before.setter
-    def slow_before(self, before: tuple[int | None, Array]) -> None:
-        self._slow_ns, self._slow_wear_depth = before
-
     def _slow(self, rows: Rows) -> Rows:
-        stamps, before_ns = rows["stamp_ns"], self._slow_ns
+        stamps, (before_ns, before_depth) = rows["stamp_ns"], self.slow_before
         if before_ns is not None:
             before = before_ns // SLOW_PERIOD_NS
             if before == stamps.item(0) // SLOW_PERIOD_NS == stamps.item(-1) // SLOW_PERIOD_NS:
@@ -302,8 +292,8 @@ class Outputs:
         elapsed_s, growth = np.ones(len(stamps)), np.zeros(wear_depth.shape)
         elapsed_s[1:], growth[1:] = np.diff(stamps) * 1e-9, np.diff(wear_depth, axis=0)
         if before_ns is not None and stamps[0] > before_ns:
-            elapsed_s[0], growth[0] = (stamps[0] - before_ns) * 1e-9, wear_depth[0] - self._slow_wear_depth
-        self._slow_ns, self._slow_wear_depth = int(stamps[-1]), wear_depth[-1].copy()
+            elapsed_s[0], growth[0] = (stamps[0] - before_ns) * 1e-9, wear_depth[0] - before_depth
+        self.slow_before = int(stamps[-1]), wear_depth[-1].copy()
         slow = np.zeros(len(index), SLOW)
         slow["stamp_ns"], slow["row"] = stamps, index
         slow["clearance"], slow["wear_rate"] = self._clearance(wear_depth), growth / elapsed_s[:, None]
@@ -329,8 +319,9 @@ class Outputs:
 
     def state(self) -> bytes:
         """Return the exact state as bytes; state and later advances determine all later publications."""
-        slow_ns, window = -1 if self._slow_ns is None else self._slow_ns, self._window
-        numbers = (window["makes"], window["impulse"], window["peak"], self._slow_wear_depth, np.array([slow_ns]))
+        (slow_ns, depth), window = self.slow_before, self._window
+        stamp = np.array([-1 if slow_ns is None else slow_ns])
+        numbers = (window["makes"], window["impulse"], window["peak"], depth, stamp)
         return b"".join(part.tobytes() for part in numbers)
 
     def set_state(self, data: bytes) -> None:
@@ -342,9 +333,8 @@ class Outputs:
         # the state does not contain `measured_peak`, the peak over advances with samples, so the peak over all advances
         # is used
         self._window["measured_peak"] = parts[2]
-        self._slow_wear_depth = parts[3].copy()
         slow_ns = int(np.frombuffer(data, np.int64, 1, offset=8 * _STATE_SIZE)[0])
-        self._slow_ns = None if slow_ns < 0 else slow_ns
+        self.slow_before = None if slow_ns < 0 else slow_ns, parts[3].copy()
 
 
 def warm_up() -> None:

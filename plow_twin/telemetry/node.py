@@ -25,16 +25,9 @@ def send_node(
     """Send the results of a node until `stopped` returns True. Return the number of lost messages.
 
     The argument `scene` is needed if the scene file of the node cannot be read on this machine. The function `on_error`
-    receives a text whenever the receiver of an output stops or resumes accepting messages.
-
-    Raises
-    ------
-    DashboardError
-        The node does not exist.
-    SceneError
-        The scene cannot be read.
-    TelemetryError, ModuleNotFoundError
-        An output cannot be opened.
+    receives a text whenever the receiver of an output stops or resumes accepting messages. Raise `DashboardError` if
+    the node does not exist, `SceneError` if the scene cannot be read, and `TelemetryError` or `ModuleNotFoundError` if
+    an output cannot be opened.
     """
     with ExitStack() as opened:
         opened.enter_context(ros())

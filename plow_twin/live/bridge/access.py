@@ -44,10 +44,8 @@ class Access:
 def host_and_port(access: Access, ports: Mapping[str, int], *, has_path: bool = False) -> tuple[str, str, int]:
     """Return scheme, host and port of an address. `ports` contains the default port of each scheme.
 
-    Raises
-    ------
-    BridgeError
-        The address is invalid or contains a user, a password, or a path although `has_path` is False.
+    Raise `BridgeError` if the address is invalid or contains a user, a password, or a path although `has_path` is
+    False.
     """
     expected = " or ".join(f"{scheme}://HOST:PORT" for scheme in ports)
     try:

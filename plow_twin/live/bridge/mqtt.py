@@ -9,14 +9,7 @@ from typing import Any, Final
 
 from plow_twin.access import is_loopback
 from plow_twin.live.bridge.access import Access, host_and_port
-from plow_twin.live.bridge.paho_client import (
-    end_of,
-    is_resumed,
-    make_client,
-    refusal,
-    subscription_refusal,
-    use_tls,
-)
+from plow_twin.live.bridge.paho_client import end_of, is_resumed, make_client, refusal, subscription_refusal, use_tls
 from plow_twin.live.bridge.source import LONGEST, Bridge, BridgeError, read_json
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived
@@ -33,10 +26,8 @@ _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
 class Mqtt(Bridge):
     """Persistent session at an MQTT broker. While the connection is broken, the broker stores messages with QoS 1.
 
-    Raises
-    ------
-    BridgeError
-        The address is invalid, the broker refuses the connection, or no broker answers within `connect_s` [s].
+    Raise `BridgeError` if the address is invalid, the broker refuses the connection, or no broker answers within
+    `connect_s` [s].
     """
 
     def __init__(self, access: Access, connect_s: float = 10.0) -> None:

@@ -58,12 +58,8 @@ class OpcUa(Bridge):
     Each role of the mapping is a topic, and its fields are nodes. `rate_hz` is the expected rate of the samples [Hz];
     with 0, the fastest sampling of the server is requested. With `waits`, `start` does not wait for the connection,
     otherwise it waits for up to `connect_s` [s]. The function `on_arrival` is called, in another thread, when samples
-    have arrived.
-
-    Raises
-    ------
-    BridgeError
-        The address, a node identifier or the set of certificates is invalid, or the connection is not encrypted.
+    have arrived. Raise `BridgeError` if the address, a node identifier or the set of certificates is invalid, or if the
+    connection is not encrypted.
     """
 
     def __init__(

@@ -98,12 +98,8 @@ class Link:
     async def open(self) -> Revised:
         """Connect to the server, subscribe to the nodes, and return the granted intervals.
 
-        Raises
-        ------
-        BridgeError
-            The certificate is not trusted, or a node cannot be subscribed to.
-        OSError, UaError, TimeoutError
-            The server does not answer or refuses the connection.
+        Raise `BridgeError` if the certificate is not trusted or a node cannot be subscribed to, and `OSError`,
+        `UaError` or `TimeoutError` if the server does not answer or refuses the connection.
         """
         if self._access.certificate is not None:
             await secure(self._client, self._access, self._host)
@@ -145,10 +141,7 @@ class Link:
     async def history(self, begin_ns: int, end_ns: int) -> list[tuple[int, Any]]:
         """Return pairs of node number and value for all stamps from `begin_ns` to `end_ns`, inclusive [ns].
 
-        Raises
-        ------
-        UaError
-            The server has no history of a node, or the answers do not end.
+        Raise `UaError` if the server has no history of a node, or if the answers do not end.
         """
         details = ua.ReadRawModifiedDetails(
             IsReadModified=False,

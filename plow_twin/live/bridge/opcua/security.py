@@ -29,10 +29,7 @@ _MODE: Final = ua.MessageSecurityMode.SignAndEncrypt
 async def secure(client: Client, access: Access, host: str) -> None:
     """Configure a client to sign and encrypt messages by the strongest policy that the server offers.
 
-    Raises
-    ------
-    BridgeError
-        The server offers no encryption, the certificate of the server is not trusted, or a file cannot be read.
+    Raise `BridgeError` if the server offers no encryption, its certificate is not trusted, or a file cannot be read.
     """
     assert access.certificate and access.key and access.ca, "checked with the address"
     endpoints = await client.connect_and_get_server_endpoints()
