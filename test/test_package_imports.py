@@ -42,7 +42,7 @@ SUBPACKAGES = {
     "demo": CORE | {"scene_file", "stream", "record", "view", "live", "ros"},
     "cli": CORE
     | {"build", "scene_file", "stream", "estimate", "record", "view", "study", "live", "ros", "dashboard", "demo"}
-    | {"telemetry"},
+    | {"access", "telemetry"},
     "__init__": CORE | {"scene_file", "record", "view"},
     "__main__": {"cli"},
 }

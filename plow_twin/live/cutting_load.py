@@ -20,7 +20,7 @@ from scipy.signal import lfilter
 from scipy.stats import gamma, norm
 
 from plow_twin.errors import ArgumentError
-from plow_twin.scene_file.validation import Schema, validate
+from plow_twin.scene_file.validation import NUMBER, Schema, validate
 
 Array = NDArray[np.float64]
 
@@ -32,16 +32,15 @@ def _at_least(low: float, kind: str = "number") -> Schema:
     return {"type": kind, "minimum": low, "description": f"a finite {kind} >= {low:g}"}
 
 
-_NUMBER: Final[Schema] = {"type": "number", "description": "a finite number"}
 _SCHEMA: Final[Schema] = {
     "type": "object",
     "properties": {
         "length_m": _at_least(1e-3),
         "speed_m_s": _at_least(1e-6),
         "turn_s": _at_least(0.0),
-        "force_n": _NUMBER,
+        "force_n": NUMBER,
         "lateral_n": _at_least(0.0),
-        "at_m": {"type": "array", "items": _NUMBER, "minItems": 2, "maxItems": 2, "description": "two numbers"},
+        "at_m": {"type": "array", "items": NUMBER, "minItems": 2, "maxItems": 2, "description": "two numbers"},
         "variation": _at_least(1e-6),
         "correlation_m": _at_least(1e-4),
         "seed": _at_least(0, "integer"),

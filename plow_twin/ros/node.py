@@ -44,10 +44,8 @@ class TwinNode(WithoutEvents, LifecycleNode):
     those of `rclpy.node.Node`. Raise `ParameterError`, which lists all invalid parameters.
     """
 
-    def __init__(
-        self, node_name: str = "plow_twin", *, stop_asked: Callable[[], bool] = lambda: False, **options: Any
-    ) -> None:
-        super().__init__(node_name, automatically_declare_parameters_from_overrides=True, **options)
+    def __init__(self, *, stop_asked: Callable[[], bool] = lambda: False, **options: Any) -> None:
+        super().__init__("plow_twin", automatically_declare_parameters_from_overrides=True, **options)
         self._stop_asked = stop_asked
         self._connections = Connections(self)
         self._front: RosFront | None = None
