@@ -14,9 +14,9 @@ import pytest
 from hostile_files import MADE
 from hostile_files import run as recorded
 
+from plow_twin.access import secret
 from plow_twin.dashboard.access import PageAccess
 from plow_twin.errors import ExcessError, InputError
-from plow_twin.live.bridge.access import password
 from plow_twin.live.bridge.files import Files
 from plow_twin.scene_file.validation import MOST_PROBLEMS
 from plow_twin.scene_file.yaml_text import (
@@ -320,7 +320,7 @@ def test_an_invalid_secret_file_is_named_and_not_shown(tmp_path: Path, content: 
     path.write_bytes(content)
     outputs = Credentials({"influx": {"token_file": "secret"}}, tmp_path)
     for read in (
-        lambda: password(path, "MQTT"),
+        lambda: secret(path, "MQTT_PASSWORD"),
         lambda: PageAccess.of("0.0.0.0:8070", path),
         lambda: outputs.secret("influx", "token_file", "INFLUX_TOKEN"),
     ):
@@ -330,7 +330,9 @@ def test_an_invalid_secret_file_is_named_and_not_shown(tmp_path: Path, content: 
             read()
         assert repr(content)[2:-1][:4] not in str(refused.value).removeprefix(str(path))
     path.write_text("s3cret, at least 16 characters\r\nmore")
-    assert password(path, "MQTT") == outputs.secret("influx", "token_file", "") == "s3cret, at least 16 characters"
+    assert (
+        secret(path, "MQTT_PASSWORD") == outputs.secret("influx", "token_file", "") == "s3cret, at least 16 characters"
+    )
 
 
 @pytest.mark.parametrize(("count", "got"), [(20_000, "got 20004 columns"), (100_000, "more than 262144 bytes")])
