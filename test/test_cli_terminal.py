@@ -16,11 +16,9 @@ from record_support import paper_sample, record_run
 from rich.console import Console
 
 from plow_twin.cli import analyse as analyse_verb
-from plow_twin.cli import app
-from plow_twin.cli import doctor as doctor_verb
+from plow_twin.cli import app, console
 from plow_twin.cli import estimate as estimate_verb
 from plow_twin.cli import info as info_verb
-from plow_twin.cli import replay as replay_verb
 from plow_twin.cli import simulate as simulate_verb
 from plow_twin.cli.app import run
 from plow_twin.cli.console import PlainConsole, progress
@@ -37,7 +35,7 @@ WIDTH = 80
 @pytest.fixture
 def printed(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
     text = io.StringIO()
-    for module in (analyse_verb, doctor_verb, estimate_verb, info_verb, replay_verb, simulate_verb, paper_verb):
+    for module in (console, analyse_verb, estimate_verb, info_verb, simulate_verb, paper_verb):
         monkeypatch.setattr(module, "output_console", lambda: PlainConsole(file=text, width=WIDTH))
 
     def lines(*arguments: object, code: int = 0) -> list[str]:

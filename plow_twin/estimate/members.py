@@ -51,9 +51,6 @@ _AT_ONCE: Final = 8
 _ALL: Final = slice(None)
 #: Accuracy of the share by which a pose is scaled, by definition: of a clearance of 100 mm, it is a nanometre.
 _SHARE: Final = 1e-8
-#: Assumed distance of a share from its linear interpolation over a unit of the share. It affects the number of passes,
-#: not the result (four passes in the case that was tried, six by bisection alone).
-_CURVED: Final = 0.1
 #: Smallest probability of a difference that members have, by definition of the median probability model.
 _PROBABLE: Final = 0.5
 #: Lower bound on the friction coefficient of a member, because all members must have the same terms.
@@ -385,7 +382,10 @@ class Ensemble:
             growth, reached = ends[1] - ends[0], ends[1] >= limit
             part = np.divide(limit - ends[0], growth, out=np.ones_like(growth), where=reached & (growth > 0.0))
             width = high - low
-            cut, curved = low + width * part.min(axis=1).clip(0.0, 1.0), np.maximum(_CURVED * width**2, 0.5 * _SHARE)
+            cut, curved = (
+                low + width * part.min(axis=1).clip(0.0, 1.0),
+                np.maximum(tuning.CURVED * width**2, 0.5 * _SHARE),
+            )
             tried = np.stack([cut - curved, cut + curved, 0.5 * (low + high)]).clip(low, high)
             allowed = (self._penetrations(q, tried, which) < limit).all(axis=2)
             low = np.where(allowed, tried, low).max(axis=0)

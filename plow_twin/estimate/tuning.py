@@ -325,6 +325,10 @@ LEARNED_FOR = 20.0
 #: time between two updates of the learned parameters [s]
 #: Basis: as for `LEARNED_TO`
 LEARNED_EACH = 1.0
+#: assumed distance of a scaled pose's share from its linear interpolation over a unit of the share; it affects the
+#: number of passes, not their result [1]
+#: Basis: four passes in the case that was tried, six by bisection alone
+CURVED = 0.1
 #: smallest share of new motion in an early window, and in the window of an estimate that replaces an estimate with
 #: fewer rough clearances [window]
 #: Basis: a window that is longer by half has a share of a third, neighbouring windows of a node have 0.31, and windows
