@@ -179,7 +179,9 @@ class Driver:
             return
         self._accept(*block[-1], now_ns, len(block))
         self.silences.add(block.stamps)
-        self._succeeded(now_ns)
+        self._advanced(now_ns)
+        self.failed.end()
+        self.state = StreamState.RUNNING
         yield series
 
     def _accept(self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int, count: int = 1) -> None:
@@ -188,7 +190,9 @@ class Driver:
 
     def _may_go_on(self, stamp_ns: int, wrench: tuple[float, float, float]) -> bool:
         reached_ns = self.session.stamp_ns
-        return not (reached_ns is None or self._steps.waits) and self.intake.goes_on(stamp_ns, wrench, reached_ns)
+        if reached_ns is None or self._steps.delayed is not None:
+            return False
+        return self.intake.goes_on(stamp_ns, wrench, reached_ns)
 
     def _use_samples(
         self, run: list[journal.Sample], stamp_ns: int, wrench: tuple[float, float, float], now_ns: int
@@ -395,20 +399,17 @@ class Driver:
     def _apply(self, samples: Sequence[journal.Sample], now_ns: int) -> Iterator[Published]:
         applied = self.session.apply_samples(samples, each=self.every_sample)
         self.rolled_back += applied.late
+        self._advanced(now_ns)
         if applied.failed:
-            self._advanced(now_ns)
             self._judge_rows(applied.rows)
         else:
-            self._succeeded(now_ns)
+            self.failed.end()
+            self.state = StreamState.RUNNING
         if len(applied.published.rows):
             yield applied.published
-        # a restart is journalled after the publication, because a replay publishes nothing of the motion before it
-        self._restart_after_failures()
-
-    def _succeeded(self, now_ns: int) -> None:
-        self._advanced(now_ns)
-        self.failed.end()
-        self.state = StreamState.RUNNING
+        if applied.failed:
+            # a restart is journalled after the publication, because a replay publishes nothing of the motion before it
+            self._restart_after_failures()
 
     def _advance(self, entry: journal.Hold | journal.Unload, now_ns: int, state: StreamState) -> Published:
         rows = self.session.apply(entry)

@@ -263,7 +263,7 @@ class Session:
             applied = self._recompute(first_ns, (stamps, wrench))
             applied = applied._replace(published=self.outputs.pop() if each else NOTHING, late=late)
         else:
-            applied = self._run(stamps, wrench, ONLY_ROW if each else NONE)
+            applied = self._advance(stamps, wrench, self._stock.new(len(stamps)), ONLY_ROW if each else NONE)
             if each and applied.failed and not applied.published.rows["stamp_ns"][0]:
                 applied = applied._replace(published=NOTHING)
         self._count(len(samples))
@@ -322,7 +322,7 @@ class Session:
         return applied
 
     def _advance(
-        self, stamps: Integers, wrench: Array, rows: Rows | None, taken: Integers, digest_after: Integers
+        self, stamps: Integers, wrench: Array, rows: Rows | None, taken: Integers = NONE, digest_after: Integers = NONE
     ) -> Applied:
         """Advance in parts, which end at a waiting travel speed or after a sample that follows a held load."""
         if not (self.held or self._travels):
@@ -378,9 +378,6 @@ class Session:
         )  # fmt: skip
         stamp_ns = self.stamp_ns if self.stamp_ns is not None else self.origin_ns or 0
         return journal.Snapshot(stamp_ns, state.pack())
-
-    def _run(self, stamps: Integers, wrench: Array, taken: Integers = NONE) -> Applied:
-        return self._advance(stamps, wrench, self._stock.new(len(stamps)), taken, NONE)
 
     def _advance_part(
         self,
@@ -484,12 +481,12 @@ class Session:
         stamps, wrench = self._rewind(corrected_ns, *travels)
         earlier = int(stamps.searchsorted(corrected_ns))
         if earlier:
-            self._run(stamps[:earlier], wrench[:earlier])
+            self._advance(stamps[:earlier], wrench[:earlier], self._stock.new(earlier))
             self._store_snapshot(kept=False)
         self.outputs.begin_correction()
         stamps, wrench = np.append(stamps[earlier:], late[0]), np.append(wrench[earlier:], late[1], axis=0)
         order = stamps.argsort(kind="stable")
-        return self._run(stamps[order], wrench[order])
+        return self._advance(stamps[order], wrench[order], self._stock.new(len(order)))
 
     def _rewind(self, stamp_ns: int, *more: journal.Travel) -> Samples:
         """Go back to the newest snapshot before `stamp_ns`; return the samples after the snapshot.

@@ -20,46 +20,42 @@ class Steps:
 
     def __init__(self, intake: Intake) -> None:
         self._intake = intake
-        self._jumped: Timed | None = None
+        #: sample that is being delayed
+        self.delayed: Timed | None = None
         #: times of the latest stray stamps [ns]
         self._strays_ns: deque[int] = deque(maxlen=_MOST_STRAYS)
-
-    @property
-    def waits(self) -> bool:
-        """Whether a sample with a jump of the stamp waits for the next sample."""
-        return self._jumped is not None
 
     def settle(
         self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int, reached_ns: int | None
     ) -> tuple[Timed, ...]:
         """Add a sample; return the samples that the intake can judge now, in order of arrival."""
-        jumped, jumps = self._jumped, self._intake.jumps(stamp_ns, reached_ns)
+        jumped, jumps = self.delayed, self._intake.jumps(stamp_ns, reached_ns)
         arrival = stamp_ns, wrench, now_ns
         if jumped is not None and stamp_ns > 0:  # a sample without a stamp gives no evidence about the clock
             if stamp_ns == jumped[0]:
                 self._intake.refuse(Verdict.DUPLICATE, stamp_ns, wrench)
                 return ()
-            self._jumped = None
+            self.delayed = None
             if jumps and self._intake.near(stamp_ns, jumped[0]):
                 return jumped, arrival
             self._intake.refuse(Verdict.STRAY, *jumped[:2])
             self._strays_ns.append(now_ns)
         if not jumps:
             return (arrival,)
-        self._jumped = arrival
+        self.delayed = arrival
         return ()
 
     def unopposed(self, now_ns: int, silence_ns: int) -> Timed | None:
         """Return the delayed sample and end its delay if no further sample has arrived for `silence_ns`."""
-        jumped = self._jumped
+        jumped = self.delayed
         if jumped is None or now_ns - jumped[2] <= silence_ns:
             return None
-        self._jumped = None
+        self.delayed = None
         return jumped
 
     def end(self) -> None:
         """Count a delayed sample as stray, because no further sample will come."""
-        jumped, self._jumped = self._jumped, None
+        jumped, self.delayed = self.delayed, None
         if jumped is not None:
             self._intake.refuse(Verdict.STRAY, *jumped[:2])
 
