@@ -151,7 +151,9 @@ class Driver:
         """
         run: list[journal.Sample] = []
         place, block = 0, arrived if isinstance(arrived, Block) else None
-        ends = NONE if block is None else 1 + np.flatnonzero(~self.intake.go_on(block.stamps, block.wrench))
+        ends = NONE
+        if block is not None:
+            ends = np.append(1 + np.flatnonzero(~self.intake.go_on(block.stamps, block.wrench)), len(block))
         while place < len(arrived):
             end, arrival = place + 1, arrived[place]
             goes_on = (block is not None or self.every_sample) and self._may_go_on(*arrival)
@@ -162,7 +164,7 @@ class Driver:
                 for settled in self._steps.settle(*arrival, now_ns, self.session.stamp_ns):
                     yield from self._use_samples(run, *settled[:2], now_ns)
             elif block is not None:
-                end = min([*ends[ends > place][:1].tolist(), len(block)])
+                end = int(ends[ends.searchsorted(place, "right")])
                 yield from self._use_together(block.part(place, end), now_ns)
             else:
                 self._accept(*arrival, now_ns)
