@@ -187,7 +187,6 @@ class Session:
         A `Digest` or a `Loss` describes the journal from which it was read. It is neither applied nor emitted. Raise
         `ValueError` if the stamp is older than all stored states, or a number is not finite. The motion is unchanged.
         """
-        changed: Driven | None = None
         match entry:
             case journal.Sample():
                 return self.apply_samples([entry]).rows[-1:]
@@ -197,8 +196,9 @@ class Session:
                 return None
             case journal.Travel(_, speed):
                 check_travel_speed(self.twin.scene, speed)
-            case journal.SetModel(_, changes):
-                changed = self._changed_twin(read_changes(changes))
+            case journal.SetModel():
+                self._apply_model(entry)
+                return None
         self.emit(entry)
         match entry:
             case journal.Travel():
@@ -213,9 +213,6 @@ class Session:
                 self.outputs.set_shift(shift)
                 if self.stamp_ns is not None:
                     self._follow(self.stamp_ns, entry)
-            case journal.SetModel(_, changes):
-                assert changed is not None
-                self._change_model(changed, read_changes(changes))
             case journal.Restore(_, data):
                 self._restore_motion(data)
             case journal.Pose(stamp_ns) | journal.PartOfPose(stamp_ns):
@@ -611,7 +608,10 @@ class Session:
             self.following.begin_at(origin_ns)
         return origin_ns
 
-    def _change_model(self, twin: Driven, changes: dict[str, float]) -> None:
+    def _apply_model(self, entry: journal.SetModel) -> None:
+        changes = read_changes(entry.changes)
+        twin = self._changed_twin(changes)
+        self.emit(entry)
         before, speed = self.twin, 0.0 if self.held else self.travel_speed_m_s
         self._use(twin)
         self._carry(before)
