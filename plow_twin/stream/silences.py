@@ -66,7 +66,7 @@ class Silences:
 
     def add_one(self, stamp_ns: int) -> None:
         """Add the stamp of one sample [ns]."""
-        newest_ns = self._begin(stamp_ns) if self._newest_ns is None else self._newest_ns
+        newest_ns = self._begin(stamp_ns)
         if stamp_ns > newest_ns:
             if self._is_silence(stamp_ns - newest_ns):
                 self._count(newest_ns, stamp_ns)
