@@ -188,16 +188,21 @@ def body_state(
 
 def body_states(states: NDArray[np.float64], offset: tuple[float, float]) -> NDArray[np.float64]:
     """Convert poses and rates of the cavity's centre, shape (s, 6), to body coordinates of G, shape (s, 8)."""
-    x, y, theta, vx, vy, omega = states.T
-    c, s = np.cos(theta), np.sin(theta)
+    _, _, theta, vx, vy, omega = states.T
+    c, s, x, y = _body_places(states[:, :3], offset)
     rx, ry = offset
     return np.stack(
-        [
-            c * x + s * y + rx, -s * x + c * y + ry, c * vx + s * vy - omega * ry, -s * vx + c * vy + omega * rx,
-            omega, c, s, theta,
-        ],
+        [x, y, c * vx + s * vy - omega * ry, -s * vx + c * vy + omega * rx, omega, c, s, theta],
         axis=1,
-    )  # fmt: skip
+    )
+
+
+def _body_places(q: NDArray[np.float64], offset: tuple[float, float]) -> tuple[NDArray[np.float64], ...]:
+    """Return c, s, X and Y, shape (m,) each, at poses of the cavity's centre, shape (m, 3)."""
+    x, y, theta = q.T
+    c, s = np.cos(theta), np.sin(theta)
+    rx, ry = offset
+    return c, s, c * x + s * y + rx, -s * x + c * y + ry
 
 
 def tumbles(scene: Scene) -> bool:
@@ -235,14 +240,11 @@ def states_of(scene: Scene, states: NDArray[np.float64]) -> NDArray[np.float64]:
 def factors_of(scene: Scene, q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the factors c, s, X, Y and 1 of `penetration_rows` at the poses `q`, shape (m, 3); shape (m, 5)."""
     factors = np.ones((len(q), 5))
-    if scene.head.carries != "walls":
+    if scene.head.carries == "walls":
+        factors[:, 0], factors[:, 1], factors[:, 2], factors[:, 3] = _body_places(q, scene.head.com_offset_m)
+    else:
         state = states_of(scene, np.concatenate([q, np.zeros_like(q)], axis=1))
         factors[:, :2], factors[:, 2:4] = state[:, 5:7], state[:, :2]
-        return factors
-    x, y, theta = q.T
-    c, s = np.cos(theta), np.sin(theta)
-    rx, ry = scene.head.com_offset_m
-    factors[:, 0], factors[:, 1], factors[:, 2], factors[:, 3] = c, s, c * x + s * y + rx, -s * x + c * y + ry
     return factors
 
 
