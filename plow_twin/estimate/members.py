@@ -382,10 +382,8 @@ class Ensemble:
             growth, reached = ends[1] - ends[0], ends[1] >= limit
             part = np.divide(limit - ends[0], growth, out=np.ones_like(growth), where=reached & (growth > 0.0))
             width = high - low
-            cut, curved = (
-                low + width * part.min(axis=1).clip(0.0, 1.0),
-                np.maximum(tuning.CURVED * width**2, 0.5 * _SHARE),
-            )
+            cut = low + width * part.min(axis=1).clip(0.0, 1.0)
+            curved = np.maximum(tuning.CURVED * width**2, 0.5 * _SHARE)
             tried = np.stack([cut - curved, cut + curved, 0.5 * (low + high)]).clip(low, high)
             allowed = (self._penetrations(q, tried, which) < limit).all(axis=2)
             low = np.where(allowed, tried, low).max(axis=0)
