@@ -82,9 +82,8 @@ def read_yaml(path: Path, name: str, sections: str) -> tuple[Any, list[Problem]]
         return None, [Problem("file", str(path), f"a readable {name} file ({error.strerror})")]
     except UnicodeDecodeError:
         kind = kind_of(data)
-        return None, [
-            Problem("file", str(path), f"a readable {name} file ({f'it is {kind}' if kind else 'not UTF-8'})")
-        ]
+        reason = f"it is {kind}" if kind else "not UTF-8"
+        return None, [Problem("file", str(path), f"a readable {name} file ({reason})")]
     return load_yaml(text, name, sections, most_values=MOST_VALUES)
 
 

@@ -16,6 +16,7 @@ from plow_twin.model.scene import Table
 from plow_twin.record.reader import RunReader
 from plow_twin.record.recording import read_recording
 from plow_twin.record.sources import Columns, read_columns
+from plow_twin.record.times import EPOCH_S
 from plow_twin.run.ensemble import Ensemble
 from plow_twin.stream.journal import Loss, Reset, Restore, SetModel, SetWear
 from plow_twin.study.parameters import StudyError
@@ -28,8 +29,6 @@ COLUMNS: Final = ("t", "x", "y", "theta")
 _LARGEST_ARCHIVE: Final = 2**28
 #: Largest number of rows of a simulated motion.
 _MOST_ROWS: Final = 20_000
-#: Smallest time [s] that is treated as a date. Smaller times, before the year 2001, count from an arbitrary start.
-_DATES_S: Final = 1e9
 
 
 @dataclass(frozen=True)
@@ -103,7 +102,7 @@ def load_poses(path: Path) -> PoseRecording:
         raise StudyError(f"{path}: row {int(np.flatnonzero(bad)[0])}: expected finite numbers")
     if t[0] < 0.0 or (np.diff(t) <= 0.0).any():
         raise StudyError(f"{path}: t: got {t[0]:g} .. {t[-1]:g}, expected increasing times from 0 on [s]")
-    if t[-1] >= _DATES_S:
+    if t[-1] >= EPOCH_S:
         raise StudyError(f"{path}: t: got {t[0]:.10g} .. {t[-1]:.10g}, expected the time since the scene's start [s]")
     return poses
 
