@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
+import os
+import signal
 import socket
 import subprocess
 import sys
@@ -38,6 +40,7 @@ from plow_twin.telemetry.sparkplug import Payload
 
 #: Version of the broker. Versions before 0.12 close connections that they refuse.
 AMQTT = tuple(map(int, version("amqtt").split(".")[:2]))
+ONLINE = Message("online", b"true", True)
 STALE = ("--set", "excitation_timeout=3600")
 
 
@@ -332,6 +335,19 @@ def test_a_broker_receives_all_groups_with_tls_and_reports_the_end_of_the_twin(b
         subscriber.close()
 
 
+def test_an_output_process_that_does_not_read_updates_is_reported(tmp_path: Path) -> None:
+    path, url = _csv(tmp_path / "load.csv", 100), f"mqtt://127.0.0.1:{_free_port()}/plough"
+    with _live(str(path), "--follow", "--mqtt-out", url, "--out-rate", "500", *STALE) as live:
+        live.until(lambda heard: "no broker" in heard.get("mqtt_out", {}).get("message", ""), "no broker")
+        children = Path(f"/proc/{live.process.pid}/task").glob("*/children")
+        numbers = [int(number) for found in children for number in found.read_text().split()]
+        (output,) = (n for n in numbers if b"telemetry.process" in Path(f"/proc/{n}/cmdline").read_bytes())
+        os.kill(output, signal.SIGSTOP)
+        live.until(lambda heard: heard["mqtt_out"]["message"] == "its process does not read updates", "stopped")
+        assert int(live.heard["mqtt_out"]["values"]["not_taken"]) > 0
+        os.kill(output, signal.SIGKILL)
+
+
 def test_a_run_that_ends_without_its_broker_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "map.yaml").write_text(MAP.replace(", sequence: n", ""))
     port, client, broker = _free_port(), make_client("", clean=True), ExitStack()
@@ -375,27 +391,56 @@ def _entries(run: Path) -> list[object]:
     return [record.entry for record in records_of(run) if isinstance(record, EntryRecord)]
 
 
+def _output(port: int, **options: Any) -> Broker:
+    return Broker(
+        host="127.0.0.1", port=port, client_id="out", user="", password="", tls=None, will=lambda: ONLINE,
+        on_connected=lambda: [ONLINE], **options,
+    )  # fmt: skip
+
+
+async def _reached(condition: Callable[[], object], event: object) -> None:
+    await asyncio.to_thread(until, condition, event)
+
+
 def test_messages_for_a_broker_are_limited_counted_and_sent_in_order(tmp_path: Path) -> None:
     port = _free_port()
-    online = Message("online", b"true", True)
-    output = Broker(
-        host="127.0.0.1", port=port, client_id="out", user="", password="", tls=None, will=lambda: online,
-        on_connected=lambda: [online], waiting=5,
-    )  # fmt: skip
-    output.open()
-    for number in range(8):
-        output.send(Message("n", str(number).encode(), False))
-    until(lambda: output.state.trouble.startswith("no broker at 127.0.0.1"), output.state)
-    assert (output.state.sent, output.state.lost, output.state.connected) == (0, 3, False)
+
+    async def send() -> None:
+        output = _output(port, waiting=5)
+        output.open()
+        for number in range(8):
+            output.send(Message("n", str(number).encode(), False))
+        await _reached(lambda: output.state.trouble.startswith("no broker at 127.0.0.1"), output.state)
+        assert (output.state.sent, output.state.lost, output.state.connected) == (0, 3, False)
+        with _open_broker(tmp_path, port):
+            subscriber = Subscriber(port)
+            await _reached(lambda: output.state.sent == 6, output.state)
+            subscriber.until(lambda: len(subscriber.messages) == 6)
+            assert [payload for _, payload, _ in subscriber.messages] == [b"true", b"3", b"4", b"5", b"6", b"7"]
+            assert (output.state.lost, output.state.trouble) == (3, "")
+            subscriber.close()
+        await _reached(lambda: not output.state.connected, output.state)
+        await output.close(ONLINE, 0.0)
+
+    asyncio.run(send())
+
+
+def test_an_acknowledgement_that_arrives_while_a_message_is_sent_does_not_block_the_output(tmp_path: Path) -> None:
+    port = _free_port()
+
+    async def send() -> None:
+        output = _output(port)
+        output.open()
+        await _reached(lambda: output.state.sent == 1, output.state)
+        with output.lock:
+            output.send(Message("n", b"0"))
+            until(lambda: output._acknowledged, output.state)  # the thread of paho is in the callback
+            output.send(Message("n", b"1"))
+        await _reached(lambda: output.state.sent == 3, output.state)
+        await output.close(ONLINE, 10.0)
+
     with _open_broker(tmp_path, port):
-        subscriber = Subscriber(port)
-        until(lambda: output.state.sent == 6, output.state)
-        subscriber.until(lambda: len(subscriber.messages) == 6)
-        assert [payload for _, payload, _ in subscriber.messages] == [b"true", b"3", b"4", b"5", b"6", b"7"]
-        assert (output.state.lost, output.state.trouble) == (3, "")
-        subscriber.close()
-    until(lambda: not output.state.connected)
-    asyncio.run(output.close(online, 0.0))
+        asyncio.run(send())
 
 
 class EdgeNode:

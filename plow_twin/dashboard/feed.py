@@ -172,6 +172,8 @@ class Feed:
         self._second = 0
         #: Number of updates that were sent, and number of updates that did not fit in the buffer.
         self.taken = self.not_taken = 0
+        #: Whether the newest update did not fit in the buffer.
+        self.blocked = False
 
     def publication(self, published: Published) -> None:
         """Add a publication with at least one row to the next update."""
@@ -231,7 +233,8 @@ class Feed:
             update["events"] = self._events
         if self.motion.stamp_ns:
             update["motion"] = self.motion.update()
-        if not self._link.send(update):
+        self.blocked = not self._link.send(update)
+        if self.blocked:
             self.not_taken += 1
             return False
         self.taken += 1

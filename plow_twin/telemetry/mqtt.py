@@ -60,6 +60,8 @@ class Broker:
         self._most, self._keeps = waiting, keeps
         self._waiting: deque[Message] = deque()
         self._unacknowledged: set[int] = set()
+        self._acknowledged: deque[int] = deque()
+        self._loop: asyncio.AbstractEventLoop | None = None
         #: held while messages are numbered and queued, so that they are queued in the order of their numbers
         self.lock = threading.RLock()
         self.client = make_client(client_id, clean=True)
@@ -75,7 +77,8 @@ class Broker:
         self.client.on_connect_fail, self.client.on_publish = self._failed, self._published
 
     def open(self) -> None:
-        """Connect in the background, and reconnect after each break."""
+        """Connect in the background, and reconnect after each break. Call this method in the event loop of `send`."""
+        self._loop = asyncio.get_running_loop()
         self.client.connect_async(*self._address, keepalive=_KEEPALIVE_S)
         self.client.loop_start()
 
@@ -136,9 +139,16 @@ class Broker:
         self.state.trouble = self.state.trouble or f"the connection broke: {end_of(*facts)}; reconnecting"
 
     def _published(self, client: Any, data: Any, number: int, *facts: Any) -> None:
+        # paho calls this method with a lock that `publish` takes too, so this method must not wait for our lock
+        self._acknowledged.append(number)
+        if self._loop is not None:
+            self._loop.call_soon_threadsafe(self._acknowledge)
+
+    def _acknowledge(self) -> None:
         with self.lock:
-            self.state.sent += 1
-            self._unacknowledged.discard(number)
+            while self._acknowledged:
+                self._unacknowledged.discard(self._acknowledged.popleft())
+                self.state.sent += 1
             self._pass_on()
 
 

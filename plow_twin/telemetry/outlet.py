@@ -60,8 +60,8 @@ class Outlet(Beside):
         values = {"address": self.address, "connected": str(report["connected"]).lower()}
         values |= {key: str(report[key]) for key in ("sent", "lost")}
         values |= {"not_taken": str(self.feed.not_taken), "trouble": report["trouble"]}
-        ended = "its process has ended" if self.link.broken else ""
-        message = ended or report["trouble"]
+        trouble = "its process does not read updates" if self.feed.blocked else report["trouble"]
+        message = "its process has ended" if self.link.broken else trouble
         return int(bool(message)), message, values
 
     def close(self) -> None:
