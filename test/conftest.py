@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from hypothesis import Phase, settings
+from ros_domain import claim_domain
 from shared_work import FOLDER, compile_once
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -25,10 +26,7 @@ def _prepare_environment() -> None:
     """Set the environment that child processes inherit, before rclpy and numpy are imported."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ.pop("ROS_LOCALHOST_ONLY", None)
-    # ROS domains 1 to 101 use no ephemeral ports; each process of each run gets its own domain
-    worker = os.environ.get("PYTEST_XDIST_WORKER", "")
-    number = 8 * (os.getppid() if worker else os.getpid()) + int(worker.removeprefix("gw") or 0)
-    os.environ["ROS_DOMAIN_ID"] = str(1 + number % 101)
+    os.environ["ROS_DOMAIN_ID"] = claim_domain()
     # the processes of a suite already use all cores, so more threads of linear algebra would only wait for each other
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     logs = tempfile.mkdtemp(prefix="plow_twin-ros-log-")

@@ -36,6 +36,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
+from ros_domain import claim_domain
 from ros_processes import Bench, bench, value
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -538,7 +539,7 @@ def test_two_twins_in_one_process_do_not_disturb_each_other() -> None:
 def test_two_minutes_of_recording_account_for_every_message_in_constant_memory() -> None:
     command = [sys.executable, str(ROOT / "benchmark" / "live_load.py"), "--minutes", "2", "--rate", "500"]
     # a separate ROS domain, because other nodes publish reports too
-    environment = os.environ | {"ROS_DOMAIN_ID": "97"}
+    environment = os.environ | {"ROS_DOMAIN_ID": claim_domain()}
     completed = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=400.0)
     rows = [json.loads(line) for line in completed.stdout.splitlines() if line.startswith("{")]
     assert completed.returncode == 0, completed.stdout[-2000:] + completed.stderr[-2000:]
