@@ -104,6 +104,10 @@ class Session:
 
     After a late sample, the motion is computed again up to the newest sample. Motion after it is dropped.
 
+    Samples have three methods, because their journal is written at different times: `apply_samples` writes it before
+    the advance, like every other entry; the caller of `apply_series` writes it after the advance, which is undone if it
+    fails; the samples of `advance` come from a journal, which also determines the places of the digests.
+
     Parameters
     ----------
     twin
