@@ -46,9 +46,9 @@ class Arrow:
         self.border[:] += block[:shared, :shared]
         first = OWN * swing
         self.coupling[first : first + len(block) - shared] += block[shared:, :shared]
-        rest = block[shared:, shared:]
-        for column in range(len(rest)):
-            self.bands[: len(rest) - column, first + column] += rest[column:, column]
+        bands = block[shared:, shared:]
+        for column in range(len(bands)):
+            self.bands[: len(bands) - column, first + column] += bands[column:, column]
 
     def diagonal(self) -> Array:
         """Return the main diagonal, which begins with the shared unknowns."""
@@ -89,9 +89,9 @@ class Factor:
     def solve(self, right: Array) -> Array:
         """Return the solution for right-hand sides of shape (k + 6 s,) or (k + 6 s, m)."""
         shared = len(self.schur)
-        border, rest = right[:shared], right[shared:]
-        first = cho_solve((self.schur, True), border - self.eliminated.T @ rest)
-        own = cho_solve_banded((self.band, True), rest, check_finite=False) - self.eliminated @ first
+        border, states = right[:shared], right[shared:]
+        first = cho_solve((self.schur, True), border - self.eliminated.T @ states)
+        own = cho_solve_banded((self.band, True), states, check_finite=False) - self.eliminated @ first
         return np.concatenate([first, own])
 
     def covariance(self) -> Array:

@@ -121,11 +121,11 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, prior_estimate: Estim
     value, deviation = _solve(scene, met, prior_estimate, level)
     clearances, states = [], []
     bias: list[Interval | None] = [Interval.normal(*pair) for pair in zip(value[_BIAS], deviation[_BIAS], strict=True)]
-    for axis, (name, before) in enumerate(zip(("horizontal", "vertical"), prior_estimate.clearances, strict=True)):
-        count = {wall: sum(impact.wall == wall for impact in met) for wall, (its, _) in WALLS.items() if its == axis}
-        share = float(deviation[axis]) / max(before.deviation, 1e-300)
+    for axis, (name, prior) in enumerate(zip(("horizontal", "vertical"), prior_estimate.clearances, strict=True)):
+        count = {wall: sum(impact.wall == wall for impact in met) for wall in WALLS if WALLS[wall][0] == axis}
+        share = float(deviation[axis]) / max(prior.deviation, 1e-300)
         observed = share < tuning.OBSERVED_SHARE
-        clearances.append(Interval.normal(value[axis], deviation[axis]).above(0.0) if observed else before)
+        clearances.append(Interval.normal(value[axis], deviation[axis]).above(0.0) if observed else prior)
         fine = float(deviation[axis]) <= tuning.OBSERVED
         states.append((State.ESTIMATED if fine else State.ROUGH) if observed else unseen)
         counts = ", ".join(f"{number} impacts on the {wall} wall" for wall, number in count.items())
@@ -197,11 +197,11 @@ def _solve(scene: Scene, met: list[Impact], prior_estimate: Estimate, level: Arr
             prior[_BIAS][axis] = 0.0
     if not met:
         return mean, prior
-    design, off = np.zeros((len(met), _SIZE)), np.zeros(len(met))
+    design, excess = np.zeros((len(met), _SIZE)), np.zeros(len(met))
     sides = np.array([scene.frame.width_m, scene.frame.height_m])
     for row, impact in enumerate(met):
         axis, normal = WALLS[impact.wall]
-        off[row] = impact.distance - impact.deeper - 0.5 * (sides[axis] + mean[axis])
+        excess[row] = impact.distance - impact.deeper - 0.5 * (sides[axis] + mean[axis])
         design[row, _DEPTH] = impact.deeper
         design[row, axis] = 0.5
         design[row, _BIAS] = *normal, impact.arm
@@ -211,12 +211,12 @@ def _solve(scene: Scene, met: list[Impact], prior_estimate: Estimate, level: Arr
     least = max(float(level[:2].max()), *(deviation_of(scene, f"frame.{side}") for side in ("width_m", "height_m")))
     scales = np.geomspace(least, max(float(prior[_CLEARANCES].max()), 2.0 * least), _SCALES)
     step, deviation = np.zeros(_SIZE), np.zeros(_SIZE)
-    step[free], deviation[free] = _student(design[:, free], off, prior[free], scales)
+    step[free], deviation[free] = _student(design[:, free], excess, prior[free], scales)
     return mean + step, deviation
 
 
-def _student(design: Array, off: Array, prior: Array, scales: Array) -> tuple[Array, Array]:
-    """Return the means and the standard deviations of the unknowns x in the equation `off` = `design` x + errors.
+def _student(design: Array, excess: Array, prior: Array, scales: Array) -> tuple[Array, Array]:
+    """Return the means and the standard deviations of the unknowns x in the equation `excess` = `design` x + errors.
 
     The prior of x is normal with the standard deviations `prior`. The errors have a Student-t distribution with a
     log-uniform prior of their scale over `scales`. For each scale, reweighting gives the mode and the covariance of x,
@@ -227,11 +227,11 @@ def _student(design: Array, off: Array, prior: Array, scales: Array) -> tuple[Ar
     for scale in scales:
         x = np.zeros(len(prior))
         for _ in range(_ROUNDS):
-            weight = (_FREEDOM + 1.0) / (_FREEDOM * scale**2 + (off - design @ x) ** 2)
+            weight = (_FREEDOM + 1.0) / (_FREEDOM * scale**2 + (excess - design @ x) ** 2)
             covariance = np.linalg.inv(design.T @ (weight[:, None] * design) + precision)
-            x = covariance @ (design.T @ (weight * off))
-        residual = (off - design @ x) / scale
-        fits = -0.5 * (_FREEDOM + 1.0) * float(np.log1p(residual**2 / _FREEDOM).sum()) - len(off) * math.log(scale)
+            x = covariance @ (design.T @ (weight * excess))
+        residual = (excess - design @ x) / scale
+        fits = -0.5 * (_FREEDOM + 1.0) * float(np.log1p(residual**2 / _FREEDOM).sum()) - len(excess) * math.log(scale)
         log.append(fits - 0.5 * ((x / prior) ** 2).sum() + 0.5 * float(np.linalg.slogdet(covariance)[1]))
         modes.append(x)
         variances.append(np.diag(covariance))
@@ -263,13 +263,13 @@ def impacts(scene: Scene, load: Load, poses: Poses, level: Array) -> tuple[list[
     for index, (first, last) in enumerate(ends):
         begin = ends[index - 1][1] if index else 0
         end = ends[index + 1][0] if index + 1 < len(ends) else len(t) - 1
-        before = np.arange(max(begin, first + 1 - _FLIGHT_ROWS[1]), first + 1)
-        after = np.arange(last, min(end, last - 1 + _FLIGHT_ROWS[1]) + 1)
-        if last - first > 1 or min(len(before), len(after)) < _FLIGHT_ROWS[0]:
+        coming = np.arange(max(begin, first + 1 - _FLIGHT_ROWS[1]), first + 1)
+        leaving = np.arange(last, min(end, last - 1 + _FLIGHT_ROWS[1]) + 1)
+        if last - first > 1 or min(len(coming), len(leaving)) < _FLIGHT_ROWS[0]:
             continue
         middle = 0.5 * (t[first] + t[last])
         flights = [
-            _flight(t[rows] - middle, q[rows], free[rows].mean(axis=0), level, unknown) for rows in (before, after)
+            _flight(t[rows] - middle, q[rows], free[rows].mean(axis=0), level, unknown) for rows in (coming, leaving)
         ]
         room = 0.5 * (t[last] - t[first]) + tuning.BEYOND * float(np.median(np.diff(t)))
         met = _meeting(scene, inertia, flights, room)
@@ -304,8 +304,8 @@ def _kinks(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> lis
     way = np.diff(q, axis=0)
     acceleration = 2.0 * (way[1:] / two - way[:-1] / one) / (one + two)
     noise = 2.0 * level * np.sqrt(one**-2 + two**-2 + (1.0 / one + 1.0 / two) ** 2) / (one + two)
-    off: NDArray[np.bool_] = np.abs(acceleration - free[1:-1]) > tuning.OUTLYING * np.hypot(noise, unknown)
-    return [(first + 1, last + 1) for first, last in _runs(np.asarray(off.any(axis=1)))]
+    bent: NDArray[np.bool_] = np.abs(acceleration - free[1:-1]) > tuning.OUTLYING * np.hypot(noise, unknown)
+    return [(first + 1, last + 1) for first, last in _runs(np.asarray(bent.any(axis=1)))]
 
 
 def _flight(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> Array:
@@ -337,16 +337,16 @@ def _meeting(scene: Scene, inertia: Array, flights: list[Array], room: float) ->
     corner = corners[:, deepest]
     arm = float(corner[0] * normal[1] - corner[1] * normal[0])
     rates = v[:, :2] @ normal + arm * v[:, 2]
-    before, after = float(rates[0]), -float(rates[1])
-    if before <= 0.0 or after < 0.0:
+    approach, separation = float(rates[0]), -float(rates[1])
+    if approach <= 0.0 or separation < 0.0:
         return None
     mass = 1.0 / (1.0 / inertia[0] + arm**2 / inertia[2])
     energy = (inertia * v**2).sum(axis=1)
     # `corner` is the centre of a rounded corner's arc
     distance = float(normal @ (q[:2] + corner)) + geometry.corner_radius(scene)
     turned = np.array([c * normal[0] + s * normal[1], -s * normal[0] + c * normal[1]])
-    deeper = _deeper(scene, mass, before, after)
-    return Impact(t, wall, distance, deeper, after / before, float(energy[1] / energy[0]), turned, arm)
+    deeper = _deeper(scene, mass, approach, separation)
+    return Impact(t, wall, distance, deeper, separation / approach, float(energy[1] / energy[0]), turned, arm)
 
 
 def _corners(scene: Scene) -> Array:
@@ -356,7 +356,7 @@ def _corners(scene: Scene) -> Array:
     return from_centre
 
 
-def _deeper(scene: Scene, mass: float, before: float, after: float) -> float:
+def _deeper(scene: Scene, mass: float, approach: float, separation: float) -> float:
     """Return the distance in m behind a compliant wall at which the flights before and after the contact meet.
 
     The corner approaches with the normal speed v and leaves with the speed e v after the time T. Straight flights meet
@@ -364,5 +364,5 @@ def _deeper(scene: Scene, mass: float, before: float, after: float) -> float:
     linear spring.
     """
     exponent = scene.contact.exponent
-    largest = ((exponent + 1.0) * mass * before**2 / (2.0 * scene.contact.stiffness)) ** (1.0 / (exponent + 1.0))
-    return float(math.pi * largest * after / (before + after))
+    largest = ((exponent + 1.0) * mass * approach**2 / (2.0 * scene.contact.stiffness)) ** (1.0 / (exponent + 1.0))
+    return float(math.pi * largest * separation / (approach + separation))

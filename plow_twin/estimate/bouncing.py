@@ -343,14 +343,14 @@ def hidden_by_geometry(unknowns: Unknowns, poses: Poses, period: float, reach: A
         frame = replace(scene.frame, width_m=scene.frame.width_m + width, height_m=scene.frame.height_m + height)
         other = replace(unknowns, scene=replace(scene, frame=frame))
         motion_features = MotionFeatures(other, poses, period)
-        off: Array = np.abs(motion_features.features(motion_features.q * (1.0 + scale))[:2] - reach)
-        return off
+        change: Array = np.abs(motion_features.features(motion_features.q * (1.0 + scale))[:2] - reach)
+        return change
 
     turned = np.array(
         [[UNSTATED[f"turn_{wall}"] for wall in walls] for walls in (("left", "right"), ("top", "bottom"))]
     )
-    off = [moved(width), moved(0.0, height), *(moved(scale=scale) for scale in np.diag(priors.SCALES))]
-    unseen = np.sqrt(np.square(off).sum(axis=0) + (0.25 * turned**2).sum(axis=1))
+    changes = [moved(width), moved(0.0, height), *(moved(scale=scale) for scale in np.diag(priors.SCALES))]
+    unseen = np.sqrt(np.square(changes).sum(axis=0) + (0.25 * turned**2).sum(axis=1))
     # a stated radius or deviation of a side includes the effect of rounded corners
     stated = scene.frame.corner_radius_m is not None or any(is_stated(scene, path) for path in _SIDES)
     # the sides stay positive
@@ -405,13 +405,13 @@ class _Drawn:
 
         The clearances have the mean `centre` and the standard deviation `about`, both in m.
         """
-        before = self.forward.work
+        work_before = self.forward.work
         if self.drawn:  # as many motions as the work allows, if each takes as many steps as those before
-            count = min(count, max(int((most_work - before) * self.drawn / max(self.work, 1)), 0))
+            count = min(count, max(int((most_work - work_before) * self.drawn / max(self.work, 1)), 0))
         motions = [self._draw(centre, about) for _ in range(count)]
         runs = self.motion_features.run(self.forward, [start for *_, start in motions], delay)
         self.drawn += count
-        self.work += self.forward.work - before
+        self.work += self.forward.work - work_before
         for q, (clearance, numbers, _) in zip(runs, motions, strict=True):
             if q is not None:
                 q = self.motion_features.with_noise(q, self.rng)
@@ -458,13 +458,13 @@ def _likeliest(features: Array, targets: Array, paths: Array, measured: Array, m
     The rows are for the n drawn motions with the paths `paths`, shape (n, lags, k), and for the measured motion with
     the path `measured_path`, shape (lags, k).
     """
-    before, after = _NO_LAG - 1, _NO_LAG + 1
+    earlier, later = _NO_LAG - 1, _NO_LAG + 1
     paths, measured_path = (path[..., : path.shape[-1] // 2] for path in (paths, measured_path))
     finite = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(measured_path).all(axis=0)
 
     def motions(features: Array, paths: Array) -> PathFeatures:
         like = np.concatenate([features[:, :2], features[:, 5:]], axis=1)
-        late = (paths[:, after] - paths[:, before]) / (_OF_DRAWN_S[after] - _OF_DRAWN_S[before])
+        late = (paths[:, later] - paths[:, earlier]) / (_OF_DRAWN_S[later] - _OF_DRAWN_S[earlier])
         return PathFeatures(
             np.concatenate([like, paths[:, _NO_LAG, finite]], axis=1),
             np.concatenate([np.zeros_like(like), late[:, finite]], axis=1),
@@ -475,8 +475,8 @@ def _likeliest(features: Array, targets: Array, paths: Array, measured: Array, m
     likely = likeliest(
         drawn, tuning.HARD_DRAWN[3], motions(features, paths), motions(measured[None], measured_path[None])
     )
-    off: Array = likely - np.concatenate([reach, measured[None, :2]])
-    return off
+    difference: Array = likely - np.concatenate([reach, measured[None, :2]])
+    return difference
 
 
 def path_delay(motion_features: MotionFeatures, features: Array, drawn: list[Array], measured: Array) -> float:
@@ -551,14 +551,14 @@ def path_deviate(measured_path: Array, features: Array, drawn: list[Array], meas
     if finite.sum() < tuning.PATH_PHASES:
         return 0.0
     paths = paths[:, :, finite]
-    off = _distance_of_paths(features, paths, measured, measured_path[:, finite])
+    apart = _distance_of_paths(features, paths, measured, measured_path[:, finite])
     distance = (((features - measured) / (features.std(axis=0) + 1e-12)) ** 2).mean(axis=1)
-    others = []
+    drawn_apart = []
     for index in np.argsort(distance, kind="stable")[:FEWEST_FOR_SCATTER]:
-        rest = np.arange(len(features)) != index
-        others.append(_distance_of_paths(features[rest], paths[rest], features[index], paths[index]))
-    ln_others = np.log(others)
-    return float((math.log(off) - ln_others.mean()) / ln_others.std(ddof=1))
+        others = np.arange(len(features)) != index
+        drawn_apart.append(_distance_of_paths(features[others], paths[others], features[index], paths[index]))
+    ln_drawn = np.log(drawn_apart)
+    return float((math.log(apart) - ln_drawn.mean()) / ln_drawn.std(ddof=1))
 
 
 def _distance_of_paths(features: Array, paths: Array, measured: Array, measured_path: Array) -> float:

@@ -44,11 +44,11 @@ def by_compliance(problem: Problem, point: Point) -> Array | None:
         return None
     load = problem.forward.load
     t = np.union1d(load.t, change.t)
-    here, there = (
+    rigid, soft = (
         problem.evaluate(point.shared, point.states, load=Load(t, load.at(t) + step * change.at(t)))
         for step in (0.0, _STEP)
     )
-    return None if here is None or there is None else np.nan_to_num((there.predicted - here.predicted) / _STEP)
+    return None if rigid is None or soft is None else np.nan_to_num((soft.predicted - rigid.predicted) / _STEP)
 
 
 def _change_of_load(problem: Problem, point: Point) -> Load | None:

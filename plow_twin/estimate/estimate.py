@@ -103,8 +103,8 @@ def estimate_window(
     units = Units.of(scene, load.longest_stretch())
     if units == Units():
         return _estimate(scene, load, poses, lost, guess, gaps, forces)
-    its = units.load(load), units.poses(poses)
-    found, following = _estimate(units.scene(scene), *its, lost, guess, units.gaps(gaps), units.forces(forces))
+    measurements = units.load(load), units.poses(poses)
+    found, following = _estimate(units.scene(scene), *measurements, lost, guess, units.gaps(gaps), units.forces(forces))
     found = units.in_si(found, scene)
     if units.only_time and found.sensor == "ok" and found.horizontal_state is not State.PRIOR:
         # the duration of an impact does not depend on the load's period, so repeat with times in s

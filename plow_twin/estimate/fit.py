@@ -450,13 +450,13 @@ class Problem:
         if self._waves[0] is not point:
             load, size = harmonics.moved(-harmonics.amplitude).added(self.forward.load), harmonics.amplitude.size
             out = np.zeros((*point.residual.shape, size))
-            here, step = self.evaluate(point.shared, point.states, load=load), self.steps * _HARMONIC_STEP
+            unmoved, step = self.evaluate(point.shared, point.states, load=load), self.steps * _HARMONIC_STEP
             for index, unit in enumerate(np.eye(size).reshape(size, *harmonics.amplitude.shape)):
                 wave = replace(harmonics, amplitude=step * unit).at(load.t)
                 moved = replace(load, wrench=load.wrench + wave)
                 other = self.evaluate(point.shared, point.states, load=moved)
-                if here is not None and other is not None:
-                    out[:, :, index] = np.nan_to_num((other.predicted - here.predicted) / step)
+                if unmoved is not None and other is not None:
+                    out[:, :, index] = np.nan_to_num((other.predicted - unmoved.predicted) / step)
             self._waves = point, out
         return self._waves[1]
 
@@ -728,12 +728,12 @@ def _spread(variance: Array, reach: int = 2) -> Array:
     return total / (2 * reach + 1)
 
 
-def noise_of(residual: Array, before: Array, jitter: Array) -> Array:
+def noise_of(residual: Array, previous: Array, jitter: Array) -> Array:
     """Return the standard deviation of each component, shape (3,), from the median of the absolute residuals."""
-    out = before.copy()
+    out = previous.copy()
     for i, column in enumerate(residual.T):
         finite = np.isfinite(column)
-        calm = finite & (jitter[:, i] < 0.1 * before[i] ** 2)
+        calm = finite & (jitter[:, i] < 0.1 * previous[i] ** 2)
         finite = calm if calm.sum() > 0.2 * finite.sum() else finite
         if finite.sum() > 10:
             out[i] = 1.4826 * np.median(np.abs(column[finite]))

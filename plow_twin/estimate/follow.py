@@ -288,12 +288,12 @@ class Follower:
 
     def warm_up(self) -> float:
         """Compile the kernels, or load them from the cache on disk; return the elapsed time in s."""
-        begin, before = _time.perf_counter(), self.snapshot()
+        begin, state = _time.perf_counter(), self.snapshot()
         self.advance(self.time + 1e-6)
         self._ensemble.start_from(self._ensemble, self._wrench)
         if self._ensemble.others is not None:
             self._ensemble.others.warm_up()
-        self.restore(before)
+        self.restore(state)
         if may_rub(self.scene) and not kept_on_disk():  # the estimating process could not pass on its kernels later
             compile_friction(self.scene, self.tol)
         return _time.perf_counter() - begin
@@ -545,10 +545,10 @@ class Follower:
 
     def _is_replaced_by(self, estimate: Estimate) -> bool:
         new = (estimate.horizontal_state, estimate.vertical_state)
-        before = self.estimate
-        if before is None:
+        previous = self.estimate
+        if previous is None:
             return any(state.known for state in new)
-        pairs = tuple(zip((before.horizontal_state, before.vertical_state), new, strict=True))
+        pairs = tuple(zip((previous.horizontal_state, previous.vertical_state), new, strict=True))
         if self.time - self._since < tuning.NEW_MOTION * (estimate.t_end - estimate.t_start) and any(
             own is State.ESTIMATED and other is State.ROUGH for own, other in pairs
         ):
@@ -587,11 +587,11 @@ class Follower:
             self._begin_anew(json.dumps(facts))
 
     def _begin_anew(self, text: str) -> None:
-        before, joins = self._ensemble, self._alone and text == self._text
+        previous, joins = self._ensemble, self._alone and text == self._text
         self.drawn += 1
         self._since = self.time
         self._draw(text, self.time, self.wear_depth)
-        self._ensemble.start_from(before, self._wrench, joins=joins)
+        self._ensemble.start_from(previous, self._wrench, joins=joins)
 
     def follow_parameters(self) -> None:
         """Continue from the state of the median twin with a single twin that poses do not move."""
@@ -608,10 +608,10 @@ class Follower:
             self._used.popleft()
         noise, delay = self._sensor()
         if noise is not None:
-            before = self._ensemble.outlying
+            outliers = self._ensemble.outlying
             used = self._ensemble.correct(t - delay, q, noise, self._load_error())
             self.poses = self.poses._replace(used=self.poses.used + used)
-            if not used and self._ensemble.outlying > before:
+            if not used and self._ensemble.outlying > outliers:
                 self.poses = self.poses._replace(outlying=self.poses.outlying + 1)
                 return
         if newest and np.isfinite(q).all():

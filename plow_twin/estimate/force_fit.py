@@ -255,7 +255,7 @@ class _Joint:
         return covariance @ score, covariance
 
     def _descended(self, at: _Evaluation, blocks: list[_Block]) -> _Evaluation | None:
-        before, place = self._cost(at), at.place
+        cost, place = self._cost(at), at.place
         step, _ = self._step(at, blocks)
         states = np.stack([block.state + block.answer @ step for block in blocks])
         for share in (1.0, 0.5, 0.2):
@@ -268,7 +268,7 @@ class _Joint:
                     place.gain + part[SIZE + 1 :],
                 )
             )
-            if other is not None and self._cost(other) < before:
+            if other is not None and self._cost(other) < cost:
                 return other
         return None
 

@@ -175,8 +175,8 @@ def _fit_one_set(
         for name, pair in GROUPS.items()
         if np.isin(pair, pairs).all()
     }
-    off = np.abs(residual.mean(axis=0)).max() / error if len(pairs) > equations.shape[1] else 0.0
-    return GapsFit(poses, clearance, np.hypot(spread, noise), groups, len(t), float(off))
+    bias = np.abs(residual.mean(axis=0)).max() / error if len(pairs) > equations.shape[1] else 0.0
+    return GapsFit(poses, clearance, np.hypot(spread, noise), groups, len(t), float(bias))
 
 
 def _displacement(unknown: Array, scene: Scene) -> tuple[Array, Array]:

@@ -85,24 +85,24 @@ class _Surface:
         matrix = np.linalg.solve(root, self.coefficients.T)
 
         def misfit(points: Array) -> tuple[Array, Array]:
-            off = normalised - _terms(points) @ matrix.T
-            return (off**2).sum(axis=1) + (points**2).sum(axis=1), off
+            residual = normalised - _terms(points) @ matrix.T
+            return (residual**2).sum(axis=1) + (points**2).sum(axis=1), residual
 
-        each, off = misfit(self.points)
+        each, residual = misfit(self.points)
         best = int(np.argmin(each))
-        point, cost, rest = self.points[best], float(each[best]), off[best]
+        point, cost, error = self.points[best], float(each[best]), residual[best]
         size, damped = len(point), _DAMPED
         for _ in range(_STEPS):
             nearby = _terms(np.concatenate([point[None], point + _SMALL * np.eye(size)]))
             slope = matrix @ (nearby[1:] - nearby[0]).T / _SMALL
             curvature = slope.T @ slope + np.eye(size)
             held = curvature + damped * np.diag(np.diag(curvature))
-            tried = np.clip(point + np.linalg.solve(held, slope.T @ rest - point), -tuning.FARTHEST, tuning.FARTHEST)
-            each, off = misfit(tried[None])
+            tried = np.clip(point + np.linalg.solve(held, slope.T @ error - point), -tuning.FARTHEST, tuning.FARTHEST)
+            each, residual = misfit(tried[None])
             gained = cost - float(each[0])
             damped *= 0.1 if gained > 0.0 else 10.0
             if gained > 0.0:
-                point, cost, rest = tried, float(each[0]), off[0]
+                point, cost, error = tried, float(each[0]), residual[0]
                 if gained < _ENOUGH:
                     break
         return -0.5 * (cost + float(np.linalg.slogdet(curvature)[1]))

@@ -110,13 +110,13 @@ class Learner:
     def _begin(self) -> None:
         self._precision, self._score = np.zeros((len(self.open), len(self.open))), np.zeros(len(self.open))
 
-    def take_over(self, before: Learner) -> None:
+    def take_over(self, previous: Learner) -> None:
         """Combine the distribution with that of the previous learner, unless they contradict each other."""
-        both, in_self, in_before = np.intersect1d(self.open, before.open, return_indices=True)
+        both, in_self, in_before = np.intersect1d(self.open, previous.open, return_indices=True)
         if not len(both):
             return
-        covariance = before.covariance[np.ix_(in_before, in_before)]
-        difference = before.mean[in_before] - self.mean[in_self]
+        covariance = previous.covariance[np.ix_(in_before, in_before)]
+        difference = previous.mean[in_before] - self.mean[in_self]
         total = covariance + self.covariance[np.ix_(in_self, in_self)]
         if difference @ np.linalg.solve(total, difference) > tuning.OUTLYING**2:
             return
@@ -143,8 +143,8 @@ class Learner:
         apart = own - middle
         spread = np.linalg.inv(apart.T @ apart + 1e-6 * np.eye(len(self.open)))
         slope = spread @ (apart.T @ measured_change)
-        rest = measured_change - apart @ slope
-        alone = rest.T @ rest / (len(own) - len(self.open) - 1)
+        scatter = measured_change - apart @ slope
+        alone = scatter.T @ scatter / (len(own) - len(self.open) - 1)
         inverse = np.linalg.inv(alone + np.diag(noise**2))
         # subtract the information in the slope that is due to the random scatter of the members
         self._precision += slope @ inverse @ slope.T - spread * np.trace(inverse @ alone)
@@ -155,11 +155,11 @@ class Learner:
         root = np.linalg.cholesky(self.covariance)
         value, axes = np.linalg.eigh(tuning.LEARNING * root.T @ self._precision @ root)
         turned = root @ axes
-        before = np.sqrt(np.diag(self.covariance))
+        prior_deviation = np.sqrt(np.diag(self.covariance))
         self.covariance = (turned / (1.0 + value.clip(0.0))) @ turned.T
         step = tuning.LEARNING * (self.covariance @ self._score)
         # the linearisation is accurate within one standard deviation
-        step /= max(1.0, float(np.abs(step / before).max()))
+        step /= max(1.0, float(np.abs(step / prior_deviation).max()))
         self.mean = np.clip(self.mean + step, self._least, self._most)
         # the deviations grow with time, because the machine changes
         deviation = np.sqrt(np.diag(self.covariance))

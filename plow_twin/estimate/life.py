@@ -190,10 +190,10 @@ def _finer(columns: list[Array]) -> list[Array]:
     """Return the columns of a path without running-in, with linearly interpolated rows inserted."""
     at = np.arange(len(columns[0]), dtype=np.float64)
     more = np.linspace(0.0, at[-1], _FINER * (len(at) - 1) + 1)
-    before = np.minimum(more.astype(int), max(len(at) - 2, 0))
-    share = more - before
-    after = np.minimum(before + 1, len(at) - 1)
-    return [(column[before].T * (1.0 - share) + column[after].T * share).T for column in columns]
+    lower = np.minimum(more.astype(int), max(len(at) - 2, 0))
+    share = more - lower
+    upper = np.minimum(lower + 1, len(at) - 1)
+    return [(column[lower].T * (1.0 - share) + column[upper].T * share).T for column in columns]
 
 
 def _beyond(scene: Scene, depth: Array, limit: tuple[float, float]) -> bool:

@@ -127,10 +127,10 @@ class Poses:
         A value that is repeated for a long time shows a stopped sensor and is kept.
         """
         previous, next_one = self.q[:-1], self.q[1:]
-        again = ((previous == next_one) | (np.isnan(previous) & np.isnan(next_one))).all(axis=1)
-        if again.mean() < tuning.REPEATING[0] if len(again) else True:
+        repeated = ((previous == next_one) | (np.isnan(previous) & np.isnan(next_one))).all(axis=1)
+        if repeated.mean() < tuning.REPEATING[0] if len(repeated) else True:
             return self
-        first = np.flatnonzero(np.append(True, ~again))
+        first = np.flatnonzero(np.append(True, ~repeated))
         lengths = np.diff(np.append(first, len(self.t)))
         if len(first) < FEWEST_FOR_SCATTER or lengths.max() > tuning.REPEATING[1] * lengths.mean() + 1.0:
             return self
@@ -337,10 +337,10 @@ class Load:
         Uncorrelated samples at long intervals do not determine the load between them, so only their strong oscillations
         are used.
         """
-        correlation, its, of_samples = self._roughness()
+        correlation, density, of_samples = self._roughness()
         # a correlation within three standard errors of zero is not significant
         rare = (correlation < 3.0 / math.sqrt(len(self.t))) & (self.interval() > RESOLVING)
-        fx, fy, moment = np.where(rare, its, of_samples - its).tolist()
+        fx, fy, moment = np.where(rare, density, of_samples - density).tolist()
         if not rare.any():
             return replace(self, unknown=(fx, fy, moment))
         t = np.linspace(self.t[0], self.t[-1], len(self.t))
@@ -379,8 +379,8 @@ def _from_lines(t: Array, value: Array) -> Array:
     """Return the mean square distance of values from the straight line through their two neighbours, shape (3,)."""
     step = np.diff(t)
     slope = np.diff(value, axis=0) / step[:, None]
-    off = np.diff(slope, axis=0) * (step[:-1] * step[1:] / (step[:-1] + step[1:]))[:, None]
-    mean: Array = (off**2).mean(axis=0)
+    distance = np.diff(slope, axis=0) * (step[:-1] * step[1:] / (step[:-1] + step[1:]))[:, None]
+    mean: Array = (distance**2).mean(axis=0)
     return mean
 
 

@@ -129,12 +129,12 @@ class Ensemble:
             if any(stiff) and compile_scene(scenes[0], tol, sampled=True).parts.implicit is None:
                 # a live twin has no time to compile the kernel of overdamped contacts, which are improbable here
                 contact = scenes[0].contact
-                rest = [
+                companions = [
                     replace(scene, contact=contact) if is_stiff else scene
                     for scene, is_stiff in zip(scenes[1:], stiff, strict=True)
                 ]
-                scenes = [scenes[0], *rest]
-                compiled = compile_scenes(rest, tol, sampled=True, kind=options(rest[0]))
+                scenes = [scenes[0], *companions]
+                compiled = compile_scenes(companions, tol, sampled=True, kind=options(companions[0]))
                 yield True
             self.others = TwinBatch(scenes[1:], tol=tol, max_steps=MOST_STEPS, compiled=compiled)
             yield True
@@ -266,12 +266,12 @@ class Ensemble:
 
     def held(self, t: float, row: Rows) -> None:
         """Write the row that the constant load of the newest sample gives at `t`; the state does not change."""
-        before = self.twins()
+        state = self.twins()
         row[:] = self.first.advance(t).rows
         self._sums[0, 0] = row["force"][0]
         if self.others is not None:
             self._sums[1:, 0] = self.others.advance(t).force[:, 0]
-        self.set_twins(before)
+        self.set_twins(state)
         self._add_intervals(row)
 
     def begin_span(self) -> None:
@@ -311,8 +311,8 @@ class Ensemble:
             out[axis] = values[order[np.searchsorted(share, [0.5, 0.05, 0.95]).clip(0, len(order) - 1)]]
         return out
 
-    def start_from(self, before: Ensemble, wrench: Array, *, joins: bool = False) -> None:
-        """Start from the state of the members `before`, under the load `wrench`.
+    def start_from(self, previous: Ensemble, wrench: Array, *, joins: bool = False) -> None:
+        """Start from the state of the members `previous`, under the load `wrench`.
 
         If `joins` is set, further members join the first member, whose state does not change.
 
@@ -320,30 +320,30 @@ class Ensemble:
         member under an estimate. If an estimate replaces a prior, the new first member therefore starts at the pose of
         the old second member, and vice versa.
         """
-        before.settle()
-        from_ = np.where(before.good, np.arange(len(before.good)), int(np.argmax(before.good)))
+        previous.settle()
+        from_ = np.where(previous.good, np.arange(len(previous.good)), int(np.argmax(previous.good)))
         from_ = np.resize(from_, len(self.good))
-        if self._steers_first and not before._steers_first and len(before.good) > 1 and before.good[1]:
+        if self._steers_first and not previous._steers_first and len(previous.good) > 1 and previous.good[1]:
             from_[0] = 1
-        if before._steers_first and not self._steers_first and before.good[0]:
+        if previous._steers_first and not self._steers_first and previous.good[0]:
             from_[1:2] = 0
-        share = self._shares(before._room()[from_])
-        self._load_off = before._load_off[from_]
+        share = self._shares(previous._room()[from_])
+        self._load_off = previous._load_off[from_]
         loads = self._loads(np.array([self.first.time]), wrench[None], _ALL)[:, 0]
         self.first.advance(self.first.time, loads[0])
         if self.others is not None:
             self.others.set_wrench(loads[1:])
-        self._path = _scaled(before._path, from_, share)
-        self._sums[1:], self._sums[0] = before._sums[from_[1:]], before._sums[0]
-        self._move_toward(self._path[-1][1], before._v[from_], before._force(before._depth)[from_])
+        self._path = _scaled(previous._path, from_, share)
+        self._sums[1:], self._sums[0] = previous._sums[from_[1:]], previous._sums[0]
+        self._move_toward(self._path[-1][1], previous._v[from_], previous._force(previous._depth)[from_])
         if joins:
-            self.first = before.first
-        if self._learner is not None and before._learner is not None:
-            self._learner.take_over(before._learner)
+            self.first = previous.first
+        if self._learner is not None and previous._learner is not None:
+            self._learner.take_over(previous._learner)
             self._take_numbers(np.arange(len(self.good)))
-        elif self.others is None and before._learner is not None:
+        elif self.others is None and previous._learner is not None:
             # a single twin continues with the parameters of the first member
-            self._set_numbers(np.zeros(1, np.int64), before._numbers[:1])
+            self._set_numbers(np.zeros(1, np.int64), previous._numbers[:1])
 
     def move_near(self, q: Array, v: Array) -> None:
         """Move each member to the pose `q`, scaled to its clearances."""
@@ -410,9 +410,9 @@ class Ensemble:
         times = [time for time, _ in self._path]
         if t <= times[0] or not len(finite):
             return False
-        after = min(bisect_left(times, t), len(times) - 1)
-        path = np.stack([self._path[index][1] for index in range(after - 1, len(times))])
-        share = min((t - times[after - 1]) / (times[after] - times[after - 1]), 1.0)
+        upper = min(bisect_left(times, t), len(times) - 1)
+        path = np.stack([self._path[index][1] for index in range(upper - 1, len(times))])
+        share = min((t - times[upper - 1]) / (times[upper] - times[upper - 1]), 1.0)
         # pose that the sensor of each member would have measured
         predicted = ((1.0 - share) * path[0] + share * path[1] + biases_of(self._numbers))[:, finite]
         since = self.first.time - self._drifted
@@ -445,7 +445,7 @@ class Ensemble:
         allowed = np.flatnonzero(self._allowed(places[-1], self._force(self._depth)))
         allowed = allowed[allowed >= 1 - self._steers_first]
         path[:, allowed] = places[:, allowed]
-        for place, index in enumerate(range(after - 1, len(times))):
+        for place, index in enumerate(range(upper - 1, len(times))):
             self._path[index] = times[index], path[place]
         self._load_off[allowed] = moved[allowed, -3:]
         self._put(allowed, places[-1, allowed], v[allowed])
@@ -462,10 +462,10 @@ class Ensemble:
 
     def _drift(self, load_error: Array) -> None:
         """Advance the load errors as Ornstein-Uhlenbeck processes, without noise for the first member."""
-        now, before = self.first.time, self._drifted
-        self._drifted = now
+        time, drifted = self.first.time, self._drifted
+        self._drifted = time
         if load_error.any() or self._load_off.any():
-            kept = math.exp(-(now - before) / tuning.LOAD_ERROR_LASTS)
+            kept = math.exp(-(time - drifted) / tuning.LOAD_ERROR_LASTS)
             white = self._rng.standard_normal(self._load_off.shape)
             white[0] = 0.0
             self._load_off = kept * self._load_off + math.sqrt(1.0 - kept**2) * load_error * white
@@ -499,14 +499,14 @@ class Ensemble:
 
         A member keeps its parameters if the new values need a different kernel, as an overdamped contact does.
         """
-        now = [self.first.scene, *(() if self.others is None else self.others.scenes)]
+        scenes = [self.first.scene, *(() if self.others is None else self.others.scenes)]
         if not len(which):
             return
-        changed, gain = with_numbers([now[place] for place in which.tolist()], numbers)
-        accepted, rest = np.ones(len(which), dtype=bool), which > 0
+        changed, gain = with_numbers([scenes[place] for place in which.tolist()], numbers)
+        accepted, lanes = np.ones(len(which), dtype=bool), which > 0
         if self.others is not None:
-            accepted[rest] = self.others.change(which[rest] - 1, changed[-int(rest.sum()) :] if rest.any() else [])
-        which, room, force, before = which[accepted], self._room(), self._force(self._depth), self._gain[0].copy()
+            accepted[lanes] = self.others.change(which[lanes] - 1, changed[-int(lanes.sum()) :] if lanes.any() else [])
+        which, room, force, old_gain = which[accepted], self._room(), self._force(self._depth), self._gain[0].copy()
         if not accepted.any():
             return
         changed = list(compress(changed, accepted))
@@ -516,7 +516,7 @@ class Ensemble:
         self._fastest[which] = [fastest_travel(scene.wear, scene.contact) for scene in changed]
         self._stiffness[which] = [scene.contact.stiffness for scene in changed]
         if which[0] == 0:
-            load = (self.first.wrench - self._load_off[0]) / before * self._gain[0] + self._load_off[0]
+            load = (self.first.wrench - self._load_off[0]) / old_gain * self._gain[0] + self._load_off[0]
             time = self.first.time
             self.first = self.first.like(changed[0])
             self.first.reset(time, wear_depth=self.worn[0], pose=(self.pose[0], self._v[0]))
@@ -552,9 +552,9 @@ class Ensemble:
     def _put(self, which: NDArray[np.int64], q: Array, v: Array) -> None:
         for place in np.flatnonzero(which == 0):
             self.first.move(q[place], v[place])
-        rest = which > 0
-        if self.others is not None and rest.any():
-            self.others.move(which[rest] - 1, q[rest], v[rest])
+        lanes = which > 0
+        if self.others is not None and lanes.any():
+            self.others.move(which[lanes] - 1, q[lanes], v[lanes])
         self._path[-1][1][which], self._v[which] = q, v
         self._depth[which] = self._penetration(q, which)
 

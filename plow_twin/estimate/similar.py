@@ -67,7 +67,7 @@ class Units:
         head, frame, clearance, gravity = scene.head, scene.frame, scene.clearance, scene.gravity
         x, y = head.com_offset_m
         (qx, qy, theta), (vx, vy, omega), speed = scene.initial.q, scene.initial.v, self.speed
-        its = replace(
+        scaled = replace(
             scene,
             head=replace(
                 head,
@@ -91,7 +91,7 @@ class Units:
             loads=(),
             wear=None,
         )
-        return replace(its, marks=_converted(scene, its))
+        return replace(scaled, marks=_converted(scene, scaled))
 
     def load(self, load: Load) -> Load:
         """Return a load in these units."""
@@ -186,13 +186,13 @@ def _over(value: float | None, unit: float) -> float | None:
     return None if value is None else value / unit
 
 
-def _converted(scene: Scene, its: Scene) -> dict[str, Provenance]:
-    marks, length = dict(scene.marks), its.frame.width_m / scene.frame.width_m
+def _converted(scene: Scene, scaled: Scene) -> dict[str, Provenance]:
+    marks, length = dict(scene.marks), scaled.frame.width_m / scene.frame.width_m
     for path, kind in KINDS.items():
         mark, (part, name) = marks.get(path), path.split(".")
         value = getattr(getattr(scene, part), name, None)
         # the ratio of the units is the converted number divided by the number, if it is not zero
         if mark is not None and mark.deviation is not None and (value or kind == "clearance"):
-            ratio = length if kind == "clearance" else getattr(getattr(its, part), name) / value
+            ratio = length if kind == "clearance" else getattr(getattr(scaled, part), name) / value
             marks[path] = replace(mark, deviation=mark.deviation * ratio)
     return marks

@@ -148,7 +148,7 @@ def compare_under_uncertain_load(
         if len(rows) < _FEWEST:
             return None, work
         found = regress_near(np.array(rows)[:, 2:], np.array(targets), measured[2:])
-        value, deviation, before = found.value, found.deviation, spread.centre
+        value, deviation, previous_centre = found.value, found.deviation, spread.centre
         spread = _Spread(
             measured[:2] + value[:2],
             max(tuning.UNCERTAIN_SPREAD[0] / 2.0, tuning.FIRM_SPREAD[1] * float(deviation[:2].max())),
@@ -162,7 +162,7 @@ def compare_under_uncertain_load(
     share, least = by.unexplained
     unexplained = np.hypot(share * value[:2], least)
     # the last change of a clearance shows how far it has converged
-    moved = spread.centre - before
+    moved = spread.centre - previous_centre
     return Compared(
         spread.centre,
         np.sqrt(deviation[:2] ** 2 + unexplained**2 + moved**2),
@@ -299,5 +299,5 @@ def _with_error(load: Load, share: float, rng: np.random.Generator) -> Load:
     missed = rng.standard_normal((len(within), 3)) * np.sqrt(rng.random() * np.array(load.unknown) / _KNOT)
     t = np.unique(np.concatenate([load.t, grid, within]))
     parts = ((load.t, load.wrench), (grid, amplitude * error), (within, missed))
-    wrench = sum(interpolated(t, its, part) for its, part in parts)
+    wrench = sum(interpolated(t, knots, part) for knots, part in parts)
     return Load(t, np.asarray(wrench))

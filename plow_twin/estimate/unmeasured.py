@@ -77,32 +77,32 @@ class _Simulation:
 
     def descend(self, vector: Array, rows: int, scale: Array) -> tuple[Array, float]:
         """Return an improved vector and its cost; `scale`, shape (3,), is the unit of the residuals."""
-        here, damping = self._normalised(vector, rows, scale), 1e-2
-        if here is None:
+        residual, damping = self._normalised(vector, rows, scale), 1e-2
+        if residual is None:
             return vector, np.inf
         for _ in range(tuning.UNMEASURED_STEPS):
-            better, damping = self._better(vector, here, rows, scale, damping)
+            better, damping = self._better(vector, residual, rows, scale, damping)
             if better is None:
                 break
-            gained = self._cost(here) - self._cost(better[1])
-            vector, here = better
+            gained = self._cost(residual) - self._cost(better[1])
+            vector, residual = better
             if gained < tuning.ENOUGH:
                 break
-        return vector, self._cost(here)
+        return vector, self._cost(residual)
 
     def _better(
-        self, vector: Array, here: Array, rows: int, scale: Array, damping: float
+        self, vector: Array, residual: Array, rows: int, scale: Array, damping: float
     ) -> tuple[tuple[Array, Array] | None, float]:
         free, spread = self.free, self.deviation[self.free]
-        normal, gradient = self._equations(vector, here, rows, scale)
+        normal, gradient = self._equations(vector, residual, rows, scale)
         for _ in range(_SHORTER):
             step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
             trial = vector.copy()
             trial[free] -= np.clip(step, -spread, spread)
             trial = self.unknowns.within(trial)
-            measured_poses = self._normalised(trial, rows, scale)
-            if measured_poses is not None and self._cost(measured_poses) < self._cost(here):
-                return (trial, measured_poses), max(0.2 * damping, 1e-6)
+            improved = self._normalised(trial, rows, scale)
+            if improved is not None and self._cost(improved) < self._cost(residual):
+                return (trial, improved), max(0.2 * damping, 1e-6)
             damping = max(8.0 * damping, 1e-3)
         return None, damping
 
@@ -116,18 +116,18 @@ class _Simulation:
         error, prior = np.split(normalised, [-len(self.free)])
         return float(huber_loss(np.abs(error)).sum() + np.square(prior).sum())
 
-    def _equations(self, vector: Array, here: Array, rows: int, scale: Array) -> tuple[Array, Array]:
-        columns = np.zeros((len(here), len(self.free)))
+    def _equations(self, vector: Array, residual: Array, rows: int, scale: Array) -> tuple[Array, Array]:
+        columns = np.zeros((len(residual), len(self.free)))
         for place, index in enumerate(self.free):
             moved = vector.copy()
             moved[index] += _STEPS[index]
-            measured_poses = self._normalised(moved, rows, scale)
-            if measured_poses is not None:
-                columns[:, place] = (measured_poses - here) / _STEPS[index]
+            moved_residual = self._normalised(moved, rows, scale)
+            if moved_residual is not None:
+                columns[:, place] = (moved_residual - residual) / _STEPS[index]
             else:  # the moved motion cannot be simulated, so only the prior acts on this unknown
                 columns[place - len(self.free), place] = 1.0 / self.deviation[index]
-        weight = np.append(huber_weight(np.abs(here[: -len(self.free)])), np.ones(len(self.free)))
-        return columns.T @ (weight[:, None] * columns), columns.T @ (weight * here)
+        weight = np.append(huber_weight(np.abs(residual[: -len(self.free)])), np.ones(len(self.free)))
+        return columns.T @ (weight[:, None] * columns), columns.T @ (weight * residual)
 
 
 def fit_some_components(
@@ -151,12 +151,12 @@ def fit_some_components(
     end = float(poses.t[0]) + tuning.FIRST_PERIODS * period
     noise = np.where(whole.measured, whole.noise, _like_measured(whole))
 
-    def refined(shared: Array, end: float, before: Fit | None = None) -> tuple[Problem, Fit] | None:
+    def refined(shared: Array, end: float, previous: Fit | None = None) -> tuple[Problem, Fit] | None:
         q = whole.motion(shared, len(poses.t))
         if q is None:
             return None
-        if before is not None:
-            predicted = before.point.predicted
+        if previous is not None:
+            predicted = previous.point.predicted
             q[: len(predicted)] = np.where(np.isfinite(predicted), predicted, q[: len(predicted)])
         # the division into swings compares poses with their noise
         q = q + shared[BIAS] + np.where(whole.measured, 0.0, noise) * rng.standard_normal(q.shape)
