@@ -10,8 +10,7 @@ program may be in another Python environment (`view:=/opt/viewer/bin/plow-twin`)
 import shutil
 
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
-from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution, PythonExpression
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
@@ -38,47 +37,55 @@ OVERRIDES = {"scene": str, "record_path": str, "use_sim_time": bool, "autostart"
 STOP_WITH_LAUNCH = "setpriv --pdeathsig TERM" if shutil.which("setpriv") else ""
 
 
-def twin(context: LaunchContext) -> list[Node]:
+def actions(context: LaunchContext) -> list[Node | ExecuteProcess]:
+    """Return the node, and its viewer if the argument `view` is given."""
+    given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    if given["view"] in ("", "false"):
+        return [twin(given)]
+    if not given["record_path"]:
+        raise ValueError(f"view: got {given['view']} without record_path, expected record_path:=FOLDER, which is shown")
+    return [twin(given), viewer(given)]
+
+
+def twin(given: dict[str, str]) -> Node:
     """Return the node. Arguments that are not empty override the parameter file."""
-    given = {name: LaunchConfiguration(name) for name in ARGUMENTS}
     overrides = {
-        name: ParameterValue(given[name], value_type=kind)
+        name: ParameterValue(LaunchConfiguration(name), value_type=kind)
         for name, kind in OVERRIDES.items()
-        if given[name].perform(context)
+        if given[name]
     }
-    return [
-        Node(
-            package="plow_twin",
-            executable="twin",
-            name="plow_twin",
-            namespace=given["namespace"],
-            parameters=[given["params_file"], overrides],
-            # the node may take up to 5 s to close its recording
-            sigterm_timeout="6",
-            sigkill_timeout="6",
-            prefix=STOP_WITH_LAUNCH,
-            exec_name="twin",
-            output="screen",
-        )
-    ]
+    return Node(
+        package="plow_twin",
+        executable="twin",
+        name="plow_twin",
+        namespace=given["namespace"],
+        parameters=[given["params_file"], overrides],
+        # the node may take up to 5 s to close its recording
+        sigterm_timeout="6",
+        sigkill_timeout="6",
+        prefix=STOP_WITH_LAUNCH,
+        exec_name="twin",
+        output="screen",
+    )
 
 
-def generate_launch_description() -> LaunchDescription:
-    """Return one twin, and its viewer if the argument `view` is given."""
-    given = {name: LaunchConfiguration(name) for name in ARGUMENTS}
+def viewer(given: dict[str, str]) -> ExecuteProcess:
+    """Return the process that shows the recording while it is written."""
     # the viewer has a Python environment of its own, so the variables that a sourced ROS 2 adds are removed
     apart = [
         "env",
         *(f"--unset={name}" for name in ("PYTHONPATH", "LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")),
     ]
-    program = PythonExpression(["'plow-twin' if '", given["view"], "' == 'true' else '", given["view"], "'"])
-    viewer = ExecuteProcess(
-        cmd=[*apart, program, "view", given["record_path"], "--follow", "--wait", "600", "--web"],
-        condition=IfCondition(PythonExpression(["'", given["view"], "' not in ('', 'false')"])),
-        output="screen",
+    program = "plow-twin" if given["view"] == "true" else given["view"]
+    return ExecuteProcess(
+        cmd=[*apart, program, "view", given["record_path"], "--follow", "--wait", "600", "--web"], output="screen"
     )
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Return one twin, and its viewer if the argument `view` is given."""
     arguments = [
         DeclareLaunchArgument(name, default_value=default, description=text)
         for name, (default, text) in ARGUMENTS.items()
     ]
-    return LaunchDescription([*arguments, OpaqueFunction(function=twin), viewer])
+    return LaunchDescription([*arguments, OpaqueFunction(function=actions)])

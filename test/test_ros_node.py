@@ -549,7 +549,7 @@ def launched(monkeypatch: pytest.MonkeyPatch, **given: str) -> dict[str, Any]:
     `launch` is not on PyPI, so mocks replace it.
     """
     modules = {name: MagicMock() for name in ("launch", "launch_ros")}
-    for package, names in (("launch", "actions conditions substitutions"), ("launch_ros", "actions substitutions")):
+    for package, names in (("launch", "actions substitutions"), ("launch_ros", "actions substitutions")):
         for name in ("", *names.split(), *(("parameter_descriptions",) if package == "launch_ros" else ())):
             monkeypatch.setitem(
                 sys.modules,
@@ -567,9 +567,16 @@ def launched(monkeypatch: pytest.MonkeyPatch, **given: str) -> dict[str, Any]:
 
 def test_the_launch_overrides_only_the_parameters_that_are_given(monkeypatch: pytest.MonkeyPatch) -> None:
     file, overrides = launched(monkeypatch, params_file="mine.yaml")["parameters"]
-    assert (file.text, overrides) == ("mine.yaml", {})
+    assert (file, overrides) == ("mine.yaml", {})
     _, overrides = launched(monkeypatch, scene="paper", autostart="false")["parameters"]
     assert overrides == {"scene": ("paper", str), "autostart": ("false", bool)}
+
+
+def test_the_launch_shows_only_a_recording_that_it_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert launched(monkeypatch, view="false")["parameters"]
+    assert launched(monkeypatch, view="true", record_path="runs/monday")["parameters"][1]
+    with pytest.raises(ValueError, match="view: got true without record_path"):
+        launched(monkeypatch, view="true")
 
 
 def test_a_twin_ends_cleanly_with_its_launch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
