@@ -147,6 +147,15 @@ def test_a_mistake_in_a_command_is_reported_in_a_message(
     assert sorted(desk.rglob("*")) == before
 
 
+def test_an_unexpected_end_of_data_is_not_called_an_interruption(monkeypatch: pytest.MonkeyPatch) -> None:
+    def cut(_: object) -> None:
+        raise EOFError("Ran out of input")
+
+    monkeypatch.setattr("plow_twin.scene_file.load_scene", cut)
+    with pytest.raises(EOFError, match="Ran out of input"):
+        cli(["info", "paper"])
+
+
 def test_rows_that_an_estimate_cannot_use_are_counted_in_its_losses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -115,8 +115,10 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except RunInterrupted as error:
         return _fail(str(error))
     except (click.Abort, KeyboardInterrupt) as error:
-        # click replaces a KeyboardInterrupt by an Abort; the KeyboardInterrupt is the cause of the Abort
+        # click replaces a KeyboardInterrupt or an EOFError by an Abort with this cause; a prompt's Abort has no cause
         stopped = error.__cause__
+        if isinstance(stopped, EOFError):
+            raise stopped from None
         return _fail(str(stopped) if isinstance(stopped, RunInterrupted) else "interrupted")
     except (InputError, UnitError, ExcessError) as error:
         return _fail(str(error), WRONG_INPUT)
