@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from plow_twin import Initial, load_scene, simulate
-from plow_twin.errors import ArgumentError
+from plow_twin.errors import ArgumentError, RecordingError
 from plow_twin.study.measured import bands, impact
 from plow_twin.study.measured.drops import Drops
 from plow_twin.study.measured.ellipse import ELLIPSE, GYRATION, SEMI_AXES, contact_arms, simulated_impact
@@ -28,6 +28,15 @@ def impacts() -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture(scope="module")
 def drops() -> Drops:
     return Drops.load(DATA / "square_drops.npz")
+
+
+def test_drops_with_rows_in_reverse_order_are_refused(tmp_path: Path) -> None:
+    with np.load(DATA / "square_drops.npz") as data:
+        arrays = {name: data[name].copy() for name in data.files}
+    arrays["pose"][3] = arrays["pose"][3, ::-1]
+    np.savez(tmp_path / "drops.npz", **arrays)
+    with pytest.raises(RecordingError, match="drop 3 ends higher than it begins"):
+        Drops.load(tmp_path / "drops.npz")
 
 
 def misses(predicted: np.ndarray, after: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.errors import RecordingError
 from plow_twin.study.measured.square import LEAST_ROWS, RATE_HZ
 
 Array = NDArray[np.float64]
@@ -35,9 +36,18 @@ class Drops:
 
     @classmethod
     def load(cls, path: Path) -> Drops:
-        """Read a file of drops such as `benchmark/data/measured/square_drops.npz`."""
+        """Read a file of drops such as `benchmark/data/measured/square_drops.npz`.
+
+        Raises
+        ------
+        RecordingError
+            The rows of a drop are in reverse order of time, because it ends higher than it begins.
+        """
         with np.load(path) as data:
             pose = data["pose"] * data["scale"]
+        rising = np.flatnonzero(pose[:, -1, 1] > pose[:, 0, 1])
+        if len(rising):
+            raise RecordingError(f"{path}: drop {rising[0]} ends higher than it begins, expected rows in order of time")
         pose[:, :, 2] = np.unwrap(pose[:, :, 2], axis=1)
         flights = np.array([_flight_rows(poses) for poses in pose])
         return cls(pose, flights, tuple(_bounces(poses[:, 1]) for poses in pose))
