@@ -238,8 +238,9 @@ def test_wear_continues_from_its_depth_and_widens_the_estimate(truth: Truth) -> 
     before = live.session.wear_depth
     live.take([_known(truth), *_in_turn(truth, 1.97, 2.011)])
     assert (live.session.wear_depth >= before).all() and before.min() >= 1e-3
-    at_first = live.clearance()
-    assert at_first[0, 0] == pytest.approx(truth.clearance[0], abs=2e-6)
+    at_first, since = live.clearance(), live.session.wear_depth - before
+    # the estimated clearance is that at the arrival of the estimate
+    assert at_first[0, 0] == pytest.approx(truth.clearance[0] + 0.5 * since[[1, 3, 5, 7]].sum(), abs=2e-6)
     live.take(_in_turn(truth, 2.011, 4.0))
     growth = live.session.wear_depth - before
     assert (growth >= 0.0).all() and growth.max() > 1e-6
@@ -403,7 +404,10 @@ def _at_1_khz(truth: Truth, begin: float, end: float) -> list[Sample]:
     return [Sample(_stamp(now), (fx, fy, m)) for now, (fx, fy, m) in zip(t.tolist(), wrench.tolist(), strict=True)]
 
 
-def test_twins_of_an_estimate_are_drawn_in_pieces(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("wear", [None, Wear(2e-11, 0.015, 2.0)])
+def test_twins_of_an_estimate_are_drawn_in_pieces(
+    truth: Truth, wear: Wear | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     draw_piece, prepare, pieces, compiled = Ensemble.draw_piece, Follower._prepare, [0], [0]
 
     def counted(ensemble: Ensemble) -> bool:
@@ -422,7 +426,7 @@ def test_twins_of_an_estimate_are_drawn_in_pieces(truth: Truth, monkeypatch: pyt
     digests = []
     for prepares in (True, False):
         monkeypatch.setattr(Follower, "_prepare", prepare if prepares else lambda follower: None)
-        live = Live(truth.nominal)
+        live = Live(replace(truth.nominal, wear=wear))
         live.take(_at_1_khz(truth, 0.0, 0.1))
         for begin, entry in zip((0.1, 0.2, 0.3), entries, strict=True):
             pieces[:], compiled[:] = [0], [0]
@@ -436,6 +440,9 @@ def test_twins_of_an_estimate_are_drawn_in_pieces(truth: Truth, monkeypatch: pyt
             # no sample has the work of two pieces, and none compiles the scenes of all twins with another piece
             assert (max(pieces[1:]) == 1) == prepares and not any(compiled)
         digests.append(live.twin.digest())
+        # twins that were drawn early begin with the wear at their first use
+        depth = live.column("wear_depth")
+        assert (np.diff(depth, axis=0) >= 0.0).all() and depth.any() == (wear is not None)
     assert digests[0] == digests[1]
 
 

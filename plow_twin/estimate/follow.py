@@ -70,6 +70,8 @@ _NO_POSES: Final = Poses(np.zeros(0), np.zeros((0, 3)))
 _LENGTH: Final = struct.Struct("<q")
 #: Key of the harmonics of the load in the JSON of an estimate.
 _HARMONICS: Final = "load_harmonics"
+#: Key of the wear depths of the pads [m] at the arrival of an estimate, in its JSON.
+_WORN: Final = "worn_m"
 #: Key of harmonics that wait for the origin of the model time, and key of the stamp [ns] from which their phases count.
 _WAITING, _BEGIN_NS = "waiting_harmonics", "begin_ns"
 
@@ -204,7 +206,7 @@ class Follower:
         members = 1 if alone else self._members
         if draft is None or not draft.fits(text, self.drawn, members):
             draft = self._begin_draft(text, self.drawn, members, worn)
-        draft.ensemble.start_at(time)
+        draft.ensemble.start_at(time, worn)
         self._text, self._ensemble, self._present_estimate = text, draft.ensemble, draft.estimate
         #: the estimate that the members follow; None for the prior
         self.estimate = Estimate.from_dict(json.loads(text)) if text else None
@@ -217,19 +219,21 @@ class Follower:
         rng = np.random.default_rng([self._seed, drawn])
         # errors of an uncertain load would distort learned parameters
         learns = not _load_share(text).any()
+        if _WORN in text:
+            worn = np.array(json.loads(text)[_WORN])
         ensemble = Ensemble(self.scene, estimate, members, rng, None, self.tol, worn, learns)
         return _Draft(text, drawn, estimate, ensemble)
 
     def _prepare(self) -> None:
         """Draw a piece of the members that the next waiting estimate will need.
 
-        This changes only when the work is done. Members with wear are not prepared, because they are drawn with the
-        wear at the time of their first use.
+        This changes only when the work is done.
         """
         self._prepared = self.time
         latest = self.time + PREPARATION_S
-        waiting = next((item for when, _, item in self._due if when <= latest and isinstance(item, str)), None)
-        text = None if waiting is None or self.scene.wear is not None else self._text_after(waiting)
+        waiting = (item for when, _, item in self._due if when <= latest and isinstance(item, str))
+        ready = next(filter(self._is_ready, waiting), None)
+        text = None if ready is None else self._text_after(ready)
         if text is None:
             self._draft = None
             return
@@ -382,8 +386,7 @@ class Follower:
         if math.floor(self.time * _KNOWN_HZ) != self._cell:
             self._note_clearance()
         while self._due and self._due[0][0] <= self.time:
-            when, _, measured = self._due.pop(0)
-            self._use(when, measured)
+            self._use(*self._due.pop(0))
         if self._due and self.time > self._prepared:
             self._prepare()
 
@@ -428,7 +431,7 @@ class Follower:
         self.drawn += 1
         worn = self._unworn() if wear_depth is None else np.array(wear_depth, dtype=np.float64)
         if self._alone and np.array_equal(worn, self._ensemble.worn_before):
-            self._ensemble.start_at(t)
+            self._ensemble.start_at(t, worn)
             self._draft, self._prepared = None, t
             self._note_clearance()
         else:
@@ -513,26 +516,46 @@ class Follower:
         After the prior, the members follow an estimate that contains a clearance. Only an estimate that contains the
         same clearances replaces it. A rough clearance does not replace an estimated clearance from nearly the same
         motion. After a withdrawn estimate, the members follow the prior.
+
+        The clearances of the estimate belong to the wear at `t` - `PREPARATION_S`, from when members can be drawn.
         """
-        self._add(t, _harmonics_from(text, start))
+        known = t if self.scene.wear is None else t - PREPARATION_S
+        self._add(known, _harmonics_from(text, start))
 
     def _add(self, t: float, measured: list[float] | str) -> None:
         self.added += 1
         if t <= self.time:
             self.catch_up()
-            self._use(t, measured)
+            self._use(t, self.added, measured)
         elif isinstance(measured, str) or len(self._due) < _MOST_DUE:
             insort(self._due, (t, self.added, measured), key=lambda due: due[:2])
         else:
             self.poses = self.poses._replace(dropped=self.poses.dropped + 1)
 
-    def _use(self, t: float, measured: list[float] | str) -> None:
+    def _use(self, t: float, number: int, measured: list[float] | str) -> None:
         if not isinstance(measured, str):
             self._use_pose(measured[0], np.array(measured[1:]))
-            return
+        elif self._is_ready(measured):
+            self._adopt(measured)
+        elif t + PREPARATION_S <= self.time:
+            self._adopt(self._with_wear(measured))
+        else:
+            insort(self._due, (t + PREPARATION_S, number, self._with_wear(measured)), key=lambda due: due[:2])
+
+    def _adopt(self, measured: str) -> None:
         text = self._text_after(measured)
         if text is not None:
             self._begin_anew(text)
+
+    def _is_ready(self, text: str) -> bool:
+        """Return whether members can be drawn from an estimate (JSON): in a scene with wear, it contains the wear."""
+        return self.scene.wear is None or not text or _WORN in text
+
+    def _with_wear(self, text: str) -> str:
+        """Return an estimate (JSON) with the present wear, unless it has the wear of an earlier time."""
+        if self._is_ready(text):
+            return text
+        return json.dumps(json.loads(text) | {_WORN: self.wear_depth.tolist()})
 
     def _text_after(self, measured: str) -> str | None:
         """Return the estimate (JSON; empty for the prior) from which `measured` lets members be drawn, or None."""
@@ -564,8 +587,9 @@ class Follower:
         self.catch_up()
         waiting = [item for item in self._due if isinstance(item[2], str)]
         self._due = [item for item in self._due if item not in waiting]
-        for when, _, measured in waiting:
-            self._use(when, measured)
+        for _, _, measured in waiting:
+            assert isinstance(measured, str)
+            self._adopt(self._with_wear(measured))
         return Learned(_waiting(self._text, origin_ns), self.steered, self.poses)
 
     def learn(self, learned: Learned) -> None:

@@ -77,7 +77,7 @@ class Ensemble:
     tol : float
         Tolerance of the solver.
     worn : ndarray, shape (8,)
-        Wear depth of the pads in m.
+        Wear depth of the pads in m that belongs to the clearances of the estimate.
     learns : bool
         Whether parameters that an estimate hardly determines are estimated from the poses.
     """
@@ -89,7 +89,7 @@ class Ensemble:
         self.count = members
         self._pieces = self._draw(scene, estimate, members, rng, tol, worn, learns)
         if start is not None:
-            self.start_at(start)
+            self.start_at(start, worn)
 
     def draw_piece(self) -> bool:
         """Draw the next of five parts, and return whether there was a part left."""
@@ -112,12 +112,12 @@ class Ensemble:
         self._steers_first = estimate.horizontal_state is not State.PRIOR
         if not self._steers_first and members > 1:
             scenes[1], gain[1] = scenes[0], gain[0]
-        #: wear depths of the pads at the start, and their part of the estimated clearances, shape (2, 1)
-        self.worn_before, self.moved_before = worn, np.zeros((2, 1))
+        #: part of the estimated clearances due to wear in m, shape (2, 1)
+        self.moved_before = np.zeros((2, 1))
         if scene.wear is not None:
             states = (estimate.horizontal_state, estimate.vertical_state)
             self.moved_before = np.where([[state.known] for state in states], widening(scene, worn)[:, None], 0.0)
-            scenes = _worn(scenes, replace(scene.wear, initial_depth_m=tuple(worn.tolist())), self.moved_before)
+            scenes = _worn(scenes, scene.wear, self.moved_before)
         #: the first member, which is advanced alone so that its forces are available first
         self.first = Twin(scenes[0], tol=tol, excitation="sampled", max_steps=MOST_STEPS)
         yield True
@@ -157,14 +157,19 @@ class Ensemble:
         # whether each degree of freedom is free
         self._free = np.array(scene.free)
 
-    def start_at(self, t: float) -> None:
-        """Draw all further parts, and set all members to the initial state of the scene at the time `t` [s]."""
+    def start_at(self, t: float, worn: Array) -> None:
+        """Draw all further parts, and set all members to the initial state of the scene at the time `t` [s].
+
+        `worn` are the present wear depths of the pads in m, shape (8,).
+        """
         while self.draw_piece():
             pass
         members = self.count
-        self.first.reset(t)
+        #: wear depths of the pads at the start in m, shape (8,)
+        self.worn_before = worn
+        self.first.reset(t, wear_depth=worn)
         if self.others is not None:
-            self.others.reset(t)
+            self.others.reset(t, wear_depth=worn)
         # index of the next member that adopts learned parameters, and number of members that are due
         self._turn, self._waiting = 0, 0.0
         if self._learner is not None:
@@ -633,7 +638,7 @@ def _clearance_of(scenes: Sequence[Scene]) -> Array:
 
 
 def _worn(scenes: Sequence[Scene], wear: Wear, moved: Array) -> list[Scene]:
-    """Return scenes with the worn pads `wear` and with clearances reduced by `moved` in m, shape (2, 1)."""
+    """Return scenes with wear and with clearances reduced by `moved` in m, shape (2, 1)."""
     horizontal, vertical = np.maximum(_clearance_of(scenes).T - moved, 0.0)
     return variants(scenes, {"clearance": {"horizontal_m": horizontal, "vertical_m": vertical}}, wear=wear)
 

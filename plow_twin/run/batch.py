@@ -214,13 +214,15 @@ class TwinBatch:
             self._wrench = samples[:, -1].copy()
         return AdvanceBatch(rows)
 
-    def reset(self, t: float) -> None:
+    def reset(self, t: float, *, wear_depth: ArrayLike | None = None) -> None:
         """Reset all twins to the initial states of their scenes, at model time `t`.
 
         Parameters
         ----------
         t : float
             Model time in s.
+        wear_depth : array_like, shape (8,) or (m, 8), optional
+            Wear depth of each pad in m, at least 0. The default are the scenes' initial wear depths.
 
         Raises
         ------
@@ -232,6 +234,8 @@ class TwinBatch:
         members = np.arange(len(self))
         self._states[:] = 0
         start_many(self._compiled, self._states, members.tolist())
+        if wear_depth is not None:
+            self._states["wear_depth"] = wear_depth
         settle_moved(self._params, self._states, members, self._states["y"].copy(), t, self._stick)
         self._reload()
         self._wrench = np.zeros((1, 3))
