@@ -21,6 +21,7 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.context import Context
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 
 from plow_twin.ros.messages import set_stamp
 
@@ -167,6 +168,18 @@ class Probe:
             publisher.publish(message)
 
         return send
+
+    def clock(self) -> Callable[[int], None]:
+        """Return a function that publishes a time [ns] on `/clock`, as soon as the twin subscribes to the topic."""
+        publisher = self.node.create_publisher(Clock, "/clock", 1000)
+        self.until(lambda: publisher.get_subscription_count() > 0, "a reader of /clock")
+
+        def show(time_ns: int) -> None:
+            message = Clock()
+            message.clock.sec, message.clock.nanosec = divmod(time_ns, 10**9)
+            publisher.publish(message)
+
+        return show
 
     def pace(self, index: int) -> None:
         """Pause after every 50 samples, because best-effort subscribers drop messages if they cannot keep up."""

@@ -28,6 +28,7 @@ from urllib.request import urlopen
 import forge
 import numpy as np
 import pytest
+from network import free_port
 from record_support import PAPER_AMPLITUDE, records_of, rewrite
 from waiting import until
 
@@ -451,7 +452,7 @@ def test_a_hanging_reader_of_the_lines_stops_nothing_and_lost_lines_are_counted(
 
 
 def test_a_live_twin_with_an_unread_standard_output_continues_and_can_be_stopped(tmp_path: Path) -> None:
-    path, port = _csv(tmp_path / "load.csv", 100), _free_port()
+    path, port = _csv(tmp_path / "load.csv", 100), free_port()
     more = ["--metrics", str(port), "--record", str(tmp_path / "run")]
     with _live(str(path), "--follow", "--scene", "paper", *more) as live:
         pipe = live.process.stdout
@@ -787,12 +788,6 @@ def test_the_memory_of_a_long_run_is_bounded_except_for_the_index_of_the_recordi
     assert int(figures["samples_used"]) == int(figures["samples_in"]) and int(figures["rolled_back"]) > 0
 
 
-def _free_port() -> int:
-    with socket.socket() as server:
-        server.bind(("127.0.0.1", 0))
-        return int(server.getsockname()[1])
-
-
 def test_a_refusal_by_the_system_is_a_warning_and_the_other_settings_apply() -> None:
     code = """
 import os, resource
@@ -852,7 +847,7 @@ def test_a_message_about_a_wrong_call_states_the_expected_call(
 
 
 def test_prometheus_reads_the_numbers_of_the_diagnostics(tmp_path: Path) -> None:
-    path, port = _csv(tmp_path / "load.csv", 100, start=time.time()), _free_port()
+    path, port = _csv(tmp_path / "load.csv", 100, start=time.time()), free_port()
     url, first = f"http://127.0.0.1:{port}/metrics", b""
     with _live(str(path), "--follow", "--metrics", str(port), "--set", "excitation_timeout=3600") as live:
         give_up = time.monotonic() + 120.0
@@ -875,7 +870,7 @@ def test_prometheus_reads_the_numbers_of_the_diagnostics(tmp_path: Path) -> None
 
 
 def test_silent_readers_of_metrics_are_limited() -> None:
-    port = _free_port()
+    port = free_port()
     with Metrics(port, {"state": (0, "", {"model_time_s": "1.5"})}), ExitStack() as opened:
         idle = [opened.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(40)]
         closed: list[socket.socket] = []

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from network import free_port, make_certificate
 from record_support import PAPER_AMPLITUDE, records_of
 from test_live import ROOT, _live
 from waiting import until
@@ -45,7 +46,7 @@ class Plant:
     """The server, and a connection to it that can be interrupted."""
 
     def __init__(self, *security: str, **environment: str) -> None:
-        self.port, server_port = _free_port(), _free_port()
+        self.port, server_port = free_port(), free_port()
         self._process = subprocess.Popen(
             [sys.executable, str(ROOT / "test" / "opcua_server.py"), str(server_port), *security],
             stdin=subprocess.PIPE,
@@ -106,12 +107,6 @@ def _pass_on(source: socket.socket, sink: socket.socket) -> None:
     for found in (source, sink):
         with suppress(OSError):
             found.shutdown(socket.SHUT_RDWR)
-
-
-def _free_port() -> int:
-    with socket.socket() as server:
-        server.bind(("127.0.0.1", 0))
-        return int(server.getsockname()[1])
 
 
 @pytest.fixture(scope="module")
@@ -414,14 +409,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("other", "urn:x"),
         ("user", "urn:y"),
     ):
-        subprocess.run(
-            ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", f"/CN={name}",
-             "-addext", f"subjectAltName=DNS:localhost,URI:{uri}",
-             "-addext", "keyUsage=digitalSignature,nonRepudiation,keyEncipherment,dataEncipherment,keyCertSign",
-             "-addext", "extendedKeyUsage=serverAuth,clientAuth",
-             "-keyout", str(folder / f"{name}.key.pem"), "-out", str(folder / f"{name}.pem")],
-            check=True, capture_output=True,
-        )  # fmt: skip
+        make_certificate(folder, name, uri)
         (folder / f"{name}.key").symlink_to(f"{name}.key.pem")  # a usual name of a key in PEM
     return folder
 

@@ -23,8 +23,9 @@ from urllib.parse import urlsplit
 
 import pytest
 from commands import plow_twin_here
+from network import free_port
 from record_support import records_of
-from test_live import ROOT, _csv, _free_port, _live, _row
+from test_live import ROOT, _csv, _live, _row
 from waiting import until
 
 from plow_twin.cli.app import run as run_cli
@@ -67,7 +68,7 @@ def broker(tmp_path: Path) -> Iterator[Access]:
         check=True, capture_output=True,
     )  # fmt: skip
     (tmp_path / "users").write_text(f"plough:{_hash('s3cret')}\n")
-    port = _free_port()
+    port = free_port()
     tls = {"ssl": True, "certfile": str(certificate), "keyfile": str(key)}
     config = {
         "listeners": {"default": {"type": "tcp", "bind": f"127.0.0.1:{port}", **tls}},
@@ -336,7 +337,7 @@ def test_a_broker_receives_all_groups_with_tls_and_reports_the_end_of_the_twin(b
 
 
 def test_an_output_process_that_does_not_read_updates_is_reported(tmp_path: Path) -> None:
-    path, url = _csv(tmp_path / "load.csv", 100), f"mqtt://127.0.0.1:{_free_port()}/plough"
+    path, url = _csv(tmp_path / "load.csv", 100), f"mqtt://127.0.0.1:{free_port()}/plough"
     with _live(str(path), "--follow", "--mqtt-out", url, "--out-rate", "500", *STALE) as live:
         live.until(lambda heard: "no broker" in heard.get("mqtt_out", {}).get("message", ""), "no broker")
         children = Path(f"/proc/{live.process.pid}/task").glob("*/children")
@@ -350,7 +351,7 @@ def test_an_output_process_that_does_not_read_updates_is_reported(tmp_path: Path
 
 def test_a_run_that_ends_without_its_broker_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "map.yaml").write_text(MAP.replace(", sequence: n", ""))
-    port, client, broker = _free_port(), make_client("", clean=True), ExitStack()
+    port, client, broker = free_port(), make_client("", clean=True), ExitStack()
     broker.enter_context(_open_broker(tmp_path, port))
 
     def connected(parts: dict[str, dict[str, Any]]) -> bool:
@@ -374,7 +375,7 @@ def test_a_run_that_ends_without_its_broker_is_an_error(tmp_path: Path) -> None:
 
 def test_a_missing_broker_is_reported_and_does_not_affect_the_twin(tmp_path: Path) -> None:
     path, runs = _csv(tmp_path / "load.csv", 2000), [tmp_path / "alone", tmp_path / "with"]
-    url = f"mqtt://127.0.0.1:{_free_port()}/plough"
+    url = f"mqtt://127.0.0.1:{free_port()}/plough"
     done = [
         plow_twin_here("live", path, "--record", run, "--json", *more)
         for run, more in zip(runs, ((), ("--mqtt-out", url)), strict=True)
@@ -403,7 +404,7 @@ async def _reached(condition: Callable[[], object], event: object) -> None:
 
 
 def test_messages_for_a_broker_are_limited_counted_and_sent_in_order(tmp_path: Path) -> None:
-    port = _free_port()
+    port = free_port()
 
     async def send() -> None:
         output = _output(port, waiting=5)
@@ -426,7 +427,7 @@ def test_messages_for_a_broker_are_limited_counted_and_sent_in_order(tmp_path: P
 
 
 def test_an_acknowledgement_that_arrives_while_a_message_is_sent_does_not_block_the_output(tmp_path: Path) -> None:
-    port = _free_port()
+    port = free_port()
 
     async def send() -> None:
         output = _output(port)
@@ -470,7 +471,7 @@ def _metrics(payload: Any) -> dict[str, Any]:
 
 
 def test_a_sparkplug_host_receives_birth_data_rebirth_and_death_in_sequence(tmp_path: Path) -> None:
-    port, path = _free_port(), _csv(tmp_path / "load.csv", 500)
+    port, path = free_port(), _csv(tmp_path / "load.csv", 500)
     arguments = (str(path), "--follow", "--mqtt-out", f"mqtt://127.0.0.1:{port}", "--sparkplug", "mine/plough")
     with ExitStack() as opened:
         opened.enter_context(_open_broker(tmp_path, port))

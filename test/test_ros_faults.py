@@ -38,7 +38,6 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 from ros_domain import claim_domain
 from ros_processes import Bench, bench, value
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
@@ -262,16 +261,12 @@ def test_a_step_of_the_sender_s_clock_causes_one_reset_and_no_loss(tmp_path: Pat
 def test_a_clock_that_is_paused_looped_and_fast_moves_the_twin_with_its_samples(tmp_path: Path) -> None:
     with bench(tmp_path, use_sim_time="true", **RELIABLE_INPUT) as running:
         probe = running.probe
-        clock = probe.node.create_publisher(Clock, "/clock", 100)
-        probe.until(lambda: clock.get_subscription_count() > 0, "a reader of /clock")
-        send = probe.excitation()
-        message = Clock()
+        show, send = probe.clock(), probe.excitation()
 
         def play(first: int, last: int, every: int) -> None:
             for index in range(first, last):
                 if index % every == 0:
-                    message.clock.sec, message.clock.nanosec = divmod(T0 + index * MS, 10**9)
-                    clock.publish(message)
+                    show(T0 + index * MS)
                 send(T0 + index * MS, (30e3, 0.0, 0.0))
                 probe.pace(index)
 
@@ -291,14 +286,7 @@ def test_a_clock_that_is_paused_looped_and_fast_moves_the_twin_with_its_samples(
 def test_the_scene_s_loads_follow_a_clock_that_is_paused_looped_and_fast(tmp_path: Path) -> None:
     with bench(tmp_path, use_sim_time="true", excitation_source="scene") as running:
         probe = running.probe
-        clock = probe.node.create_publisher(Clock, "/clock", 100)
-        probe.until(lambda: clock.get_subscription_count() > 0, "a reader of /clock")
-        forces = probe.listen(JointState, "contact_forces")
-        message = Clock()
-
-        def show(time_ns: int) -> None:
-            message.clock.sec, message.clock.nanosec = divmod(time_ns, 10**9)
-            clock.publish(message)
+        show, forces = probe.clock(), probe.listen(JointState, "contact_forces")
 
         def reach(time_ns: int) -> None:
             probe.until(lambda: show(time_ns) or (forces and stamp_ns(forces[-1].header) == time_ns), "that time")
@@ -326,16 +314,10 @@ def test_any_sequence_on_clock_is_survived_counted_and_repeated_by_the_journal(s
         tmp_path, use_sim_time="true", excitation_source=source, record_path=tmp_path / "run", **RELIABLE_INPUT
     ) as running:
         probe = running.probe
-        clock = probe.node.create_publisher(Clock, "/clock", 1000)
-        probe.until(lambda: clock.get_subscription_count() > 0, "a reader of /clock")
+        show = probe.clock()
         send = probe.excitation() if source == "excitation" else None
         forces = probe.listen(JointState, "contact_forces")
-        message, time_ns, sent = Clock(), T0, 0
-
-        def show(time_ns: int) -> None:
-            message.clock.sec, message.clock.nanosec = divmod(time_ns, 10**9)
-            clock.publish(message)
-
+        time_ns, sent = T0, 0
         for index in range(3000):
             draw = rng.random()
             if draw < 0.9:

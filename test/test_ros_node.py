@@ -30,7 +30,6 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from record_support import records_of
 from ros_processes import ROOT, WAIT_S, Process, bench, value
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from websockets.sync.client import connect
@@ -673,14 +672,11 @@ def test_under_sim_time_the_model_does_not_advance_in_a_silence(tmp_path: Path) 
         assert "no message has arrived on /clock" in probe.status[-1].message and probe.status[-1].level == b"\x01"
         assert not probe.call(Trigger, f"{running.namespace}/plow_twin/reset", Trigger.Request()).success
         assert (len(forces), probe.figures("recorder")["written"]) == (0, "0")
-        clock = probe.node.create_publisher(Clock, "/clock", 10)
-        message = Clock()
+        show, time_ns = probe.clock(), T0
         # a time before 0 is invalid
-        message.clock.sec = -5
-        probe.until(lambda: clock.publish(message) or "/clock: got -5 s" in running.twin.output(), "a wrong time said")
+        probe.until(lambda: show(-5 * 10**9) or "/clock: got -5 s" in running.twin.output(), "a wrong time said")
         assert value(probe.status[-1], "clock") == "waiting" and not forces
-        message.clock.sec = T0 // 10**9
-        probe.until(lambda: clock.publish(message) or len(forces) == 200, "200 answers")
+        probe.until(lambda: show(time_ns) or len(forces) == 200, "200 answers")
         for _ in range(2):
             assert probe.figures("input")["holds"] == "0"
         probe.until(lambda: value(probe.status[-1], "clock") == "paused", "the clock stands still")
@@ -688,8 +684,9 @@ def test_under_sim_time_the_model_does_not_advance_in_a_silence(tmp_path: Path) 
         assert "/clock is paused" in probe.status[-1].message
 
         def tick() -> bool:
-            message.clock.nanosec += MS
-            clock.publish(message)
+            nonlocal time_ns
+            time_ns += MS
+            show(time_ns)
             return value(probe.status[-1], "clock") == "running"
 
         probe.until(tick, "the clock goes on")
@@ -794,12 +791,10 @@ def test_the_scenes_own_loads_follow_the_nodes_clock(tmp_path: Path) -> None:
     with bench(tmp_path, excitation_source="scene", use_sim_time="true") as running:
         probe = running.probe
         heads = probe.listen(Odometry, "head_state")
-        clock = probe.node.create_publisher(Clock, "/clock", 10)
-        for step in range(5):
-            message = Clock()
-            message.clock.sec, message.clock.nanosec = divmod(T0 + step * 300 * MS, 1_000_000_000)
+        show = probe.clock()
+        for time_ns in range(T0, T0 + 1500 * MS, 300 * MS):
             # the twin may discover the clock later than this process does, so the clock is published repeatedly
-            probe.until(lambda: clock.publish(message) or _at(heads, T0 + step * 300 * MS), "its answer")  # noqa: B023
+            probe.until(lambda: show(time_ns) or _at(heads, time_ns), "its answer")  # noqa: B023
     twin = Twin(PAPER)
     for index, head in enumerate(heads):
         q = twin.advance((stamp_ns(head.header) - T0) * 1e-9).q

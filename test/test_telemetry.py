@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import socket
-import subprocess
 import threading
 import time
 from collections.abc import Callable, Coroutine
@@ -18,7 +17,8 @@ from asyncua import Client, ua
 from asyncua.crypto.security_policies import SecurityPolicyAes256Sha256RsaPss
 from asyncua.crypto.uacrypto import CertProperties
 from commands import plow_twin_here
-from test_live import Live, _csv, _free_port, _live
+from network import free_port, make_certificate
+from test_live import Live, _csv, _live
 from test_mqtt import STALE, _entries
 
 from plow_twin.live.bridge.source import BridgeError
@@ -82,7 +82,7 @@ async def _soon(reached: Callable[[], Any]) -> None:
 
 
 def test_opcua_clients_read_a_typed_model_and_may_acknowledge_alarms(tmp_path: Path) -> None:
-    path, run, url = _csv(tmp_path / "load.csv", 1500), tmp_path / "run", f"opc.tcp://127.0.0.1:{_free_port()}"
+    path, run, url = _csv(tmp_path / "load.csv", 1500), tmp_path / "run", f"opc.tcp://127.0.0.1:{free_port()}"
     arguments = (str(path), "--follow", "--opcua", url, "--out-rate", "5", "--set", "alarm_force=[20e3,1e9]", *STALE)
 
     async def look(*, allowed: bool) -> None:
@@ -140,8 +140,8 @@ async def _is_good(node: Any) -> bool:
 
 
 def test_an_opcua_server_for_other_machines_encrypts_and_admits_trusted_clients(tmp_path: Path) -> None:
-    for name in ("server", "client", "other"):
-        _certificate(tmp_path, name)
+    for name, program in (("server", "server"), ("client", "client"), ("other", "client")):
+        make_certificate(tmp_path, name, f"urn:plow-twin:{program}")
     (tmp_path / "trusted").mkdir()
     (tmp_path / "client.pem").rename(tmp_path / "trusted" / "client.crt")
     (tmp_path / "trusted" / "note.txt").write_text("for the operator")
@@ -149,7 +149,7 @@ def test_an_opcua_server_for_other_machines_encrypts_and_admits_trusted_clients(
     (tmp_path / "out.yaml").write_text(
         "opcua: {certificate: server.pem, key: server.key.pem, trusted: trusted, user: plant, password_file: secret}\n"
     )
-    path, port = _csv(tmp_path / "load.csv", 100), _free_port()
+    path, port = _csv(tmp_path / "load.csv", 100), free_port()
     arguments = (str(path), "--follow", "--opcua", f"opc.tcp://0.0.0.0:{port}")
 
     async def connects(certificate: Path | None, password: str) -> bool:
@@ -184,18 +184,6 @@ def test_an_opcua_server_for_other_machines_encrypts_and_admits_trusted_clients(
     (tmp_path / "trusted" / "bad.pem").write_text("none")
     with pytest.raises(BridgeError, match=r"bad\.pem: got no certificate"):
         asyncio.run(Trusted([tmp_path / "trusted"], []).load())
-
-
-def _certificate(folder: Path, name: str) -> None:
-    uri = "urn:plow-twin:client" if name != "server" else "urn:plow-twin:server"
-    subprocess.run(
-        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", f"/CN={name}",
-         "-addext", f"subjectAltName=DNS:localhost,URI:{uri}",
-         "-addext", "keyUsage=digitalSignature,nonRepudiation,keyEncipherment,dataEncipherment,keyCertSign",
-         "-addext", "extendedKeyUsage=serverAuth,clientAuth",
-         "-keyout", str(folder / f"{name}.key.pem"), "-out", str(folder / f"{name}.pem")],
-        check=True, capture_output=True,
-    )  # fmt: skip
 
 
 class Database(BaseHTTPRequestHandler):

@@ -10,8 +10,8 @@ import pytest
 
 pytest.importorskip("rclpy")
 
+from network import free_port
 from ros_processes import Process, bench
-from test_live import _free_port
 from test_mqtt import Subscriber, _open_broker
 
 MS = 1_000_000
@@ -19,12 +19,12 @@ RELIABLE_INPUT = {"qos_overrides.{ns}/excitation.subscription.reliability": "rel
 
 
 def test_the_telemetry_of_a_node_sends_its_results_and_ends_cleanly(tmp_path: Path) -> None:
-    port = _free_port()
+    port = free_port()
     parameters = {"alarm_force": "[1.0, 1e9]", "excitation_timeout": 60.0, **RELIABLE_INPUT}
     with _open_broker(tmp_path, port), bench(tmp_path, **parameters) as running:
         probe, subscriber = running.probe, Subscriber(port)
         words = ["telemetry", "--namespace", running.namespace, "--mqtt-out", f"mqtt://127.0.0.1:{port}/face"]
-        words += ["--influx", f"http://127.0.0.1:{_free_port()}/org/bucket", "--out-rate", "5"]
+        words += ["--influx", f"http://127.0.0.1:{free_port()}/org/bucket", "--out-rate", "5"]
         beside = Process("plow_twin", words, tmp_path / "telemetry.log")
         try:
             probe.until(lambda: subscriber.newest("face/status") is not None, "the status")
@@ -51,7 +51,7 @@ def test_the_telemetry_of_a_node_sends_its_results_and_ends_cleanly(tmp_path: Pa
 def test_a_missing_node_is_named(tmp_path: Path) -> None:
     words = ["telemetry", "--namespace", f"/none_{os.getpid()}", "--wait", "0.5"]
     for more, code, message in (
-        (["--mqtt-out", f"mqtt://127.0.0.1:{_free_port()}/face"], 2, "a running node within 0.5 s"),
+        (["--mqtt-out", f"mqtt://127.0.0.1:{free_port()}/face"], 2, "a running node within 0.5 s"),
         ([], 2, "expected --mqtt-out, --influx or --opcua"),
     ):
         process = Process("plow_twin", [*words, *more], tmp_path / f"{len(more)}.log")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import re
 import signal
-import socket
 import subprocess
 from pathlib import Path
 
 import forge
+from network import free_port
 from ros_processes import WAIT_S, bench
 from sensor_msgs.msg import JointState
 from waiting import until
@@ -28,9 +28,7 @@ def follower(run: Path, log: Path, *options: str) -> subprocess.Popen[bytes]:
 
 
 def test_a_stopped_viewer_does_not_disturb_the_node_and_catches_up_later(tmp_path: Path) -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     run, log, file_log = tmp_path / "run", tmp_path / "view.log", tmp_path / "file.log"
     # one process sends to a viewer, the other writes a file
     shown = follower(run, log, "--web", "--web-port", str(port))
