@@ -288,6 +288,18 @@ def test_a_restored_twin_a_batch_and_a_limited_twin_have_the_same_motion(most: i
         assert bounded.advance(t, load).q == pytest.approx(row.q, abs=1e-6)
 
 
+def test_moving_a_twin_that_sticks_to_its_own_pose_keeps_its_friction() -> None:
+    scene = replace(preset("paper"), friction=Friction(0.1, stick_stiffness_n_m=5e6), loads=())
+    twins, alone = TwinBatch([scene] * 2, tol=1e-9), Twin(scene, tol=1e-9, excitation="sampled")
+    for index in range(1, 400):
+        wrench = np.array([2e4 * np.sin(0.03 * index), 0.0, 1e4])
+        row, one = twins.advance(1e-3 * index, wrench), alone.advance(1e-3 * index, wrench)
+        twins.move([1], row.q[1], row.v[1])
+        alone.move(one.q, one.v)
+    assert np.allclose(row.q[0], row.q[1], atol=1e-8) and np.allclose(row.q[0], one.q, atol=1e-8)
+    assert np.allclose(row.force[0], row.force[1], rtol=1e-4, atol=1.0)
+
+
 def test_a_batch_of_heads_that_stick_and_heads_that_do_not_is_refused() -> None:
     scene = replace(preset("paper"), friction=Friction(0.3, stick_stiffness_n_m=5e7))
     with pytest.raises(ValueError, match="friction with stick in all or in none"):

@@ -126,17 +126,39 @@ def switch_grip(p, state, pair, new) -> None:
 def settle_grips(p, state, force) -> None:
     """Determine after a fixed step which corners slip under the normal forces `force`, shape (8,)."""
     for pair in range(PAIR_COUNT):
-        place, rate = _along(p, pair, state.y)
         if state.mode[pair] != ON or force[pair] <= 0.0:
             # each touch starts with a relaxed spring, as in `grasp`
-            state.anchor[pair], state.grip[pair] = place, 0
+            state.anchor[pair], _ = _along(p, pair, state.y)
+            state.grip[pair] = 0
             continue
-        held = held_force(p, state, pair, place, rate)
-        limit = (p.static_friction if state.grip[pair] == 0 else p.friction) * force[pair]
-        state.grip[pair] = 0
-        if abs(held) > limit:
-            state.grip[pair] = 1 if held > 0.0 else -1
-            _anchor(p, state, pair, state.grip[pair] * p.friction * force[pair], place, rate)
+        _settle_grip(p, state, pair, force[pair])
+
+
+@kernel()
+def _settle_grip(p, state, pair, normal) -> None:
+    """Determine whether a corner slips under the normal force `normal`."""
+    place, rate = _along(p, pair, state.y)
+    held = held_force(p, state, pair, place, rate)
+    limit = (p.static_friction if state.grip[pair] == 0 else p.friction) * normal
+    state.grip[pair] = 0
+    if abs(held) > limit:
+        state.grip[pair] = 1 if held > 0.0 else -1
+        _anchor(p, state, pair, state.grip[pair] * p.friction * normal, place, rate)
+
+
+@kernel()
+def stretches(p, state, out) -> None:
+    """Write the elongation of the spring of each corner in m to `out`, shape (8,)."""
+    for pair in range(PAIR_COUNT):
+        out[pair] = _along(p, pair, state.y)[0] - state.anchor[pair]
+
+
+@kernel()
+def keep_grip(p, state, pair, stretch, grip) -> None:
+    """Give a corner that was moved the elongation of its spring and the grip before the move."""
+    state.anchor[pair] = _along(p, pair, state.y)[0] - stretch
+    state.grip[pair] = grip
+    _settle_grip(p, state, pair, _normal_force(p, state, pair, penetration_of(p, state, pair, state.y)))
 
 
 @kernel()

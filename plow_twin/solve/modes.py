@@ -12,7 +12,7 @@ from plow_twin.kernel.simd import below, row, splat
 from plow_twin.model.geometry import STATE_SIZE
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_force
-from plow_twin.solve.grip import grasp, weigh_grips
+from plow_twin.solve.grip import grasp, keep_grip, stretches, weigh_grips
 from plow_twin.solve.kinematics import named_angle, penetration_of, rate_of, row_value, row_values
 from plow_twin.solve.state import (
     ACTS,
@@ -169,15 +169,21 @@ def settle_modes(p, state, stick) -> None:
 def settle_moved(params, states, which, places, time, stick) -> None:
     """Set the states `which` to the body coordinates `places` at `time`, and set their modes.
 
-    A continuing contact keeps the damping factor of its touch.
+    A continuing contact keeps the damping factor of its touch, and the force of the spring that holds its corner.
     """
     touched = np.zeros(PAIR_COUNT, np.int64)
     damping = np.zeros(PAIR_COUNT)
+    pushed, grip, stretch = np.zeros(PAIR_COUNT, np.int64), np.zeros(PAIR_COUNT, np.int64), np.zeros(PAIR_COUNT)
     for i in range(which.size):
         p, state = params[which[i]], states[which[i]]
         for pair in range(PAIR_COUNT):
             touched[pair] = 0 if state.mode[pair] == OFF else 1
             damping[pair] = state.damping_factor[pair]
+        if stick is not None:
+            stretches(p, state, stretch)
+            for pair in range(PAIR_COUNT):
+                pushed[pair] = 1 if state.mode[pair] == ON else 0
+                grip[pair] = state.grip[pair]
         for k in range(STATE_SIZE):
             state.y[k] = places[i, k]
         state.step_start = time
@@ -186,6 +192,10 @@ def settle_moved(params, states, which, places, time, stick) -> None:
         for pair in range(PAIR_COUNT):
             if touched[pair] == 1:
                 state.damping_factor[pair] = damping[pair]
+        if stick is not None:
+            for pair in range(PAIR_COUNT):
+                if pushed[pair] == 1 and state.mode[pair] == ON:
+                    keep_grip(p, state, pair, stretch[pair], grip[pair])
 
 
 @kernel(entry=True)
