@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from plow_twin import Clearance, Contact, Frame, Gravity, Harmonic, Head, Initial, Scene
+from plow_twin import Clearance, Contact, Frame, Friction, Gravity, Harmonic, Head, Initial, Scene
 from plow_twin.model.geometry import penetration_rows
 from plow_twin.scene_file import load_scene
 
@@ -59,6 +59,26 @@ def wall_and_point(
         locked=("x", "theta"),
         pairs=pairs,
     )
+
+
+#: Side [m], mass [kg], moment of inertia [kg m^2] and friction of `tumbling_block`.
+SIDE, MASS = 0.06, 1.0
+INERTIA = MASS * SIDE**2 / 6.0
+MU, SLIP_SPEED = 0.2, 0.05
+
+
+def tumbling_block(*, contact: Contact, **changes: object) -> Scene:
+    """Return a square block above a table 1 m below the centre of the cavity. It never touches the other walls."""
+    scene = Scene(
+        Head(MASS, INERTIA, carries="corners"),
+        Frame(SIDE, SIDE),
+        Clearance(2.0 - SIDE, 2.0 - SIDE),
+        contact,
+        Gravity(),
+        initial=Initial(q=(0.0, -0.85, 0.3), v=(0.4, 0.0, 6.0)),
+        friction=Friction(MU, SLIP_SPEED),
+    )
+    return replace(scene, **changes)  # type: ignore[arg-type]
 
 
 #: An inertia so large that no moment of the tests turns the head, and a harmonic moment.

@@ -30,7 +30,7 @@ SHARE = 0.1
 
 @pytest.fixture(scope="module")
 def truth() -> Truth:
-    return draw(replace(GROUPS["plain"], periods=5.0, third_harmonic=SHARE), 3)
+    return draw(replace(GROUPS["plain"], periods=4.0, third_harmonic=SHARE), 3)
 
 
 @pytest.fixture(scope="module")

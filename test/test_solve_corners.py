@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
+from scenes import INERTIA, MASS, MU, SIDE, SLIP_SPEED, tumbling_block
 from scipy.integrate import solve_ivp
 
 from plow_twin import (
@@ -31,27 +33,11 @@ from plow_twin import (
 from plow_twin.errors import ArgumentError
 from plow_twin.estimate.forward import Forward
 
-SIDE, MASS = 0.06, 1.0
-INERTIA = MASS * SIDE**2 / 6.0
-STIFFNESS, DAMPING, MU, SLIP_SPEED = 3e6, 600.0, 0.2, 0.05
+STIFFNESS, DAMPING = 3e6, 600.0
 #: A load that moves nothing. With it, a mirrored head with walls has the terms of a pinned motion.
 NOTHING = Harmonic("nothing", (1e-12, 0.0), 9.0)
 WALL = 1.0
-
-
-def block(**changes: object) -> Scene:
-    """Return a square block above a table 1 m below the centre of the cavity. It never touches the other walls."""
-    scene = Scene(
-        Head(MASS, INERTIA, carries="corners"),
-        Frame(SIDE, SIDE),
-        Clearance(2.0 * WALL - SIDE, 2.0 * WALL - SIDE),
-        Contact("kelvin_voigt", stiffness=STIFFNESS, damping=DAMPING),
-        Gravity(),
-        (NOTHING,),
-        initial=Initial(q=(0.0, -0.85, 0.3), v=(0.4, 0.0, 6.0)),
-        friction=Friction(MU, SLIP_SPEED),
-    )
-    return replace(scene, **changes)  # type: ignore[arg-type]
+block = partial(tumbling_block, contact=Contact("kelvin_voigt", STIFFNESS, damping=DAMPING), loads=(NOTHING,))
 
 
 def on_table(t: float, z: np.ndarray) -> list[float]:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
+from scenes import INERTIA, MASS, MU, SIDE, SLIP_SPEED, tumbling_block
 from scipy.integrate import solve_ivp
 
 from plow_twin import (
@@ -16,7 +18,6 @@ from plow_twin import (
     Contact,
     Frame,
     Friction,
-    Gravity,
     Head,
     Initial,
     Scene,
@@ -31,9 +32,7 @@ from plow_twin.errors import ArgumentError
 from plow_twin.model.friction import painleve_coefficients
 from plow_twin.model.loads import compile_loads
 
-SIDE, RADIUS, MASS = 0.06, 0.01, 1.0
-INERTIA = MASS * SIDE**2 / 6.0
-STIFFNESS, MU, SLIP_SPEED = 3e6, 0.2, 0.05
+RADIUS, STIFFNESS = 0.01, 3e6
 #: A law with the terms of the preset `measured_square`, whose kernels are compiled for other tests too.
 LAW = Contact(
     "exact_restitution", STIFFNESS, restitution=0.8, restitution_fall=0.1, restitution_speed_m_s=0.1,
@@ -42,20 +41,7 @@ LAW = Contact(
 #: The same law with negligible damping.
 ELASTIC = replace(LAW, restitution=1.0 - 1e-9, restitution_fall=1e-12)
 STICK = Friction(MU, stick_stiffness_n_m=1e6, stick_damping_n_s_m=20.0)
-
-
-def block(**changes: object) -> Scene:
-    """Return a rounded square block above a table 1 m below the centre of the cavity."""
-    scene = Scene(
-        Head(MASS, INERTIA, carries="corners"),
-        Frame(SIDE, SIDE, corner_radius_m=RADIUS),
-        Clearance(2.0 - SIDE, 2.0 - SIDE),
-        LAW,
-        Gravity(),
-        initial=Initial(q=(0.0, -0.85, 0.3), v=(0.4, 0.0, 6.0)),
-        friction=Friction(MU, SLIP_SPEED),
-    )
-    return replace(scene, **changes)  # type: ignore[arg-type]
+block = partial(tumbling_block, contact=LAW, frame=Frame(SIDE, SIDE, corner_radius_m=RADIUS))
 
 
 def in_guide(carries: str, **changes: object) -> Scene:
