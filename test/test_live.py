@@ -793,14 +793,14 @@ def test_a_refusal_by_the_system_is_a_warning_and_the_other_settings_apply() -> 
 import os, resource
 from dataclasses import replace
 from plow_twin.live.parameters import settings
-from plow_twin.live.realtime import apply_realtime
+from plow_twin.live.realtime import apply_realtime, raise_priority
 asked, wrong = settings({"priority": 50, "lock_memory": True}), settings({"cpu_affinity": "0,x"})
 for limit in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK):
     resource.setrlimit(limit, (0, 0))
 if os.getuid() == 0:
     os.setresuid(65534, 65534, 65534)
 one = min(os.sched_getaffinity(0))
-print(*apply_realtime(replace(asked, cpu_affinity=str(one))), sep="\\n")
+print(*raise_priority(asked), *apply_realtime(replace(asked, cpu_affinity=str(one))), sep="\\n")
 print(*apply_realtime(wrong), sep="\\n")
 print(os.sched_getaffinity(0) == {one})
 """
@@ -810,6 +810,29 @@ print(os.sched_getaffinity(0) == {one})
     )
     lines = completed.stdout.splitlines()
     assert [line.partition(" ")[0].rstrip(":") for line in lines] == ["priority", "lock_memory", "cpu_affinity", "True"]
+
+
+def test_the_priority_is_for_the_computing_thread_alone() -> None:
+    code = """
+import os, sys
+from threading import Thread
+from plow_twin.live.parameters import settings
+from plow_twin.live.realtime import raise_priority
+refused = raise_priority(settings({"priority": 1}))
+found = []
+thread = Thread(target=lambda: found.append(os.sched_getscheduler(0)))
+thread.start()
+thread.join()
+if not (child := os.fork()):
+    os._exit(os.sched_getscheduler(0) != os.SCHED_OTHER)
+normal = [os.SCHED_OTHER] == found and os.waitpid(child, 0)[1] == 0
+print(bool(refused) or os.sched_getscheduler(0) == os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, normal)
+"""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    completed = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert completed.stdout.split() == ["True", "True"]
 
 
 @pytest.mark.parametrize(
@@ -921,7 +944,7 @@ def test_impossible_poses_gaps_and_speeds_are_not_used() -> None:
 @pytest.mark.parametrize(
     ("text", "code", "message"),
     [
-        ("t,fx,fy,m\n", 3, "no sample arrived on load"),
+        ("t,fx,fy,m\n", 3, "topic load: got no sample, expected at least one"),
         ("t,fx,fy,m\n" + "1.0,inf,2.0,3.0\n" * 40, 3, "40 loads have a number that is not finite (nan or inf)"),
         ("0.0,1.0,2.0,3.0\n0.1,1.0,2.0,3.0\n", 1, "columns 0.0, 1.0, 2.0, 3.0 (no header row?)"),
     ],
@@ -978,6 +1001,29 @@ def test_every_view_reports_a_silence_in_a_file_and_no_loss(tmp_path: Path, caps
     assert named in text and "No loss was counted" not in text
     assert run_cli(["analyse", str(run)]) == 0
     assert f"{named}; in these intervals the load is interpolated linearly" in capsys.readouterr().out.replace("\n", "")
+
+
+def test_a_hole_in_a_file_that_is_longer_than_jump_forward_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "load.csv"
+    rows = [",".join(map(repr, _row(index))) for index in (*range(100), *range(20_100, 20_200))]
+    path.write_text("t,fx,fy,m\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    assert run_cli(["live", str(path), "--json"]) == 0
+    shown = capsys.readouterr()
+    assert "the stamps jumped forward (1) by more than jump_forward (10 s), and the motion was reset" in shown.err
+    assert json.loads(shown.out)["input"]["jumps_forward"] == "1"
+
+
+def test_a_sample_that_is_late_by_less_than_rollback_span_is_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "load.csv"
+    rows = [",".join(map(repr, _row(index))) for index in (*range(300), *range(301, 2200), 300, *range(2200, 2300))]
+    path.write_text("t,fx,fy,m\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    assert run_cli(["live", str(path), "--json"]) == 0
+    counted = json.loads(capsys.readouterr().out)["input"]
+    assert (counted["samples_used"], counted["rolled_back"]) == ("2300", "1")
 
 
 @pytest.mark.parametrize(("setting", "reported"), [("follow=full", True), ("follow=parameters", False)])

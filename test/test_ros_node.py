@@ -306,6 +306,10 @@ def test_an_alarm_stays_until_it_is_acknowledged_and_writes_the_time_before_it(t
                 probe.until(lambda: len(alarms) > 1, "what is left")
                 page.send(json.dumps({"do": "mark", "text": "by the screen"}))
                 told(lambda: len(latest["events"]) == 2)
+                page.send(json.dumps({"do": "mark", "text": 201 * "x"}))
+                told(lambda: len(latest["events"]) == 3)
+                refused = latest["events"].pop()
+                assert not refused["done"] and "at most 200" in refused["text"]
                 send(T0 + 601 * MS, (0.0, 0.0, 0.0))
                 told(lambda: latest["motion"] is not None)
             assert all(event["done"] for event in latest["events"]), latest["events"]

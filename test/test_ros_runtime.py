@@ -28,6 +28,7 @@ from record_support import records_of
 from sensor_msgs.msg import JointState
 from waiting import until
 
+from plow_twin.live.inputs import SILENT_NS
 from plow_twin.live.parameters import ParameterError
 from plow_twin.live.tool_forces import ToolForces
 from plow_twin.model.scene import Constant, Table
@@ -233,6 +234,7 @@ def test_a_pose_and_its_negative_quaternion_give_the_same_residual() -> None:
             residual = node.runtime.inputs.residual(np.array([0.0, 0.0, 0.002]))
             assert residual is not None
             residuals.append(residual[2])
+            assert node.runtime.inputs.head_pose.used == number
     assert residuals == pytest.approx([-0.008, -0.008], abs=1e-12)
 
 
@@ -326,7 +328,7 @@ def test_a_queue_that_fills_during_reading_is_read_completely() -> None:
             numbers.extend(message.number for message in messages)
             return more
 
-        assert take()
+        assert take() and queue.waiting == 30
         send(3)
         while take():
             pass
@@ -342,6 +344,16 @@ def test_another_node_under_the_same_name_is_reported() -> None:
         node.create_publisher(JointState, "contact_forces", 1)
         node._publish_diagnostics()
         assert node._published_status[0] == 1 and "second twin" in node._published_status[1]
+
+
+def test_a_node_that_gets_no_sample_warns() -> None:
+    with _node() as node:
+        assert node.start() and node.runtime is not None
+        node._publish_diagnostics()
+        assert node._published_status[:2] == (0, "waiting for the first sample")
+        node.runtime._active_since_ns -= SILENT_NS
+        node._publish_diagnostics()
+        assert node._published_status[:2] == (1, "waiting for the first sample; no sample has arrived")
 
 
 def test_loss_is_counted_by_the_publishers_numbers() -> None:

@@ -109,7 +109,7 @@ def _live(source: str, stop: StopSignals, options: dict[str, Any]) -> int:
     from plow_twin.live.bridge.files import Files
     from plow_twin.live.control import TURN_S, Control
     from plow_twin.live.front import BridgeFront
-    from plow_twin.live.realtime import apply_realtime
+    from plow_twin.live.realtime import apply_realtime, raise_priority
     from plow_twin.live.services import Services
     from plow_twin.live.solver_start import Preparation, leave
     from plow_twin.live.stop import StopRequested
@@ -123,7 +123,7 @@ def _live(source: str, stop: StopSignals, options: dict[str, Any]) -> int:
         access = access_if_shown(options)
         outputs = outputs_of(options)
         bridge = _bridge(source, options, settings.expected_rate)
-        for refused in apply_realtime(settings):
+        for refused in (*apply_realtime(settings), *raise_priority(settings)):
             say_error(f"plow-twin: refused by the system: {refused}")
         with busy("preparing the solver", quiet or not error_console().is_terminal):
             prepared = Preparation(settings).result(lambda: stop.stopped)

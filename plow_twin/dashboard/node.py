@@ -97,10 +97,10 @@ class NodeWatch:
     def listen(self, feed: Feed) -> None:
         """Pass all messages that arrive after this call to a feed."""
         self.feed = feed
-        newest, every = sensor_input(_NEWEST), sensor_input(_ALL)
+        newest = sensor_input(_NEWEST)
         self._subscribe("contact_forces", newest, self._forces)
-        self._subscribe("contact_peaks", every, self._peaks)
-        self._subscribe("peak_intervals", every, self._points)
+        self._subscribe("contact_peaks", OUTPUTS["contact_peaks"], self._peaks)
+        self._subscribe("peak_intervals", OUTPUTS["peak_intervals"], self._points)
         self._subscribe("head_state", newest, self._pose)
         self._subscribe("clearance", newest, self._clearance)
         self._subscribe("quality", OUTPUTS["quality"], self._quality)
@@ -115,7 +115,11 @@ class NodeWatch:
         service = "acknowledge_alarms" if action == "acknowledge" else "mark"
         if service == "mark":
             value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=text)
-            self._called(self._set, SetParameters.Request(parameters=[Parameter(name="mark", value=value)]))
+            done = self._called(self._set, SetParameters.Request(parameters=[Parameter(name="mark", value=value)]))
+            if done is None:
+                return False, f"mark: no answer to set_parameters within {_PATIENCE_S:g} s"
+            if not done.results[0].successful:
+                return False, str(done.results[0].reason)
         answer = self._called(self._services[service], Trigger.Request())
         return (False, f"no answer within {_PATIENCE_S:g} s") if answer is None else (answer.success, answer.message)
 

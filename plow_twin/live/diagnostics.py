@@ -59,7 +59,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "dropped_without_clock": "samples that exceeded input_depth before the first message on /clock",
         "jumps_back": "stamps that stepped back by more than jump_back",
         "jumps_forward": "stamps that stepped forward by more than jump_forward",
-        "out_of_plane": "samples used in spite of components outside the plane",
+        "out_of_plane": "used samples, and poses, with components outside the plane, which are ignored",
         "holds": "advances under the hold policy",
         "silences": "intervals without samples longer than excitation_timeout and five times the previous interval",
         "silent_s": "total duration of the counted silences [s]",
@@ -82,9 +82,9 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "withheld": "messages that were not sent, because a number was not finite",
         "held": "published messages that were computed without a sample",
         "corrected": "published messages that correct an earlier message",
-        "latency_p50_ms": "median time from the reception of a sample to its forces [ms]",
-        "latency_p99_ms": "99 % quantile of the time from the reception of a sample to its forces [ms]",
-        "latency_max_ms": "longest time from the reception of a sample to its forces [ms]",
+        "latency_p50_ms": "median time from the reading of a sample from the input queue to its forces [ms]",
+        "latency_p99_ms": "99 % quantile of this time [ms]",
+        "latency_max_ms": "largest value of this time [ms]",
         "age_p50_ms": "median age of the stamp at publication by the system clock [ms]; empty under use_sim_time",
         "age_p99_ms": "99 % quantile of the same age [ms]; empty under use_sim_time",
         "recent_latency_p99_ms": "latency_p99_ms since the last report [ms]",
@@ -222,6 +222,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
         (WARN, estimation, "; ".join(estimation.reasons) if estimation else ""),
         (WARN, runtime.reduced, "the twins were too slow: measured poses no longer correct the motion"),
         (OK, runtime.clock == "paused", "/clock is paused"),
+        (WARN, runtime.without_samples, "no sample has arrived"),
         (WARN, runtime.without_clock, "use_sim_time is set and no message has arrived on /clock"),
         (WARN, others, f"another publisher of {others} is also sending, and is not followed"),
         (WARN, runtime.others_publish, "another node also publishes contact_forces: is it a second twin?"),
@@ -324,6 +325,7 @@ class Health:
             "samples_lost": inputs.senders.lost,
             "samples_not_followed": inputs.senders.ignored,
             "messages_lost": inputs.lost,
+            "refused_publishers": inputs.refused_publishers,
             **{f"{topic}_dropped": _refused(getattr(inputs, topic)) for topic in OPTIONAL},
             **{f"{topic}_not_followed": optional.ignored for topic, optional in inputs.optional.items()},
         }
@@ -441,10 +443,10 @@ class Health:
 #: Counters of the part `input` that cause a warning when they have grown since the last report.
 _TROUBLE: Final = (
     "dropped_unstamped", "dropped_non_finite", "dropped_duplicate", "dropped_out_of_order", "dropped_late",
-    "dropped_implausible", "dropped_unsteady", "dropped_stray", "rolled_back", "dropped_malformed",
-    "dropped_not_selected", "jumps_back", "jumps_forward", "out_of_plane", "samples_missing", "samples_lost",
-    "samples_not_followed", "messages_lost", "travel_dropped", "travel_misplaced", "head_pose_dropped", "gaps_dropped",
-    "travel_not_followed", "head_pose_not_followed", "gaps_not_followed",
+    "dropped_implausible", "dropped_unsteady", "dropped_stray", "dropped_malformed",
+    "dropped_not_selected", "jumps_back", "jumps_forward", "samples_missing", "samples_lost",
+    "samples_not_followed", "messages_lost", "refused_publishers", "travel_dropped", "travel_misplaced",
+    "head_pose_dropped", "gaps_dropped", "travel_not_followed", "head_pose_not_followed", "gaps_not_followed",
 )  # fmt: skip
 
 

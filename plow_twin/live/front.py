@@ -168,7 +168,7 @@ class BridgeFront:
             return []
         intake, topic = self.runtime.driver.intake, self.roles["drive" if "drive" in self.roles else "excitation"].topic
         if not sum(intake.counts.values()):
-            return [f"no sample arrived on {topic}"]
+            return [f"topic {topic}: got no sample, expected at least one"]
         if stopped and self._bridge.ends and (self._first or not self._bridge.finished):
             return [f"stopped before the end of {topic}"]
         estimation = self.runtime.estimation
@@ -208,8 +208,12 @@ class BridgeFront:
             found.append("no estimate was made, because the run ended too early")
         if silence := self.runtime.driver.silences.text():
             found.append(silence)
-        jumps = counts[Verdict.JUMP_BACK]
-        if jumps:
+        if jumps := counts[Verdict.JUMP_FORWARD]:
+            found.append(
+                f"the stamps jumped forward ({jumps}) by more than jump_forward "
+                f"({self.runtime.settings.jump_forward:g} s), and the motion was reset: are samples missing?"
+            )
+        if jumps := counts[Verdict.JUMP_BACK]:
             found.append(
                 f"the stamps jumped back ({jumps}), and the motion was reset: are they in local time "
                 "at the end of summer time, or was a clock set? Expected stamps in UTC, or with an offset"

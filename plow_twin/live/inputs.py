@@ -23,8 +23,8 @@ TOPICS: Final = ("excitation", "tool_forces", "travel", "head_pose", "gaps")
 OPTIONAL: Final = ("travel", "head_pose", "gaps")
 #: Time for which a sender that is not followed counts as present after its last sample [ns].
 _OTHER_SENDER_NS: Final = 3_000_000_000
-#: Time without a message after which an optional input counts as silent [ns].
-_SILENT_NS: Final = 10_000_000_000
+#: Time without a message after which an input counts as silent [ns].
+SILENT_NS: Final = 10_000_000_000
 
 
 class Inputs:
@@ -84,7 +84,7 @@ class Inputs:
         if self.ended:
             return []
         now_ns = time.monotonic_ns()
-        return [topic for topic, heard_ns in self._heard_ns.items() if now_ns - heard_ns > _SILENT_NS]
+        return [topic for topic, heard_ns in self._heard_ns.items() if now_ns - heard_ns > SILENT_NS]
 
     def waited(self, messages: int, longest_s: float) -> None:
         """Register the number of messages in the queue, and the time that the first message waited [s]."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from plow_twin.errors import InputError, Problem
-from plow_twin.live.service_names import SERVICES
+from plow_twin.live.service_names import MOST_MARK, SERVICES
 from plow_twin.scene_file.presets import PRESETS
 from plow_twin.stream.topics import Cadence, names_of
 
@@ -58,8 +58,12 @@ def _choice(default: str, choices: tuple[str, ...], doc: str, effect: Effect = E
     return field(default=default, metadata={"choices": choices, "effect": effect, "doc": doc})
 
 
-def _plain(default: bool | str, doc: str, effect: Effect = Effect.CONFIGURE) -> Any:
-    return field(default=default, metadata={"effect": effect, "doc": doc})
+#: Largest length of a text [characters]. A path on Linux has the same limit.
+_LONGEST: Final = 4096
+
+
+def _plain(default: bool | str, doc: str, effect: Effect = Effect.CONFIGURE, longest: int = _LONGEST) -> Any:
+    return field(default=default, metadata={"effect": effect, "doc": doc, "longest": longest})
 
 
 @dataclass(frozen=True)
@@ -190,7 +194,7 @@ class Settings:
     limit_gap_rate: float = _limit("m/s", "rate of change of a gap; with 0, a change by limit_gap within 1 ms")
     set_wear: tuple[float, ...] = _number((0.0,) * 8, "m", 0.0, 1.0,
         "wear depths of the eight pads, which the service ~/set_wear applies; new pads have the depth 0", Effect.NOW)
-    mark: str = _plain("", "text that the service ~/mark writes to the journal", Effect.NOW)
+    mark: str = _plain("", "text that the service ~/mark writes to the journal", Effect.NOW, MOST_MARK)
     clearance_horizontal: float = _of_scene("m", 10.0, "horizontal clearance of unworn pads")
     clearance_vertical: float = _of_scene("m", 10.0, "vertical clearance of unworn pads")
     stiffness: float = _of_scene("N/m^exponent", 1e300, "stiffness of the contact law")
@@ -215,8 +219,9 @@ class Settings:
     alarm_residual: tuple[float, ...] = _alarm("m", 10.0, "distances of head_pose from the model at the same stamp")
     alarm_duration: float = _number(0.0, "s", 0.0, 3600.0,
         "time for which a value must exceed a threshold to raise an alarm")
-    jump_back: float = _number(1.0, "s", 0.0, 3600.0,
-        "largest age relative to the newest stamp; an older stamp resets the model", Effect.NOW)
+    jump_back: float = _number(2.0, "s", 0.0, 3600.0,
+        "largest age relative to the newest stamp; repeated older stamps reset the model, so no sample older than this "
+        "is used as a late sample", Effect.NOW)
     jump_forward: float = _number(10.0, "s", 0.1, 3600.0,
         "largest lead of a stamp ahead of the model time; a stamp further ahead resets the model", Effect.NOW)
     failure_limit: int = _number(10, "advances", 0, 1000000,
@@ -244,8 +249,6 @@ FILES: Final = ("scene", "record_path", "wear_state_path")
 SPECS: Final[Mapping[str, Field[Any]]] = {spec.name: spec for spec in fields(Settings)}
 #: Pattern of a number. ROS launch files use YAML 1.1, which reads a number such as 1e-9 as a string.
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-#: Largest length of a text [characters]. A path on Linux has the same limit.
-_LONGEST: Final = 4096
 #: Largest number of items of a list for a separate check of each item. The lists of parameters are shorter.
 _MOST_ITEMS: Final = 20
 #: Pattern of a line without control characters, which could change the state of a terminal.
@@ -285,7 +288,9 @@ def expected(spec: Field[Any]) -> str:
         return _range(f"{len(spec.default)} numbers", spec)
     if "unit" in spec.metadata:
         return _range("an integer" if isinstance(spec.default, int) else "a number", spec)
-    return "true or false" if isinstance(spec.default, bool) else f"one line of at most {_LONGEST} characters"
+    if isinstance(spec.default, bool):
+        return "true or false"
+    return f"one line of at most {spec.metadata['longest']} characters"
 
 
 def _range(kind: str, spec: Field[Any]) -> str:
@@ -319,7 +324,7 @@ def _property(spec: Field[Any]) -> dict[str, Any]:
     if "unit" not in spec.metadata:
         if isinstance(spec.default, bool):
             return {"type": "boolean", **words}
-        return {"type": "string", "maxLength": _LONGEST, "pattern": _ONE_LINE, **words}
+        return {"type": "string", "maxLength": spec.metadata["longest"], "pattern": _ONE_LINE, **words}
     bounds = {"minimum": spec.metadata["low"], "maximum": spec.metadata["high"]}
     if isinstance(spec.default, tuple):
         count = len(spec.default)

@@ -1,4 +1,4 @@
-"""Set the priority, the processors and the memory lock of this process."""
+"""Set the processors and the memory lock of this process, and the priority of a thread."""
 
 from __future__ import annotations
 
@@ -13,15 +13,23 @@ _MCL_CURRENT: Final = 1
 _MCL_FUTURE: Final = 2
 
 
-def apply_realtime(settings: Settings) -> list[str]:
-    """Request the real-time settings from the operating system, and return a text for each refused setting."""
-    refused = []
+def raise_priority(settings: Settings) -> list[str]:
+    """Request the real-time priority for the calling thread, and return a text if it is refused.
+
+    Threads and processes that the thread starts later have the normal priority.
+    """
     if settings.priority:
         try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(settings.priority))
+            os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(settings.priority))
         except OSError as error:
             hint = "allow it by ulimit -r or LimitRTPRIO="
-            refused.append(f"priority {settings.priority}: {error.strerror}; {hint}")
+            return [f"priority {settings.priority}: {error.strerror}; {hint}"]
+    return []
+
+
+def apply_realtime(settings: Settings) -> list[str]:
+    """Request the processors and the memory lock, and return a text for each refused setting."""
+    refused = []
     if settings.cpu_affinity:
         try:
             os.sched_setaffinity(0, {int(number) for number in settings.cpu_affinity.split(",")})

@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from plow_twin.errors import ArgumentError
-from plow_twin.live.inputs import Inputs
+from plow_twin.live.inputs import SILENT_NS, Inputs
 from plow_twin.live.parameters import MODEL, ParameterError, Settings, model_changes, outside
 from plow_twin.live.publishing import Front, Outgoing, Publishing
 from plow_twin.live.service_names import mark_problem
@@ -26,7 +26,7 @@ from plow_twin.record.alarms import alarms_of
 from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.record.times import EPOCH_S
 from plow_twin.record.wear_state import scene_identity
-from plow_twin.stream.driver import Arrival, Block, Driver, Policy
+from plow_twin.stream.driver import Arrival, Block, Driver, Policy, StreamState
 from plow_twin.stream.health import Periods
 from plow_twin.stream.intake import Verdict
 from plow_twin.stream.journal import Entry, Gaps, Mark, Parameter, Pose, pose_entry
@@ -104,6 +104,7 @@ class Runtime:
                 made.callback(self.recording.recorder.close)
             self.estimation = self._estimate()
             made.pop_all()
+        self._active_since_ns = 0
         session = Session(
             prepared.twin, on_entry=self._journal, rollback_span_s=settings.rollback_span, wear_depth=depth
         )
@@ -145,6 +146,12 @@ class Runtime:
     def unsteady(self) -> bool:
         """Whether the stamps jump so often that resets are refused."""
         return self.driver.unsteady(time.monotonic_ns())
+
+    @property
+    def without_samples(self) -> bool:
+        """Whether the active twin has waited for its first sample for 10 s."""
+        waits = self.inputs.active and self.driver.state is StreamState.WAITING and not self.driver.intake.arrived
+        return waits and time.monotonic_ns() - self._active_since_ns > SILENT_NS
 
     @property
     def without_clock(self) -> bool:
@@ -223,7 +230,8 @@ class Runtime:
 
     def activate(self) -> None:
         """Begin to use samples."""
-        self.driver.resume(time.monotonic_ns())
+        self._active_since_ns = time.monotonic_ns()
+        self.driver.resume(self._active_since_ns)
         if self.periods:
             self.periods.begin()
         self.inputs.active = True

@@ -31,7 +31,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.model.pairs import CORNER_X, CORNER_Y, NORMAL_X, NORMAL_Y
 
@@ -246,6 +246,15 @@ def factors_of(scene: Scene, q: NDArray[np.float64]) -> NDArray[np.float64]:
         state = states_of(scene, np.concatenate([q, np.zeros_like(q)], axis=1))
         factors[:, :2], factors[:, 2:4] = state[:, 5:7], state[:, :2]
     return factors
+
+
+def angle_of(z: ArrayLike, w: ArrayLike) -> NDArray[np.float64]:
+    """Return the angle in [-pi, pi] rad of a rotation about the z axis, from the elements z and w of its quaternion.
+
+    A quaternion and its negative describe the same rotation.
+    """
+    turned = np.signbit(w)
+    return np.asarray(2.0 * np.arctan2(np.where(turned, np.negative(z), z), np.abs(w)))
 
 
 def largest_angle(scene: Scene) -> float:

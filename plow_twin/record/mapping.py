@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import UnitError
+from plow_twin.model.geometry import angle_of
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.map_file import (
     LOAD_MODEL,
@@ -231,7 +232,7 @@ def _follow(content: Any, path: str) -> float | None:
         if value is None:
             return None
     if hasattr(value, "w") and hasattr(value, "z"):
-        return 2.0 * math.atan2(float(value.z), float(value.w))
+        return float(angle_of(float(value.z), float(value.w)))
     try:
         return float(value)
     except (TypeError, ValueError):

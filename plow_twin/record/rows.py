@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
+from plow_twin.model.geometry import angle_of
 from plow_twin.record.entries import Outputs, concatenated
 from plow_twin.record.messages import JointState, Message, Odometry
 from plow_twin.record.template import Indexes, Template, read_numbers
@@ -38,7 +39,7 @@ class Rows:
 
 def poses_of(numbers: Array) -> Array:
     """Return x, y [m], theta [rad], shape (..., 3), of the numbers of `head_state`, shape (..., 7)."""
-    theta = 2.0 * np.arctan2(numbers[..., 2:3], numbers[..., 3:4])
+    theta = angle_of(numbers[..., 2:3], numbers[..., 3:4])
     return np.concatenate((numbers[..., :2], theta), axis=-1)
 
 

@@ -11,6 +11,7 @@ from rclpy.node import Node
 
 from plow_twin.live.parameters import ESTIMATES, Settings
 from plow_twin.live.part import Part
+from plow_twin.live.realtime import raise_priority
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.services import Services
 from plow_twin.live.solver_start import Prepared
@@ -73,7 +74,12 @@ class RosFront:
             without += FOLLOWED_TOPICS
         self._publishers = OutputPublishers(node, ["status", *without], runtime.publishing.memory)
         made.callback(self._publishers.close)
-        self._loop = loop = InputLoop(self.turns, self._inputs_failed)
+
+        def raise_thread() -> None:
+            for refused in raise_priority(settings):
+                node.get_logger().warning(f"refused by the system: {refused}")
+
+        self._loop = loop = InputLoop(self.turns, self._inputs_failed, raise_thread)
         made.callback(loop.close)
         if settings.opcua_server:
             from plow_twin.ros.opcua_input import OpcUaInput

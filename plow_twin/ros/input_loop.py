@@ -6,6 +6,7 @@ timers only when no message is waiting, so its timers may never run if samples a
 
 from __future__ import annotations
 
+import math
 import os
 import select
 import threading
@@ -66,18 +67,22 @@ class InputLoop:
     """Thread that processes the inputs of a node.
 
     The thread and the thread of the executor use the lock `turns`. An error that ends the thread is stored in the
-    attribute `error` and passed to the function `on_error`.
+    attribute `error` and passed to the function `on_error`. The thread calls `on_start` first.
     """
 
-    def __init__(self, turns: Turns, on_error: Callable[[Exception], None]) -> None:
-        self._turns, self._on_error = turns, on_error
+    def __init__(
+        self, turns: Turns, on_error: Callable[[Exception], None], on_start: Callable[[], object] = lambda: None
+    ) -> None:
+        self._turns, self._on_error, self._on_start = turns, on_error, on_start
         self._queues: dict[int, tuple[Queue, Receiver, str]] = {}
         #: timers; `run_timers` does not stop the first timer, which reads all queues
         self._timers = [Timer(_LOOK_S, self._look_at_all)]
         self._active = self._stopped = False
         self._due = 0.0
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._signs = [self._wake]
+        # select() fails with file descriptors above 1023
+        self._signs = select.poll()
+        self._signs.register(self._wake, select.POLLIN)
         self._thread = threading.Thread(target=self._run, name="plow_twin_inputs", daemon=True)
         self.error: Exception | None = None
 
@@ -85,7 +90,7 @@ class InputLoop:
         """Pass messages from a queue to the receiver. The method `close` of this object closes the queue."""
         with self._turns:
             self._queues[queue.fd] = queue, receiver, topic
-            self._signs.append(queue.fd)
+            self._signs.register(queue.fd, select.POLLIN)
         self._look_again()
 
     def every(self, period_s: float, do: Callable[[], float | None]) -> None:
@@ -127,10 +132,11 @@ class InputLoop:
 
     def _run(self) -> None:
         try:
+            self._on_start()
             unfinished: list[int] = []  # queues that may still contain messages
             while not self._stopped:
                 pause_s = 0.0 if unfinished else max(0.0, self._due - time.monotonic())
-                ready = select.select(self._signs, (), (), pause_s)[0]
+                ready = [fd for fd, _ in self._signs.poll(math.ceil(1e3 * pause_s))]
                 if self._wake in ready:
                     os.eventfd_read(self._wake)
                     ready.remove(self._wake)

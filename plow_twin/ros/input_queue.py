@@ -10,6 +10,8 @@ from __future__ import annotations
 import ctypes
 import os
 import struct
+import time
+from collections import Counter
 from functools import cache
 from typing import Final, NamedTuple
 
@@ -25,7 +27,8 @@ class Received(NamedTuple):
     """A received message.
 
     `sender` is the identifier of the publisher. `number` is the sequence number of the message, counted from 1 for each
-    publisher. `data` contains the CDR bytes, and the times are in ns.
+    publisher. If the middleware does not number messages, the received messages are counted, so a loss is not noticed.
+    `data` contains the CDR bytes, and the times are in ns.
     """
 
     sender: bytes
@@ -52,6 +55,8 @@ class _Info(ctypes.Structure):
 #: Layouts of `_Info` (times of sending and reception, sequence number, publisher) and of `SerializedMessage` (address
 #: and length of the bytes).
 _INFO, _PLACE = struct.Struct("=qqQ16x16s"), struct.Struct("=QQ")
+#: Sequence number from a middleware that does not number messages.
+_NO_NUMBER: Final = 2**64 - 1
 #: Return code of rcl for an empty queue.
 _EMPTY_QUEUE: Final = 401
 
@@ -84,6 +89,8 @@ class InputQueue:
         self._buffer, self._info = _new_buffer(), _Info()
         self._places = ctypes.byref(self._buffer), ctypes.byref(self._info)
         self._signs = 0
+        #: number of messages of each publisher, if the middleware does not number them
+        self._counted: Counter[bytes] = Counter()
         self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         node._subscriptions.remove(subscription)
         with subscription.handle:
@@ -106,6 +113,11 @@ class InputQueue:
         self._signs = max(0, self._signs - len(received)) if len(received) == count else 0
         return received, self._signs > 0 or (all_there_are and len(received) == most)
 
+    @property
+    def waiting(self) -> int:
+        """Number of messages that were signalled and have not been read."""
+        return self._signs
+
     def close(self) -> None:
         """Destroy the subscription."""
         with self._subscription.handle:
@@ -125,8 +137,10 @@ class InputQueue:
                 if answer:
                     break
                 sent_ns, received_ns, number, sender = _INFO.unpack_from(self._info)
+                if number == _NO_NUMBER:
+                    number = self._counted[sender] = self._counted[sender] + 1
                 data = ctypes.string_at(*_PLACE.unpack_from(self._buffer))
-                received.append(Received(sender, number, received_ns, data, sent_ns))
+                received.append(Received(sender, number, received_ns or time.time_ns(), data, sent_ns))
             else:
                 answer = 0
         if answer not in (0, _EMPTY_QUEUE):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Collection, Iterator
 from typing import Any, Final
@@ -18,6 +17,7 @@ from plow_twin.errors import ArgumentError
 from plow_twin.live.publishing import Front
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.tool_forces import ToolForces
+from plow_twin.model.geometry import angle_of
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.ros.connections import Connections
 from plow_twin.ros.input_loop import InputLoop, Turns
@@ -47,6 +47,7 @@ class Subscriptions:
         self._inputs, self._intake = runtime.inputs, runtime.driver.intake
         self._connections = Connections(node)
         self._taken_from: dict[str, Subscription] = {}
+        self._queues: dict[str, InputQueue] = {}
         #: publishers of each input at the last lookup
         self._publishers: dict[str, list[bytes]] = {}
         self._tool_forces = ToolForces(runtime.scene)
@@ -132,7 +133,8 @@ class Subscriptions:
             self._since_ns, self._before = time.time_ns(), frozenset(self._present(topic))
             self._inputs.senders.start(self._before)
         self._taken_from[topic] = subscription
-        self._loop.add(InputQueue(self._node, subscription), self, topic)
+        self._queues[topic] = queue = InputQueue(self._node, subscription)
+        self._loop.add(queue, self, topic)
 
     def receive(self, topic: str, batch: list[Received]) -> None:
         """Count the gaps in the sequence numbers of a batch, and process its messages."""
@@ -190,7 +192,7 @@ class Subscriptions:
 
     def _samples(self, topic: str, batch: list[Received]) -> None:
         inputs = self._inputs
-        inputs.waited(len(batch), (time.time_ns() - batch[0].received_ns) * 1e-9)
+        inputs.waited(len(batch) + self._queues[topic].waiting, (time.time_ns() - batch[0].received_ns) * 1e-9)
         arrived: list[Arrival] = []
         followed = inputs.senders.followed
         for message in batch:
@@ -246,11 +248,12 @@ class Subscriptions:
             with_covariance = self._pose is PoseWithCovarianceStamped
             pose = message.pose.pose if with_covariance else message.pose
             turn, stamp = pose.orientation, stamp_ns(message.header)
-            # z and w are zero if the sender has not set the orientation, or if the orientation is no rotation about z
+            # z and w are zero if the sender has not set the orientation, or for half a turn about x or y
             if turn.z == turn.w == 0.0:
                 self._inputs.head_pose.refuse(Verdict.MALFORMED, stamp, (pose.position.x, pose.position.y))
                 continue
-            theta = 2.0 * math.atan2(turn.z, turn.w)
+            self._intake.out_of_plane += turn.x != 0.0 or turn.y != 0.0
+            theta = float(angle_of(turn.z, turn.w))
             deviation = deviations(message.pose.covariance) if with_covariance else ()
             self._runtime.add_pose(stamp, (pose.position.x, pose.position.y, theta), deviation)
 

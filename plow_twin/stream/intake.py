@@ -106,7 +106,7 @@ class Intake:
         self.expected_rate_hz = expected_rate_hz
         self.limits = limits
         self.counts: dict[Verdict, int] = dict.fromkeys(Verdict, 0)
-        #: number of used samples whose wrench has a component outside the plane of the motion
+        #: number of used samples, and of poses, with components outside the plane of the motion
         self.out_of_plane = 0
         self._newest_ns: int | None = None
         self._newest_values: Sequence[float] = ()

@@ -12,6 +12,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from plow_twin.model.geometry import angle_of
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
 from plow_twin.record.alarms import ALARMS
@@ -368,7 +369,7 @@ class Drawing:
     def _moment(self, stamp_ns: int, step: int, head: Array, contact: Array, load: Array) -> None:
         self.section_rows += 1
         force = contact[2 * PAIR_COUNT :]
-        pose = (float(head[0]), float(head[1]), 2.0 * math.atan2(head[2], head[3]))
+        pose = (float(head[0]), float(head[1]), float(angle_of(head[2], head[3])))
         color = set_color(int(masks_of(force[None])[0]))
         strips = self.section.head_strips(pose)
         self.head.add(stamp_ns, step, strips=list(strips), colors=[color] * len(strips))

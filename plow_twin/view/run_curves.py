@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
@@ -11,6 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.model.geometry import angle_of
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.record.entries import Batch, Holes
 from plow_twin.record.outputs import publication_templates
@@ -227,4 +227,4 @@ def _largest(contact: Rows, head: Rows) -> Iterator[Instant]:
     row = int(force.max(axis=1).argmax())
     x, y, *turn = head.numbers[both[row], :4].tolist()
     penetration = contact.numbers[at[both[row]], :PAIR_COUNT]
-    yield Instant(int(head.stamp_ns[both[row]]), (x, y, 2.0 * math.atan2(turn[0], turn[1])), force[row], penetration)
+    yield Instant(int(head.stamp_ns[both[row]]), (x, y, float(angle_of(*turn))), force[row], penetration)
