@@ -218,7 +218,8 @@ class Settings:
     alarm_clearance_rate: tuple[float, ...] = _alarm("m/s", 1.0, "growth rates of the larger clearance, over 10 s,")
     alarm_residual: tuple[float, ...] = _alarm("m", 10.0, "distances of head_pose from the model at the same stamp")
     alarm_duration: float = _number(0.0, "s", 0.0, 3600.0,
-        "time for which a value must exceed a threshold to raise an alarm")
+        "time for which a value must exceed a threshold to raise an alarm; impacts last milliseconds, so a longer time "
+        "prevents most alarms on forces")
     jump_back: float = _number(2.0, "s", 0.0, 3600.0,
         "largest age relative to the newest stamp; repeated older stamps reset the model, so no sample older than this "
         "is used as a late sample", Effect.NOW)
