@@ -6,6 +6,7 @@ outside the model, the contact law, load shape, sensor or machine contradicts th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -68,6 +69,8 @@ class Group:
     forces_gain: float = 0.05
     #: Largest delay of the load cells [s].
     forces_delay_s: float = 0.05
+    #: Change of the paper's scene to the scene that the estimate is told.
+    machine: Callable[[Scene], Scene] | None = None
     #: Expected verdict on the model.
     model: str = "ok"
     #: Expected verdict on the sensor.
@@ -155,6 +158,8 @@ def draw(group: Group, seed: int) -> Truth:
     """Draw a truth. A seed always gives the same truth."""
     rng = np.random.default_rng([20261121, seed])
     nominal = load_scene(ROOT / "config" / "paper.yaml")
+    if group.machine is not None:
+        nominal = group.machine(nominal)
     end = group.periods * PERIOD
     fine = np.arange(0.0, end + _FINE, _FINE)
     nominal_load = compile_loads(nominal.loads).at(fine)
@@ -168,10 +173,10 @@ def draw(group: Group, seed: int) -> Truth:
     scene = replace(
         nominal,
         clearance=Clearance(*rng.uniform(0.018, 0.034, 2)),
-        contact=_contact(group, rng),
+        contact=_contact(group, nominal.contact, rng),
         friction=Friction(group.friction) if group.friction else nominal.friction,
         loads=(Table("cutting", fine, true_load),),
-        wear=Wear(group.wear_m2_n, 0.015, 2.0) if group.wear_m2_n else None,
+        wear=Wear(group.wear_m2_n, 0.015, 2.0) if group.wear_m2_n else nominal.wear,
     )
     t = np.arange(0.0, end, 1.0 / group.rate_hz)
     delay = group.delay_s * rng.uniform()
@@ -188,15 +193,18 @@ def draw(group: Group, seed: int) -> Truth:
     return Truth(group, scene, nominal, load, poses, bias, delay, gain, clearance, forces)
 
 
-def _contact(group: Group, rng: np.random.Generator) -> Contact:
+def _contact(group: Group, nominal: Contact, rng: np.random.Generator) -> Contact:
     low, high = np.log(group.stiffness)
     stiffness = float(np.exp(rng.uniform(low, high)))
-    damping = 0.72 * float(np.exp(rng.normal(0.0, 0.4)))
+    if nominal.restitution is not None:
+        return replace(nominal, stiffness=stiffness, restitution=rng.uniform(0.3, 0.8))
+    share = float(np.exp(rng.normal(0.0, 0.4)))
+    damping = (nominal.damping if nominal.ramp_m and nominal.damping else 0.72) * share
     if group.law == "kelvin_voigt":
         # above 3e7 N/m, the damping grows with the root of the stiffness, so that the damping ratio is independent of
         # the stiffness
         damping = 10.0 ** rng.uniform(4.5, 5.3) * max(1.0, np.sqrt(stiffness / 3e7))
-    return Contact(law=group.law, stiffness=stiffness, exponent=group.exponent, damping=damping)
+    return replace(nominal, law=group.law, stiffness=stiffness, exponent=group.exponent, damping=damping)
 
 
 def cutting(rng: np.random.Generator, t: Array) -> Array:

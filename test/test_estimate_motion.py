@@ -395,3 +395,14 @@ def test_a_load_with_a_little_noise_is_followed_in_long_swings() -> None:
     assert result.horizontal_state is State.ESTIMATED, result.reasons
     means = [result.horizontal.mean, result.vertical.mean]
     assert means == pytest.approx(truth.clearance, abs=1e-4)
+
+
+def test_a_machine_with_a_locked_rotation_is_estimated() -> None:
+    """The noise of the locked angle must not become a rate of rotation, with which the fitted motions would turn."""
+    locked = replace(GROUPS["plain"], stiffness=(3e6, 3e8), machine=lambda scene: replace(scene, locked=("theta",)))
+    truth = draw(replace(locked, periods=6.0), 74000)
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert result.horizontal_state is State.ESTIMATED
+    assert result.horizontal.p05 <= truth.clearance[0] <= result.horizontal.p95
+    # the head always lies on the frame, so it does not show the vertical clearance
+    assert result.vertical_state is State.NOT_OBSERVABLE

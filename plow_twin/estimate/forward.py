@@ -136,7 +136,7 @@ class Forward:
         """
         params, segments = self._compiled(scene, gain, depth, push, stiffness)
         records = new_records(state_type(self._terms), len(starts))
-        records["y"] = body_states(states, scene.head.com_offset_m)
+        records["y"] = body_states(_with_locks(scene, states), scene.head.com_offset_m)
         if self._terms.hysteretic is not None:
             records["damping_factor"] = (scene.contact.damping or 0.0) * (1.0 if damping is None else damping)
         records["step_start"] = starts
@@ -188,6 +188,7 @@ class Forward:
         at_times, out = np.isin(t, times), []
         states, gains = np.array([one.state for one in starts]), np.array([one.gain for one in starts])[:, None]
         batch = TwinBatch([one.scene for one in starts], tol=tuning.TOLERANCE, start=start, max_steps=_STEPS)
+        states = _with_locks(starts[0].scene, states)
         batch.move(range(len(starts)), states[:, :3], states[:, 3:])
         batch.set_wrench((self.load.at(np.array([start])) * gains)[:, 0])
         good = np.ones(len(starts), np.bool_)
@@ -221,3 +222,9 @@ class Forward:
         if push is not None:
             segments["start"] += push / inertia
         return self._params[2], segments
+
+
+def _with_locks(scene: Scene, states: Array) -> Array:
+    """Return states, shape (s, 6), whose locked degrees of freedom rest where the scene begins."""
+    free = np.tile(scene.free, 2)
+    return states if free.all() else np.where(free, states, [*scene.initial.q, 0.0, 0.0, 0.0])
