@@ -57,6 +57,8 @@ _POSE_HZ: Final = 100.0
 _POSE_NOISE: Final = np.array([5e-4, 5e-4, 2e-3])
 #: Time without an answer after which samples are counted as lost [s].
 _STALL_S: Final = 2.0
+#: Longest wait [ns] for acknowledgements. Fast DDS requests them every 3 s.
+_ACKNOWLEDGED_NS: Final = 4 * NS_PER_S
 #: Longest wait at the end for a further answer, by definition. A busy machine may stop a twin for seconds.
 _SILENT_S: Final = 10.0
 #: Layout of a serialised message up to its stamp: four bytes of encapsulation, sec and nanosec.
@@ -152,12 +154,16 @@ class ExcitationPublisher(WithoutEvents):
         self._wait_for_answer(FIRST_STAMP_NS + (self.sent - 1) * self._plan.period_ns)
 
     def flush(self) -> None:
-        """Wait until all reliable subscribers have received all messages, and a twin has used them.
+        """Wait until a twin has used all samples, and all reliable subscribers have received all messages.
 
-        When a publisher ends, the middleware discards the samples that a slow twin has not read.
+        When a publisher ends, the middleware discards the messages that a slow subscriber has not read. A twin that has
+        answered the last sample has read all samples, so only other messages and subscribers need acknowledgements.
         """
-        self._samples.wait_for_all_acked(Duration(nanoseconds=round(_STALL_S * NS_PER_S)))
         while_progress(lambda: self._answered_ns, self._last_ns, self._hear_twin, _SILENT_S)
+        sent = [publisher for publisher in (self._samples, self._travel, self._poses) if publisher is not None]
+        if not self._stop.stopped and (len(sent) > 1 or self._samples.get_subscription_count() > 1):
+            for publisher in sent:
+                publisher.wait_for_all_acked(Duration(nanoseconds=_ACKNOWLEDGED_NS))
 
     def _hear_twin(self) -> bool:
         """Wait briefly for an answer. Return False if there is no twin, or a stop was requested."""
