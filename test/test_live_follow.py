@@ -38,6 +38,7 @@ from plow_twin.ros.messages import set_stamp
 from plow_twin.run.batch import TwinBatch
 from plow_twin.scene_file import dump_scene
 from plow_twin.solve.state import FOLLOWED, ROW, WITH_INTERVALS
+from plow_twin.stream import insertion
 from plow_twin.stream.driven import PREPARATION_S
 from plow_twin.stream.journal import (
     Digest,
@@ -53,6 +54,7 @@ from plow_twin.stream.journal import (
     SetModel,
     SetWear,
     Snapshot,
+    Travel,
 )
 from plow_twin.stream.outputs import CLEARANCE_NAMES, NONE, Published
 from plow_twin.stream.session import Session
@@ -391,6 +393,122 @@ def test_twins_that_catch_up_later_give_the_same_bits(truth: Truth) -> None:
         entry for entry in at_once.journal if isinstance(entry, Digest)
     ]
     assert _again(later.journal, truth.nominal).twin.digest() == later.twin.digest()
+
+
+@pytest.fixture
+def ten_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the followers of these tests repeat ten samples at once."""
+    monkeypatch.setattr(insertion, "MEMBER_SAMPLES", 10 * MEMBERS)
+
+
+@pytest.mark.usefixtures("ten_at_once")
+def test_a_late_sample_waits_until_a_second_set_of_twins_has_caught_up(
+    truth: Truth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The result equals that of a sample that arrives at the end of the insertion and is inserted at once."""
+    live, other = Live(truth.nominal, defers=True), Live(truth.nominal)
+    for one in (live, other):
+        one.take([*_in_turn(truth, 0.0, 0.6), _known(truth), *_in_turn(truth, 0.6, 1.0)])
+    late = _late(truth, 0.5)
+    advance, samples = TwinBatch.advance_samples, list[int]()
+
+    def counted(twins: TwinBatch, t: Array, wrench: Array) -> Any:
+        samples[-1] += len(t)
+        return advance(twins, t, wrench)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TwinBatch, "advance_samples", counted)
+        samples.append(0)
+        live.take(late)
+        assert (live.session.waiting, samples) == (1, [0]) and not len(live.published[-1].rows)
+        # poses, also late ones, and an estimate arrive meanwhile
+        entries = [*_in_turn(truth, 1.0, 1.2), *_poses(truth, 0.985, 0.99), _known(truth), *_in_turn(truth, 1.2, 2.0)]
+        for entry in entries:
+            samples.append(0)
+            waiting = live.session.waiting
+            live.take([entry])
+            live.session.catch_up()
+            if waiting and not live.session.waiting:
+                break
+    place = entries.index(entry)
+    # the motion since 0.5 s has 50 samples; in the time of three new samples, ten samples are repeated
+    assert 20 < place < 80 and max(samples) <= 12
+    assert (
+        live.column("corrected")[-2:].tolist() == [0, 1]
+        and len(live.column("t")) == sum(isinstance(entry, Sample) for entry in live.journal) - 1
+    )
+    other.take(entries[:place])
+    digests = [entry for entry in live.journal if isinstance(entry, Digest)]
+    monkeypatch.setattr(insertion, "MEMBER_SAMPLES", 10**6)
+    other.take([*late, entry])
+    assert live.twin.digest() == other.twin.digest() and live.twin.added == other.twin.added
+    for one in (live, other):
+        one.published.clear()
+        one.take(_in_turn(truth, 2.0, 2.2))
+        one.session.catch_up()
+    for name in set(ROW.names or ()) - {"marked"}:
+        assert np.array_equal(live.column(name), other.column(name)), name
+    assert digests == [entry for entry in live.journal if isinstance(entry, Digest)][: len(digests)]
+    monkeypatch.setattr(insertion, "MEMBER_SAMPLES", 10 * MEMBERS)
+    for at_once in (1, 7, 1000):
+        assert _again(live.journal, truth.nominal, at_once).twin.digest() == live.twin.digest()
+
+
+@pytest.mark.usefixtures("ten_at_once")
+@pytest.mark.parametrize("wear", [None, Wear(2e-14, 0.015, 2.0)])
+def test_many_late_samples_give_the_same_bits_live_and_later(truth: Truth, wear: Wear | None) -> None:
+    """Samples that are late during an insertion wait for the next one. Other entries, of each kind, come between."""
+    rng, scene = np.random.default_rng(5), replace(truth.nominal, wear=wear)
+    arrivals: list[tuple[float, Entry]] = []
+    for entry in _in_turn(truth, 0.0, 2.4):
+        t = (entry.stamp_ns - T0) * 1e-9
+        delay = 0.7 * float(rng.random()) if t > 0.1 and rng.random() < 0.08 else 0.0
+        arrivals.append((t + delay, entry))
+    arrivals += [(0.6, _known(truth)), (1.5, _known(truth, State.WITHDRAWN)), (1.7, _known(truth))]
+    arrivals += [(1.4001, Hold(_stamp(1.405))), (1.9, OTHER)]
+    for t in (0.1 + 2.2 * rng.random(20)).tolist() if wear else ():
+        arrivals.append((t, Travel(_stamp(t - float(rng.choice([-0.05, 0.0, 0.004, 0.2]))), float(rng.random()))))
+    entries = [*(entry for _, entry in sorted(arrivals, key=lambda arrival: arrival[0])), *_late(truth, 2.0)]
+    later, at_once = Live(scene, defers=True), Live(scene)
+    most = 0
+    for entry in entries:
+        for one in (later, at_once):
+            oldest_ns = one.session.history.oldest_ns or 0
+            if not isinstance(entry, Sample) or entry.stamp_ns > oldest_ns:
+                one.take([entry])
+        most = max(most, later.session.waiting)
+    assert most > 1 and later.session.waiting
+    for one in (later, at_once):
+        one.session.close()
+        assert not one.session.waiting
+    assert later.journal == at_once.journal and isinstance(later.journal[-2], Hold)
+    for name in ROW.names or ():
+        assert np.array_equal(later.column(name), at_once.column(name)), name
+    for count in (1, 13, 1000):
+        session = _again(later.journal, scene, count)
+        assert session.twin.digest() == later.twin.digest()
+        assert session.travel_speed_m_s == later.session.travel_speed_m_s
+
+
+@pytest.mark.usefixtures("ten_at_once")
+def test_without_poses_late_samples_give_the_motion_of_ordered_samples(
+    truth: Truth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[Any] = []
+    monkeypatch.setattr(
+        Follower, "second", lambda twin, data, second=Follower.second: begun.append(second(twin, data)) or begun[-1]
+    )
+    ordered, late = Live(truth.nominal), Live(truth.nominal)
+    samples = _samples(truth, 0.0, 2.0)
+    ordered.take(samples)
+    # a twin without late samples has no second set of twins
+    assert not begun
+    late.take(
+        [*samples[:30], *samples[31:35], *samples[37:100], samples[35], samples[30], *samples[100:120], samples[36]]
+    )
+    assert late.session.waiting == 3 and samples[36].stamp_ns in late.session.history
+    late.take(samples[120:])
+    assert len(begun) == 2 and late.twin.digest() == ordered.twin.digest()
 
 
 def _late(truth: Truth, t: float) -> list[Sample]:

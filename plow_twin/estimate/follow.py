@@ -20,6 +20,7 @@ import time as _time
 from bisect import insort
 from collections import Counter, deque
 from collections.abc import Container
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, NamedTuple
 
@@ -499,6 +500,23 @@ class Follower:
         self._ensemble.outlying, self._range = int(facts["outlying"]), np.array(facts["range"])
         self._noise_rows = deque(np.frombuffer(noise).reshape(-1, 3).copy(), maxlen=_NOISE_ROWS[1])
         self._clearance, self._wrench = np.frombuffer(clearance).reshape(2, 3).copy(), np.frombuffer(wrench).copy()
+
+    def second(self, data: bytes) -> Follower:
+        """Return a follower with equal settings, which `restore` must set to the snapshot `data` before any other use.
+
+        Its members are drawn by `draw_piece`, or by `restore` if that has not been called often enough.
+        """
+        facts, _ = _facts(data)
+        second = copy(self)
+        # no members have this number, so `restore` never uses the members that both followers still share
+        second._behind, second.drawn = None, -1
+        members = 1 if facts["alone"] else int(facts["members"])
+        second._draft = self._begin_draft(facts["estimate"], int(facts["drawn"]), members, np.array(facts["worn"]))
+        return second
+
+    def draw_piece(self) -> bool:
+        """Draw the next of five parts of the members that `restore` will need; return whether there was a part left."""
+        return self._draft is not None and self._draft.ensemble.draw_piece()
 
     # -- measurements ------------------------------------------------------------------------------------------------
 

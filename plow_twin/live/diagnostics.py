@@ -112,6 +112,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "poses_used": "measured poses that corrected the motion of the twins",
         "poses_outlying": "poses that were ignored, because they are too far from their predictions",
         "poses_dropped": "poses dropped because they were an hour ahead of the load or too many poses waited",
+        "late_waiting": "late samples of the load that wait until twins have repeated the motion with them",
         "taken_over": "number of times that the twins were drawn again, because an estimate or the machine had changed",
         "reduced": "1 if poses no longer correct the motion, because the twins were too slow",
     },
@@ -406,6 +407,7 @@ class Health:
             "poses_used": str(follower.poses.used),
             "poses_outlying": str(follower.poses.outlying),
             "poses_dropped": str(follower.poses.dropped + runtime.driver.session.poses_dropped),
+            "late_waiting": str(runtime.driver.session.waiting),
             "taken_over": str(follower.drawn),
             "reduced": str(int(reduced)),
         }

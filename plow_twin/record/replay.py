@@ -449,6 +449,8 @@ class _Replay:
             computed = self.session.renew().data
             self._compare("snapshot", snapshot.stamp_ns, "state", _hash(snapshot.data), _hash(computed))
             return
+        # the live session inserted the late samples that waited before it made the snapshot
+        self.session.insert_waiting()
         before = self.session.twin.digest() if self.synced else None
         try:
             self.session.apply(snapshot)

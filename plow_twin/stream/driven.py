@@ -94,6 +94,19 @@ class Following(Driven, Protocol):
     #: whether a row that is published alone is returned before its intervals are computed; `catch_up` computes them
     defers: bool
 
+    @property
+    def members(self) -> int:
+        """Number of twins that are advanced together."""
+
+    def second(self, data: bytes) -> Self:
+        """Return a twin with equal settings, which `restore` must set to the snapshot `data` before any other use.
+
+        Calls of `draw_piece` before `restore` spread the work of the latter.
+        """
+
+    def draw_piece(self) -> bool:
+        """Do the next of five parts of the work of `restore`, and return whether there was a part left."""
+
     def catch_up(self) -> None:
         """Finish the deferred computation for the newest row. Every other method does so first."""
 

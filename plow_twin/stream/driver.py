@@ -108,7 +108,7 @@ class Driver:
         self.failed = Failures(session.emit)
         self.resets = 0
         self.holds = 0
-        #: number of late samples that were inserted
+        #: number of late samples that were used; some may wait for their insertion (`Session.waiting`)
         self.rolled_back = 0
         #: number of travel speeds that could not take effect at their stamps
         self.travel_misplaced = 0

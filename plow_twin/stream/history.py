@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
 from collections import deque
+from collections.abc import Iterable
+from copy import copy
 from typing import Final
 
 import numpy as np
@@ -46,7 +48,32 @@ class History:
         self._resumed_ns: list[int] = []
         #: applied samples, as they were added
         self._samples: deque[Samples] = deque()
+        #: stamps [ns] of late samples that wait for their insertion; a copy shares them
+        self._waiting_ns: set[int] = set()
         self._due = True
+
+    def copy(self) -> History:
+        """Return a history with the same data, which also stores the data that waiting samples will need."""
+        other = copy(self)
+        other._snapshots, other._travels = self._snapshots.copy(), self._travels.copy()
+        other._kept_ns, other._resumed_ns = self._kept_ns.copy(), self._resumed_ns.copy()
+        other._samples, other._dropped = self._samples.copy(), []
+        return other
+
+    def replace_motion(self, other: History, waiting_ns: Iterable[int]) -> None:
+        """Replace snapshots, samples and speeds by those of a copy in which late samples have been inserted.
+
+        The stamps that decide whether a sample is too old are not replaced. They must not depend on the progress of the
+        copy. The samples with the stamps `waiting_ns` [ns] still wait.
+        """
+        self._dropped += self._snapshots
+        self._snapshots, self._samples, self._travels = other._snapshots, other._samples, other._travels
+        self._due, self._waiting_ns = other._due, set(waiting_ns)
+        self._drop_old()
+
+    def wait(self, stamp_ns: int) -> None:
+        """Store the data that are needed until a late sample with this stamp [ns] is inserted."""
+        self._waiting_ns.add(stamp_ns)
 
     @property
     def is_due(self) -> bool:
@@ -69,6 +96,8 @@ class History:
         return self._samples[-1][0].item(-1) if self._samples else None
 
     def __contains__(self, stamp_ns: int) -> bool:
+        if stamp_ns in self._waiting_ns:
+            return True
         if stamp_ns <= (self._snapshots[0][0] if self._snapshots else 0):
             return False
         found = next((stamps_ns for stamps_ns, _ in reversed(self._samples) if stamps_ns[0] <= stamp_ns), NO_SAMPLES[0])
@@ -79,6 +108,7 @@ class History:
         self._dropped += self._snapshots
         self._snapshots, self._travels, self._kept_ns, self._resumed_ns = [], [], [], []
         self._samples.clear()
+        self._waiting_ns = set()
         self._newest_kept_ns, self._due = None, True
 
     def add(self, stamps_ns: NDArray[np.int64], wrench: NDArray[np.float64]) -> None:
@@ -117,7 +147,8 @@ class History:
         self._drop_old()
 
     def _drop_old(self) -> None:
-        oldest_ns, old = self._kept_ns[0], 0
+        # a state before each waiting sample is needed
+        oldest_ns, old = min([self._kept_ns[0], *(stamp_ns - 1 for stamp_ns in self._waiting_ns)]), 0
         while old + 1 < len(self._snapshots) and self._snapshots[old + 1][0] <= oldest_ns:
             old += 1
         if old:
@@ -163,6 +194,30 @@ class History:
         """
         place = bisect_left(self._resumed_ns, stamp_ns)
         return max(self._resumed_ns[place - 1] if place else 0, self.oldest_ns or 0)
+
+    def repeated(self, stamp_ns: int) -> int:
+        """Return how many samples are applied again if a sample is inserted at `stamp_ns`.
+
+        The result does not depend on the snapshots that have been added.
+        """
+        place = bisect_left(self._kept_ns, stamp_ns)
+        from_ns, count = self._kept_ns[place - 1] if place else 0, 0
+        for stamps_ns, _ in reversed(self._samples):
+            if stamps_ns[0] <= from_ns:
+                return count + len(stamps_ns) - int(stamps_ns.searchsorted(from_ns, "right"))
+            count += len(stamps_ns)
+        return count
+
+    def until_snapshot(self, stamps_ns: NDArray[np.int64]) -> int:
+        """Return the number of the next samples, with these stamps [ns], up to the first sample of a cell."""
+        if self.is_due or not self._kept_ns:
+            return 1
+        begins = stamps_ns // self._cell_ns != self._kept_ns[-1] // self._cell_ns
+        return int(begins.argmax()) + 1 if begins.any() else len(stamps_ns)
+
+    def before(self, stamp_ns: int) -> bytes:
+        """Return the last snapshot before `stamp_ns`."""
+        return self._snapshots[bisect_left(self._snapshots, stamp_ns, key=lambda item: item[0]) - 1][1]
 
     def rewind(self, stamp_ns: int) -> tuple[bytes, Samples, list[Travel]]:
         """Go back to the last snapshot before `stamp_ns`; return the snapshot and the later samples and speeds."""

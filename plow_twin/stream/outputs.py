@@ -8,6 +8,7 @@ alone, so a replay gives bit-identical publications.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from functools import cache
 from typing import Final, NamedTuple
 
@@ -261,6 +262,17 @@ class Outputs:
         """Number of touches of each pair so far, shape (8,)."""
         makes: Integers = self._window["makes"][0].copy()
         return makes
+
+    def copy(self) -> Outputs:
+        """Return outputs with the same state."""
+        other = copy(self)
+        other._window, other._stock = self._window.copy(), Stock()
+        return other
+
+    def replace_motion(self, other: Outputs) -> None:
+        """Replace the unpublished advances by those of a copy, in which late samples have been inserted."""
+        self._window, self._waits = other._window, other._waits
+        self._corrected_ns, self._before = other._corrected_ns, other._before
 
     def restart(self) -> None:
         """Drop all unpublished data; the numbers of touches do not change."""

@@ -5,7 +5,8 @@ Terms of this module:
 - An *advance* moves the model to a stamp, usually the stamp of a sample. Its result is a *row*.
 - The load is *held* while the motion advances without samples.
 - A sample is *late* if the model has already advanced beyond its stamp. For a late sample, the session goes back to a
-  snapshot in its *history*, inserts the sample, and computes the motion again.
+  snapshot in its *history*, inserts the sample, and computes the motion again. If a twin that follows measurements
+  cannot repeat so many samples at once, the late sample *waits* (module `insertion`).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import math
 from bisect import insort
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -24,6 +26,7 @@ from plow_twin.solve.samples import model_times
 from plow_twin.stream import journal, outputs
 from plow_twin.stream.driven import MOST_MEASURED, PREPARATION_S, Driven, Following
 from plow_twin.stream.history import NO_SAMPLES, History, Samples
+from plow_twin.stream.insertion import Insertion, samples_at_once
 from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
 from plow_twin.stream.outputs import NONE, NOTHING, ONLY_ROW, Array, Integers, Outputs, Published, Rows, Stock
 from plow_twin.stream.snapshot import SessionState, split_changes, with_changes
@@ -36,6 +39,8 @@ _AHEAD_NS: Final = 3_600_000_000_000
 _NO_LOAD: Final = np.zeros((1, 3))
 _NO_SHIFT: Final = (0.0,) * 6
 _NO_ROWS: Final = NOTHING.rows
+#: Entries that end the motion; all late samples that wait are inserted before.
+_ENDING: Final = journal.Reset | journal.SetWear | journal.Restore
 
 
 class _Measured(NamedTuple):
@@ -136,6 +141,8 @@ class Session:
         self._use(twin)
         #: poses and estimates since the oldest snapshot
         self._measured: deque[_Measured] = deque()
+        #: late samples that wait; None without such samples
+        self._insertion: Insertion | None = None
         #: number of poses that were dropped, because they were too far ahead of the model or more than `MOST_MEASURED`
         self.poses_dropped = 0
         self._scene = twin.scene
@@ -173,16 +180,26 @@ class Session:
         """Finish the deferred computation of a following twin, and add a snapshot to the history if it is due."""
         if self.following is not None:
             self.following.catch_up()
-            if self.history.is_due and self.stamp_ns is not None and not self.held:
+            if self._insertion is not None:
+                self._insertion.work()
+            elif self.history.is_due and self.stamp_ns is not None and not self.held:
                 self._store_snapshot(kept=False)
+
+    @property
+    def waiting(self) -> int:
+        """Number of late samples that wait for their insertion."""
+        return 0 if self._insertion is None else self._insertion.waiting
 
     def start(self) -> None:
         """Emit the snapshot that opens a journal."""
         self.emit(self.snapshot())
 
     def close(self) -> None:
-        """Emit the digest that ends a journal."""
+        """Insert all late samples that wait, and emit the digest that ends a journal."""
         if self.stamp_ns is not None:
+            if self._insertion is not None:
+                # the hold, by a time of zero, tells a replay when the samples were inserted
+                self.apply(journal.Hold(self.stamp_ns))
             self.emit(journal.Digest(self.stamp_ns, self.twin.digest()))
 
     def apply(self, entry: journal.Entry) -> Rows | None:
@@ -193,7 +210,8 @@ class Session:
         """
         match entry:
             case journal.Sample():
-                return self.apply_samples([entry]).rows[-1:]
+                rows = self.apply_samples([entry]).rows[-1:]
+                return rows if len(rows) else None
             case journal.Hold() | journal.Unload():
                 return self._apply_hold(entry)
             case journal.Digest() | journal.Loss():
@@ -204,6 +222,8 @@ class Session:
                 self._apply_model(entry)
                 return None
         self.emit(entry)
+        if isinstance(entry, _ENDING):
+            self.insert_waiting()
         match entry:
             case journal.Travel():
                 self._apply_travel(entry)
@@ -216,18 +236,20 @@ class Session:
             case journal.Estimated(shift=shift):
                 self.outputs.set_shift(shift)
                 if self.stamp_ns is not None:
-                    self._follow(self.stamp_ns, entry)
+                    self.follow(self.stamp_ns, entry)
             case journal.Restore(_, data):
                 self._restore_motion(data)
             case journal.Pose(stamp_ns) | journal.PartOfPose(stamp_ns):
                 if self.following is not None and self.stamp_ns is not None and stamp_ns > self.stamp_ns + _AHEAD_NS:
                     self.poses_dropped += 1
                 else:
-                    self._follow(stamp_ns, entry)
+                    self.follow(stamp_ns, entry)
             case journal.Parameter("follow", "parameters") if self.following is not None:
+                self.insert_waiting()
                 self.following.follow_parameters()
                 self._renew_history()
             case journal.Snapshot(_, data):
+                self._insertion = None
                 self._restore(data)
                 self._renew_history()
         return None  # entries of other types do not change the motion
@@ -260,7 +282,14 @@ class Session:
             self.emit(sample)
         stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
         wrench = np.array([sample.wrench for sample in samples])
-        if late:
+        if late and self._must_wait(first_ns):
+            for sample in samples[:late]:
+                self._wait(sample, self.history.repeated(sample.stamp_ns))
+            applied = Applied(_NO_ROWS, NOTHING, [], 0)
+            if late < len(samples):
+                applied = self._advance(stamps[late:], wrench[late:], self._stock.new(len(samples) - late))
+            applied = applied._replace(published=self.outputs.pop() if each else NOTHING, late=late)
+        elif late:
             applied = self._recompute(first_ns, (stamps, wrench))
             applied = applied._replace(published=self.outputs.pop() if each else NOTHING, late=late)
         else:
@@ -277,7 +306,9 @@ class Session:
         advance fails. The `stamps` [ns], shape (n,), must rise, and the first must not be late. The loads `wrench`,
         shape (n, 3), must be finite. `each` is as for `apply_samples`.
         """
-        if self.stamp_ns is None or self.held or self._travels or not (self.outputs.is_clear or not each):
+        if self.stamp_ns is None or self.held or self._travels or self._insertion is not None:
+            return None
+        if each and not self.outputs.is_clear:
             return None
         count = len(stamps)
         first = DIGEST_INTERVAL - self._advances % DIGEST_INTERVAL
@@ -325,14 +356,22 @@ class Session:
     def _advance(
         self, stamps: Integers, wrench: Array, rows: Rows | None, taken: Integers = NONE, digest_after: Integers = NONE
     ) -> Applied:
-        """Advance in parts, which end at a waiting travel speed or after a sample that follows a held load."""
-        if not (self.held or self._travels):
+        """Advance in parts.
+
+        A part ends at a waiting travel speed, after a sample that follows a held load, and where late samples are
+        inserted.
+        """
+        if not (self.held or self._travels or self._insertion is not None):
             return self._advance_part(stamps, wrench, rows, taken, digest_after)
         if not np.isfinite(wrench).all():
             raise ValueError(f"wrench: got {wrench!r}, expected finite numbers")
         resumed, begin, count = self._resume_wear(), 0, len(stamps)
         parts: list[Applied] = []
         while begin < count:
+            if self._insertion is not None:
+                self._insertion.work()
+                if not self._insertion.left:
+                    self._insert()
             travel, end = self._travels[0] if self._travels else None, count
             if travel is not None and travel.stamp_ns < stamps[begin]:
                 self._apply_waiting_travel(travel, int(stamps[begin]), wrench[begin])
@@ -343,12 +382,16 @@ class Session:
             # begin there
             if resumed:
                 end = begin + 1
+            if self._insertion is not None:
+                end = min(end, begin + self._insertion.left)
             part = slice(begin, end)
             chosen = taken[(taken >= begin) & (taken < end)] - begin
             part_digest_after = digest_after[(digest_after > begin) & (digest_after <= end)] - begin
             out = None if rows is None else rows[part]
             applied = self._advance_part(stamps[part], wrench[part], out, chosen, part_digest_after, resumed=resumed)
             parts.append(applied)
+            if self._insertion is not None:
+                self._insertion.add(stamps[part], wrench[part])
             if resumed:
                 self._store_snapshot(resumed=True)
             begin, resumed = end, False
@@ -366,7 +409,11 @@ class Session:
         return largest
 
     def renew(self) -> journal.Snapshot:
-        """Return a snapshot from which a journal can continue, and drop all stored earlier states."""
+        """Insert all late samples that wait, drop all stored earlier states, and return a snapshot of the state.
+
+        A journal can continue from the snapshot.
+        """
+        self.insert_waiting()
         snapshot = self.snapshot()
         self._renew_history()
         return snapshot
@@ -399,7 +446,8 @@ class Session:
         """
         origin_ns = self._begin(int(stamps[0])) if self.origin_ns is None else self.origin_ns
         # no state is saved at the stamp of a speed, because a late sample may change the load there
-        if self.history.is_due and stored and not resumed and self.stamp_ns in (None, self.history.newest_sample_ns):
+        due = self.history.is_due and self._insertion is None
+        if due and stored and not resumed and self.stamp_ns in (None, self.history.newest_sample_ns):
             before_ns = int(stamps[0]) - 1 if self.stamp_ns is None else self.stamp_ns
             self.history.add_snapshot(before_ns, self.snapshot().data, kept=False)
         if self.following is not None:
@@ -421,9 +469,10 @@ class Session:
             self._largest_error_m = max(self._largest_error_m, float(rows["error_estimate"].max()))
         return Applied(rows, self.outputs.add(rows, stamps, taken, held=self.held), digests, failed)
 
-    def _follow(
+    def follow(
         self, stamp_ns: int, entry: journal.Pose | journal.PartOfPose | journal.Estimated, known: float = -math.inf
     ) -> None:
+        """Pass a pose or an estimate to the twin, without effect before model time `known` [s]."""
         if self.following is None or self.origin_ns is None:
             return
         time = (stamp_ns - self.origin_ns) * 1e-9
@@ -434,6 +483,8 @@ class Session:
             self.following.add_pose(time, journal.whole_pose(entry), known)
         measured, earliest_ns, reached_ns = self._measured, self.history.earliest_ns, self.stamp_ns or 0
         known = max(known, self.following.time)
+        if self._insertion is not None:
+            self._insertion.add_measured(entry, stamp_ns, known)
         measured.append(_Measured(self.following.added, reached_ns, known, stamp_ns, entry))
         while measured and (earliest_ns is None or measured[0].reached_ns < earliest_ns):
             measured.popleft()
@@ -472,6 +523,54 @@ class Session:
             expected = f"at least {reached}" if oldest_ns is None else f"a stamp after {stored}"
             raise ValueError(f"stamp: got {stamp_ns} ns, expected {expected}")
 
+    def _must_wait(self, stamp_ns: int) -> bool:
+        """Return whether a late sample must wait, because too many samples would be repeated at once."""
+        if self._insertion is not None or self.following is None or self.held:
+            return self._insertion is not None
+        return self.history.repeated(stamp_ns) > samples_at_once(self.following.members)
+
+    def _wait(self, sample: journal.Sample, repeated: int) -> None:
+        """Let a late sample wait, for which `repeated` samples must be applied again."""
+        assert self.following is not None
+        if self._insertion is None:
+            state = SessionState.unpack(self.history.before(sample.stamp_ns))
+            self._insertion = Insertion(self.following.second(self._split_changes(state.twin)[0]), self._second)
+        self._insertion.add_late(sample, repeated)
+        self.history.wait(sample.stamp_ns)
+
+    def _second(self, twin: Following, stamp_ns: int) -> tuple[Session, int, Samples]:
+        """Return a session of `twin` in a state before `stamp_ns`, and the samples after the state.
+
+        The second result is the stamp at which the motion changes.
+        """
+        second = copy(self)
+        second._use(twin)
+        second.emit, second._insertion = lambda entry: None, None
+        second.history, second.outputs, second._stock = self.history.copy(), self.outputs.copy(), Stock()
+        second._measured, second._travels = self._measured.copy(), self._travels.copy()
+        corrected_ns = second.outputs.correct(stamp_ns, second.history.correction_limit_ns(stamp_ns))
+        return second, corrected_ns, second._rewind(corrected_ns)
+
+    def _insert(self) -> None:
+        """Replace the motion by the motion with the late samples that have waited longest."""
+        assert self._insertion is not None and self.following is not None
+        insertion, self._insertion = self._insertion, None
+        self.following.catch_up()
+        second = insertion.finish()
+        self._use(second.twin)
+        self.history.replace_motion(second.history, [sample.stamp_ns for sample, _ in insertion.later])
+        self.outputs.replace_motion(second.outputs)
+        self._measured, self._travels, self.wear_depth = second._measured, second._travels, second.wear_depth
+        if self._wears:
+            self.travel_speed_m_s = second.travel_speed_m_s
+        for sample, behind in insertion.later:
+            self._wait(sample, behind + insertion.passed)
+
+    def insert_waiting(self) -> None:
+        """Insert all late samples that wait."""
+        while self._insertion is not None:
+            self._insert()
+
     def _recompute(self, stamp_ns: int, late: Samples, *travels: journal.Travel) -> Applied:
         """Go back to a state before a late stamp, and compute the motion again with late samples and travel speeds.
 
@@ -504,7 +603,7 @@ class Session:
             measured, self._measured = self._measured, deque()
             for measurement in measured:
                 if measurement.number > self.following.added:
-                    self._follow(measurement.stamp_ns, measurement.entry, measurement.known)
+                    self.follow(measurement.stamp_ns, measurement.entry, measurement.known)
                 else:
                     self._measured.append(measurement)
         # a speed with the stamp of the snapshot may occur twice
@@ -517,6 +616,7 @@ class Session:
         if self.stamp_ns is not None and stamp_ns < self.stamp_ns:
             raise ValueError(f"stamp: got {stamp_ns} ns, expected at least the time reached, {self.stamp_ns} ns")
         self.emit(entry)
+        self.insert_waiting()
         if self._sampled:
             self._suspend_wear()
         while self._travels and self._travels[0].stamp_ns <= stamp_ns:
@@ -546,6 +646,10 @@ class Session:
             self.twin.set_travel_speed(self.travel_speed_m_s)
         return held
 
+    def schedule(self, travel: journal.Travel) -> None:
+        """Let a travel speed wait for its stamp."""
+        insort(self._travels, travel, key=lambda item: item.stamp_ns)
+
     def _apply_travel(self, travel: journal.Travel) -> None:
         newest_ns, oldest_ns = self.history.newest_sample_ns, self.history.oldest_ns
         if not self._wears:
@@ -554,15 +658,24 @@ class Session:
             # no advance has been made yet, so the speed takes effect at once
             self._use_speed(travel.speed_m_s)
         elif travel.stamp_ns > self.stamp_ns:
-            insort(self._travels, travel, key=lambda item: item.stamp_ns)
+            self.schedule(travel)
+            self._pass_on(travel)
         elif oldest_ns is not None and travel.stamp_ns <= oldest_ns:
             # a speed older than all stored states takes effect at the newest sample or, without samples, at the oldest
             # stored state
-            self._set_speed(journal.Travel(oldest_ns if newest_ns is None else newest_ns, travel.speed_m_s))
+            applied = journal.Travel(oldest_ns if newest_ns is None else newest_ns, travel.speed_m_s)
+            self._set_speed(applied)
+            self._pass_on(applied)
         elif newest_ns is None or oldest_ns is None or travel.stamp_ns >= newest_ns:
             self._set_speed(travel)
+            self._pass_on(travel)
         else:
+            self.insert_waiting()
             self._recompute(travel.stamp_ns, NO_SAMPLES, travel)
+
+    def _pass_on(self, travel: journal.Travel) -> None:
+        if self._insertion is not None:
+            self._insertion.add_travel(travel)
 
     def _set_speed(self, travel: journal.Travel) -> None:
         self.history.add_travel(travel)
@@ -616,6 +729,7 @@ class Session:
         changes = read_changes(entry.changes)
         twin = self._changed_twin(changes)
         self.emit(entry)
+        self.insert_waiting()
         before, speed = self.twin, 0.0 if self.held else self.travel_speed_m_s
         self._use(twin)
         self._carry(before)
