@@ -229,10 +229,11 @@ class History:
         later = [NO_SAMPLES]
         while self._samples and self._samples[-1][0][-1] > reached_ns:
             stamps, wrench = self._samples.pop()
-            first = stamps.searchsorted(reached_ns, "right")
-            later.append((stamps[first:], wrench[first:]))
-            if first:
+            if stamps[0] <= reached_ns:
+                first = stamps.searchsorted(reached_ns, "right")
                 self._samples.append((stamps[:first], wrench[:first]))
+                stamps, wrench = stamps[first:], wrench[first:]
+            later.append((stamps, wrench))
         travels = [item for item in self._travels if item.stamp_ns >= reached_ns]
         self._travels = [item for item in self._travels if item.stamp_ns < reached_ns]
         stamps, wrench = map(np.concatenate, zip(*reversed(later), strict=True))

@@ -22,7 +22,7 @@ from plow_twin.stream.outputs import Array, Integers
 if TYPE_CHECKING:
     from plow_twin.stream.session import Session
 
-#: Largest product of twins and samples in one part of the repeated motion, and number of new samples for each part.
+#: Product of twins and samples in one part of the repeated motion, and number of new samples for each part.
 #: With 128 twins, a part has ten samples and takes 1.3 ms, and a new sample takes 0.3 ms. Three new samples and a part
 #: together take less than the three milliseconds that they have at 1 kHz.
 MEMBER_SAMPLES: Final = 1280
@@ -110,7 +110,7 @@ class Insertion:
             self._second.schedule(travel)
 
     def work(self) -> None:
-        """Do the work that belongs to the newest samples. A second call without new samples does nothing."""
+        """Do the work that belongs to the newest samples. A second call without new samples repeats no motion."""
         before, self._worked = self._worked, self.passed
         if self.passed < GATHERED:
             for _ in range(before, self.passed):
@@ -120,6 +120,8 @@ class Insertion:
         elif (self.passed - GATHERED) // STRIDE > (before - GATHERED) // STRIDE:
             # the rest is divided equally among the remaining parts
             self._repeat(self._second, -(-(len(self._stamps) + self.left) // (self.left // STRIDE + 1)))
+        else:
+            self._second.catch_up()
 
     def finish(self) -> Session:
         """Do all the rest of the work, and return the second session."""
@@ -141,16 +143,25 @@ class Insertion:
         self._stamps, self._wrench = stamps[order], wrench[order]
 
     def _repeat(self, second: Session, count: int) -> None:
-        while count:
-            unchanged = 0
+        """Repeat `count` samples, at most all that wait.
+
+        The part may be shorter or longer by half, so that it ends where a snapshot is due. The snapshot is taken after
+        the next new sample, which has more time.
+        """
+        done = 0
+        while done < count:
+            end = second.history.until_snapshot(self._stamps)
+            if done + end > 1.5 * count:
+                if done >= 0.5 * count:
+                    return
+                end = count - done
             if self._changed_ns is not None:
                 unchanged = int(self._stamps.searchsorted(self._changed_ns))
                 if not unchanged:
                     second.outputs.begin_correction()
                     self._changed_ns = None
-            # a part ends where a snapshot is due, so that a later insertion repeats as few samples as expected
-            part = slice(min(count, unchanged or count, second.history.until_snapshot(self._stamps)))
-            stamps, wrench = self._stamps[part].copy(), self._wrench[part].copy()
-            second.advance(stamps, wrench, np.zeros(len(stamps), ROW))
-            self._stamps, self._wrench = self._stamps[len(stamps) :], self._wrench[len(stamps) :]
-            count -= len(stamps)
+                end = min(end, unchanged or end)
+            stamps, wrench = self._stamps[:end].copy(), self._wrench[:end].copy()
+            second.advance(stamps, wrench, np.zeros(end, ROW))
+            self._stamps, self._wrench = self._stamps[end:], self._wrench[end:]
+            done += end
