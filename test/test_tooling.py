@@ -113,7 +113,7 @@ def test_it():
 
 def test_the_processes_of_a_suite_compile_a_kernel_once(tmp_path: Path) -> None:
     (folder := tmp_path / "test").mkdir()
-    for name in ("conftest.py", "compiles.py", "shared_work.py", "first.txt"):
+    for name in ("conftest.py", "compiles.py", "ros_domain.py", "shared_work.py", "first.txt"):
         shutil.copy(ROOT / "test" / name, folder)
     (folder / "doubling.py").write_text(DOUBLE)
     for name in ("test_one.py", "test_other.py"):
