@@ -9,6 +9,7 @@ from typing import Any
 
 import estimate_pages
 import follow
+import follow_machines
 import lives
 import measured_pages
 import month
@@ -171,6 +172,10 @@ def follow_sum() -> str:
     return table(head, rows)
 
 
+def follow_machines_table() -> str:
+    return follow_machines.as_markdown(load_rows(RESULTS / "follow_machines.jsonl"))
+
+
 def follow_latency() -> str:
     """Return the CPU times of live samples with an event, without following and with it."""
     with (RESULTS / "follow_latency.csv").open(newline="", encoding="utf-8") as file:
@@ -214,6 +219,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "machine": machine, "speed": speed, "located": located, "work": work, "missed": missed,
     "random_scenes": random_scenes, "siconos": siconos, "lives": life_table, "lives_sum": life_sum,
     "month": month_table, "follow": follow_table, "follow_sum": follow_sum, "follow_latency": follow_latency,
+    "follow_machines": follow_machines_table,
     **estimate_pages.FIGURES, **measured_pages.FIGURES,
     "measured_sum": measured_sum, "replay": replay, "tuning": tuning_sensitivity.table,
     **{

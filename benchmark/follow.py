@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -26,11 +27,12 @@ from estimate import completed
 from estimate_truths import PERIOD, Group, Truth, draw
 from numpy.typing import NDArray
 
-from plow_twin import Scene, simulate
+from plow_twin import Scene, Table, simulate
 from plow_twin.errors import SolverError
 from plow_twin.estimate.estimate import warm_up
-from plow_twin.estimate.follow import MEMBERS
+from plow_twin.estimate.follow import MEMBERS, Follower
 from plow_twin.estimate.followed import Stretch, follow
+from plow_twin.stream.outputs import clearances
 
 Array = NDArray[np.float64]
 RESULTS = Path(__file__).resolve().parent / "results" / "follow.jsonl"
@@ -49,19 +51,22 @@ FIRST_PERIOD, LEAST_SHARE = 4, 0.01
 _FINE = 1e-4
 
 
-def run_one(name: str, seed: int, members: int) -> dict[str, Any]:
+def run_one(name: str, seed: int, members: int, groups: Mapping[str, Group] = GROUPS) -> dict[str, Any]:
     try:
-        truth = draw(GROUPS[name], seed)
+        truth = draw(groups[name], seed)
     except SolverError as error:  # the head has passed through a wall, which is impossible in a real machine
         return {"group": name, "seed": seed, "not_drawn": str(error)}
-    true, nominal = (Motion(scene, truth) for scene in (truth.scene, truth.nominal))
+    load = Table("measured", truth.load.t, truth.load.wrench)
+    true, nominal = (Motion(scene, truth) for scene in (truth.scene, replace(truth.nominal, loads=(load,))))
+    warm_up(truth.nominal)
+    Follower(truth.nominal, members).warm_up()
     begin = time.process_time()
     stretch = follow(truth.nominal, truth.load, truth.poses, members, span=PERIOD)
     cpu_s = time.process_time() - begin
     return {
         "group": name, "seed": seed, "stiffness": truth.scene.contact.stiffness,
         "estimates": len(stretch.taken_over), "cores": cpu_s / float(truth.load.t[-1]),
-        **_forces(stretch, true, nominal), **_spans(stretch, true, nominal), **_clearance(stretch, truth),
+        **_forces(stretch, true, nominal), **_spans(stretch, true, nominal), **_clearance(stretch, true),
     }  # fmt: skip
 
 
@@ -71,11 +76,23 @@ class Motion:
     def __init__(self, scene: Scene, truth: Truth) -> None:
         end = float(truth.load.t[-1])
         run = simulate(scene, end, _FINE, 1e-6)
-        self.force = run.force[:: round(float(truth.load.t[1]) / _FINE)]
+        every = round(float(truth.load.t[1]) / _FINE)
+        self.force = run.force[::every]
+        #: clearances [m] at the samples of the load, shape (n, 2)
+        self.clearance = clearances(scene, _worn(scene, run.force)[::every])[..., :2]
         edges = np.searchsorted(run.t, PERIOD * np.arange(int(end / PERIOD) + 1))
         pieces = [run.force[first:last] for first, last in pairwise(edges.tolist())]
         self.peak = np.stack([piece.max(axis=0) for piece in pieces])
         self.impulse = np.stack([piece.sum(axis=0) * _FINE for piece in pieces])
+
+
+def _worn(scene: Scene, force: Array) -> Array:
+    """Return the wear depths [m] of the pads that the forces at intervals of `_FINE` cause, shape (n, 8)."""
+    wear = scene.wear
+    if wear is None:
+        return np.zeros_like(force)
+    speed = wear.coefficient_m2_n * wear.travel_speed_m_s / wear.pad_area_m2
+    return np.asarray(wear.initial_depth_m) + speed * _FINE * np.cumsum(force, axis=0)
 
 
 def _forces(stretch: Stretch, true: Motion, nominal: Motion) -> dict[str, float]:
@@ -114,17 +131,19 @@ def _spans(stretch: Stretch, true: Motion, nominal: Motion) -> dict[str, float]:
     return out
 
 
-def _clearance(stretch: Stretch, truth: Truth) -> dict[str, float]:
+def _clearance(stretch: Stretch, true: Motion) -> dict[str, float]:
     rows, out = stretch.rows, {}
+    count = min(len(rows.t), len(true.clearance))
     first = next((takeover.t for takeover in stretch.taken_over if takeover.taken), float(rows.t[-1]))
     for axis, name in enumerate(("horizontal", "vertical")):
-        value, low, high = rows.clearance[:, axis].T
-        before = rows.t < first
-        out[f"{name}_coverage"] = float(((low <= truth.clearance[axis]) & (truth.clearance[axis] <= high)).mean())
-        out[f"{name}_before"] = float((low <= truth.clearance[axis])[before].mean()) if before.any() else float("nan")
+        value, low, high = rows.clearance[:count, axis].T
+        own = true.clearance[:count, axis]
+        before = rows.t[:count] < first
+        out[f"{name}_coverage"] = float(((low <= own) & (own <= high)).mean())
+        out[f"{name}_before"] = float((low <= own)[before].mean()) if before.any() else float("nan")
         out[f"{name}_width_before_mm"] = 1e3 * float((high - low)[before][-1]) if before.any() else float("nan")
         out[f"{name}_width_mm"] = 1e3 * float((high - low)[-1])
-        out[f"{name}_error_mm"] = 1e3 * float((value - truth.clearance[axis])[-1])
+        out[f"{name}_error_mm"] = 1e3 * float((value - own)[-1])
     return out
 
 
