@@ -160,8 +160,12 @@ def test_every_test_named_beside_a_promise_exists() -> None:
     assert len(named) > 60
     sources = {file: (ROOT / "test" / file).read_text() for file, _ in named}
     assert [(file, test) for file, test in named if f"def {test}(" not in sources[file]] == []
-    rows = [row for row in text.splitlines() if row.startswith("- ")]
-    assert all("::test_" in row or "benchmark/" in row for row in rows)
+    promises, _, notes = text.partition("## Tests of the promises")
+    referred = re.findall(r"^- [^[]+\[\^(\d+)\]$", promises, re.MULTILINE)
+    assert len(referred) == len(re.findall("^- ", promises, re.MULTILINE))
+    tests = dict(re.findall(r"^\[\^(\d+)\]: (.*)$", notes, re.MULTILINE))
+    assert sorted(referred) == sorted(tests)
+    assert all("::test_" in named or "benchmark/" in named for named in tests.values())
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/interface.md"])
