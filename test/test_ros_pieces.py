@@ -7,6 +7,8 @@ import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +18,12 @@ from nav_msgs.msg import Odometry
 from ros_processes import ROOT, bench
 from visualization_msgs.msg import Marker, MarkerArray
 
+from plow_twin.dashboard.feed import Feed
+from plow_twin.dashboard.node import NodeWatch
 from plow_twin.live.diagnostics import KEYS
 from plow_twin.live.service_names import SERVICES
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.ros.start import ros
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.topics import TOPICS
@@ -29,10 +34,14 @@ RELIABLE_INPUT = {"qos_overrides.{ns}/excitation.subscription.reliability": "rel
 
 
 def _rights(enclave: str, kind: str, right: str, namespace: str) -> set[str]:
-    """Return the full names that the policy allows an enclave to use; `~` is replaced by the name of the twin."""
+    """Return the full names that the policy allows an enclave to use; `~` is replaced by the name of its node."""
     root = ElementTree.parse(CONFIG / "sros2" / "policy.xml").getroot()
-    elements = root.findall(f".//enclave[@path='{enclave}']//{kind}s[@{right}='ALLOW']/{kind}")
-    names = [(item.text or "").replace("~", "/plow_twin") for item in elements]
+    profiles = root.findall(f".//enclave[@path='{enclave}']//profile")
+    names = [
+        (item.text or "").replace("~", f"/{profile.get('node')}")
+        for profile in profiles
+        for item in profile.findall(f"{kind}s[@{right}='ALLOW']/{kind}")
+    ]
     apart = {"/rosout", "/parameter_events", "/diagnostics", "/tf"}
     return {name if name in apart else f"{namespace}/{name.removeprefix('/')}" for name in names}
 
@@ -57,6 +66,31 @@ def test_the_policy_allows_exactly_the_names_of_the_node(tmp_path: Path) -> None
     # the sender of the load may publish only the inputs, and may call no service
     assert not _rights("/plow_twin/plant", "service", "request", ns)
     assert _rights("/plow_twin/plant", "topic", "publish", ns) - {"/rosout"} == subscribed - {"/parameter_events"}
+
+
+def test_the_policy_contains_only_enclaves_beside_each_other() -> None:
+    """sros2 reads each child of `enclaves` as an enclave, and a comment ends the generation of keys with an error."""
+    parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
+    (enclaves,) = ElementTree.parse(CONFIG / "sros2" / "policy.xml", parser).getroot()
+    assert len(enclaves) > 5 and {child.tag for child in enclaves} == {"enclave"}
+
+
+def test_the_policy_allows_exactly_the_names_of_the_screen(tmp_path: Path) -> None:
+    with bench(tmp_path, lifecycle="active") as running, ros():
+        name, node, ns = ("plow_twin_screen", running.namespace), running.probe.node, running.namespace
+        with closing(NodeWatch(ns, "plow_twin", 30.0, lambda: False)) as watch:
+            watch.facts(None)
+            watch.listen(Feed(None, {}))  # type: ignore[arg-type]  # no message is passed on
+            running.probe.until(lambda: name in node.get_node_names_and_namespaces(), "the screen")
+            running.probe.pause(1.0)
+            sent = {topic for topic, _ in node.get_publisher_names_and_types_by_node(*name)}
+            subscribed = {topic for topic, _ in node.get_subscriber_names_and_types_by_node(*name)}
+            asked = {service for service, _ in node.get_client_names_and_types_by_node(*name)}
+            answered = {service for service, _ in node.get_service_names_and_types_by_node(*name)}
+    rights = partial(_rights, "/plow_twin/screen", namespace=ns)
+    assert rights("topic", "publish") == sent and rights("topic", "subscribe") == subscribed
+    assert rights("service", "request") == asked and rights("service", "reply") == answered
+    assert asked <= _rights("/plow_twin/manager", "service", "request", ns)
 
 
 def test_markers_show_the_head_where_it_is_and_the_forces_on_it(tmp_path: Path) -> None:
