@@ -10,16 +10,15 @@ program may be in another Python environment (`view:=/opt/viewer/bin/plow-twin`)
 import shutil
 
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
-from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchContext, LaunchDescription
 
 ARGUMENTS = {
     "namespace": ("", "namespace of the node and its topics"),
-    "params_file": (PathJoinSubstitution([FindPackageShare("plow_twin"), "config", "twin.yaml"]), "parameter file"),
+    "params_file": ("", "parameter file; empty: the defaults of the node"),
     "scene": ("", "scene file or preset; empty: as in params_file"),
     "record_path": ("", "folder to make for the recording; empty: as in params_file"),
     "use_sim_time": ("", "take the time from /clock; empty: as in params_file"),
@@ -59,7 +58,7 @@ def twin(given: dict[str, str]) -> Node:
         executable="twin",
         name="plow_twin",
         namespace=given["namespace"],
-        parameters=[given["params_file"], overrides],
+        parameters=[*filter(None, [given["params_file"]]), overrides],
         # the node may take up to 5 s to close its recording
         sigterm_timeout="6",
         sigkill_timeout="6",

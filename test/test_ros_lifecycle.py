@@ -226,6 +226,7 @@ def test_a_parameter_file_may_have_integers_for_doubles_and_a_misspelt_name_is_r
         assert _set(running, "tolerance", 1e-8).successful and _set(running, "scene", "paper").successful
         assert not _set(running, "tolerance", 1e-7).successful
         assert "unknown parameter hold_polcy: 'zero' is not used; did you mean hold_policy?" in running.twin.output()
+        assert "no parameter scene: the preset paper is used, which is not your machine" in running.twin.output()
 
 
 @pytest.fixture(scope="module")

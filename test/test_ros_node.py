@@ -580,13 +580,14 @@ def launched(monkeypatch: pytest.MonkeyPatch, **given: str) -> dict[str, Any]:
 def test_the_launch_overrides_only_the_parameters_that_are_given(monkeypatch: pytest.MonkeyPatch) -> None:
     file, overrides = launched(monkeypatch, params_file="mine.yaml")["parameters"]
     assert (file, overrides) == ("mine.yaml", {})
-    _, overrides = launched(monkeypatch, scene="paper", autostart="false")["parameters"]
+    # without a file, the node has its defaults, and warns that the scene is a preset if no scene is given
+    (overrides,) = launched(monkeypatch, scene="paper", autostart="false")["parameters"]
     assert overrides == {"scene": ("paper", str), "autostart": ("false", bool)}
 
 
 def test_the_launch_shows_only_a_recording_that_it_names(monkeypatch: pytest.MonkeyPatch) -> None:
     assert launched(monkeypatch, view="false")["parameters"]
-    assert launched(monkeypatch, view="true", record_path="runs/monday")["parameters"][1]
+    assert launched(monkeypatch, view="true", record_path="runs/monday")["parameters"][-1]
     with pytest.raises(ValueError, match="view: got true without record_path"):
         launched(monkeypatch, view="true")
 
@@ -668,6 +669,7 @@ def test_silence_is_held_and_reported(tmp_path: Path) -> None:
             "pads": "prior",
         }
         assert [item.key for item in probe.status[-1].values] == list(STATUS_KEYS)
+        assert value(probe.status[-1], "scene") == "paper"
 
 
 def test_under_sim_time_the_model_does_not_advance_in_a_silence(tmp_path: Path) -> None:

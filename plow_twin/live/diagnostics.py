@@ -130,6 +130,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
 #: Keys of `status`, with their descriptions.
 STATUS_KEYS: Final[dict[str, str]] = {
     "lifecycle": "unconfigured, inactive, active or finalized",
+    "scene": "scene in use",
     "stream": "waiting, running, stale, ended or failed",
     "stale_inputs": "silent inputs, separated by commas",
     "clock": "running; under use_sim_time, the clock can also be waiting (for the first message) or paused",
@@ -195,6 +196,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
             values,
         )
     state = runtime.driver.state
+    values["scene"] = runtime.settings.scene
     values["stream"] = state.name.lower()
     stale = ["excitation"] if state in (StreamState.STALE, StreamState.ENDED) else []
     stale += runtime.inputs.silent()

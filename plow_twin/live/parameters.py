@@ -161,7 +161,7 @@ class Settings:
     record_part_s: float = _number(0.0, "s", 0.0, 1e9,
         "time after which a new file of the recording begins; with 0, no limit")
     record_keep_mb: float = _number(0.0, "MB", 0.0, 1e9,
-        "total size of completed files of the present run above which the oldest of them are removed; with 0, no file is "
+        "total size of completed files of the present run above which its oldest files are removed; with 0, no file is "
         "removed")
     record_ring: float = _number(0.0, "s", 0.0, 3600.0,
         "duration of a recording in memory, which is written to a folder at each alarm or mark; with 0, the whole run "

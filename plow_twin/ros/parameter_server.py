@@ -74,6 +74,10 @@ class ParameterServer:
             hint = f"; did you mean {nearest}?" if nearest else ""
             node.get_logger().warning(f"unknown parameter {name}: {values[name]!r} is not used{hint}")
         self.settings: Settings = parameters.settings(values)
+        if "scene" not in values:
+            node.get_logger().warning(
+                f"no parameter scene: the preset {self.settings.scene} is used, which is not your machine"
+            )
         for name, spec in SPECS.items():
             if node.has_parameter(name):
                 node.undeclare_parameter(name)
