@@ -26,7 +26,11 @@ RESULTS = ROOT / "benchmark" / "results"
 #: File with the name of the machine of the newest complete run, which the pages quote.
 NEWEST = RESULTS / "newest.txt"
 #: Processors by the beginning of a machine's name, which contains vendor, brand, family and model.
-_PROCESSORS = {"amd_epyc_f26m": "an AMD EPYC (Zen 5)", "intel_r_xeon_r_processor_f6m207": "an Intel Xeon with AVX-512"}
+_PROCESSORS = {
+    "amd_epyc_f26m": "an AMD EPYC (Zen 5)",
+    "intel_r_xeon_r_processor_f6m167": "an Intel Xeon (family 6, model 167)",
+    "intel_r_xeon_r_processor_f6m207": "an Intel Xeon with AVX-512",
+}
 _PEERS = (
     "CVODE from C", "CVODE from C, rootfinding", "heyoka", "best of SciPy and scikit-sundae", "lean jitted RK4",
 )  # fmt: skip
@@ -34,25 +38,39 @@ _PEERS = (
 
 def solver_rows() -> list[Row]:
     """Return the rows of the newest complete run of `make bench`."""
-    return read_rows(RESULTS / f"{NEWEST.read_text(encoding='utf-8').strip()}.csv")
+    return read_rows(RESULTS / f"{_machine_name()}.csv")
+
+
+def _machine_name() -> str:
+    """Return the name of the machine of the newest complete run."""
+    return NEWEST.read_text(encoding="utf-8").strip()
+
+
+def _processor() -> str:
+    name = _machine_name()
+    return next((text for prefix, text in _PROCESSORS.items() if name.startswith(prefix)), f"the machine `{name}`")
 
 
 def machine() -> str:
     """Return a sentence with the processor of the newest complete run, and the file with its tables."""
-    name = NEWEST.read_text(encoding="utf-8").strip()
-    processor = next((text for prefix, text in _PROCESSORS.items() if name.startswith(prefix)), f"the machine `{name}`")
-    return f"The figures before it were measured on {processor}. `benchmark/results/{name}.md` contains all tables."
+    return (
+        f"The figures before it were measured on {_processor()}. "
+        f"`benchmark/results/{_machine_name()}.md` contains all tables."
+    )
 
 
 def speed() -> str:
-    """Return a table of run times for 20 s of impacts at three errors. Times of peers are multiples of our times."""
+    """Return a table of run times for 20 s of impacts at three errors, and the processor.
+
+    Times of peers are multiples of our times.
+    """
     rows = solver_rows()
     lines = []
     for level in (1e-3, 1e-6, 1e-9):
         own = _own_ms(rows, "kv", 0.1, level, OURS_BARE)
         peers = [_times(rows, "kv", 0.1, level, peer, own) for peer in _PEERS]
         lines.append([f"{level:g}", f"{own:.2f} ms", *peers])
-    return table(["error / clearance [1]", "plow_twin", *_PEERS], lines)
+    return f"{table(['error / clearance [1]', 'plow_twin', *_PEERS], lines)}\n\nMeasured on {_processor()}."
 
 
 def located() -> str:
