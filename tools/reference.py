@@ -1,4 +1,4 @@
-"""Tables of the reference pages, made from the code: topics and priors."""
+"""Tables of the reference pages, made from the code: topics, priors and contact laws."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import textwrap
 from collections.abc import Callable
 
 from plow_twin.estimate.priors import DEFAULTS
+from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.scene import Mark
 from plow_twin.stream.topics import JOINT_STATE, TOPICS
 
@@ -30,4 +31,13 @@ def priors() -> str:
     return "\n".join(lines)
 
 
-TABLES: dict[str, Callable[[], str]] = {"topics": topics, "priors": priors}
+def contact_laws() -> str:
+    """Return the contact laws of the package with name, equation and source."""
+    lines = ["| law | name | equation | source |", "|---|---|---|---|"]
+    for name, law in LAWS.items():
+        equation, _, publication = law.source.partition("; ")
+        lines.append(f"| `{name}` | {law.title} | {equation} | {publication} |")
+    return "\n".join(lines)
+
+
+TABLES: dict[str, Callable[[], str]] = {"topics": topics, "priors": priors, "contact_laws": contact_laws}

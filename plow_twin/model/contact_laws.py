@@ -63,7 +63,7 @@ class ContactLaw:
     title : str
         Usual name of the law.
     source : str
-        Equation of the law, and its publication.
+        Equation of the law, and its publication after a semicolon.
     number_of : callable, optional
         Function of the restitution e that returns the damping number D = lambda v0 [1]. Without it, a scene cannot
         give a restitution for this law.
@@ -133,7 +133,10 @@ class ContactLaw:
 
 _LAWS: Final[dict[str, ContactLaw]] = {
     "exact_restitution": ContactLaw(
-        "exact restitution", "D (1 + e) = ln((1 + D) / (1 - D e))", exact_damping_number, takes_damping=False
+        "exact restitution",
+        "D (1 + e) = ln((1 + D) / (1 - D e)); first integral of a free impact, cf. J. Appl. Mech. 42 (1975) 440",
+        exact_damping_number,
+        takes_damping=False,
     ),
     "kelvin_voigt": ContactLaw(
         "Kelvin-Voigt", "F = max(0, K d + C d'); Goldsmith, Impact, 1960", exponent=1.0, additive=True
