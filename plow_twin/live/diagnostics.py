@@ -347,8 +347,8 @@ class Health:
         values = {
             "published": str(runtime.publishing.published),
             "withheld": str(runtime.publishing.withheld),
-            "held": str(runtime.publishing.held_frames),
-            "corrected": str(runtime.publishing.corrected_frames),
+            "held": str(runtime.publishing.held_publications),
+            "corrected": str(runtime.publishing.corrected_publications),
             "latency_p50_ms": _ms(latency.quantile(0.5)),
             "latency_p99_ms": _ms(latency.quantile(0.99)),
             "latency_max_ms": _ms(latency.largest_s) if latency.count else "",

@@ -159,7 +159,7 @@ class Inputs:
         # a component that was not measured is replaced by its last value, so that the limits can be checked
         judged = pose if all(missing) else _filled(pose, self._newest_pose)
         verdict = self._judged("head_pose", self.head_pose, stamp_ns, (*judged, *deviation), self._poses)
-        if verdict.used and verdict is not Verdict.WORKED_IN:
+        if verdict.used and verdict is not Verdict.INSERTED:
             self._newest_pose = judged
             if not any(missing):
                 self.measured = pose
@@ -174,7 +174,7 @@ class Inputs:
             self.gaps.refuse(Verdict.IMPLAUSIBLE, stamp_ns, values)
             return False
         verdict = self._judged("gaps", self.gaps, stamp_ns, values, self._gap_stamps)
-        if verdict.used and verdict is not Verdict.WORKED_IN:
+        if verdict.used and verdict is not Verdict.INSERTED:
             self._newest_gaps |= {pair: (stamp_ns, gap) for pair, gap in gaps.items()}
         return verdict.used
 

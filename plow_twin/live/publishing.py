@@ -89,7 +89,7 @@ class Publishing:
         #: number of publications that were sent, and number of publications that contain NaN or infinity
         self.published = self.withheld = 0
         #: number of publications at times without a sample, and number of publications that a late sample corrected
-        self.held_frames = self.corrected_frames = 0
+        self.held_publications = self.corrected_publications = 0
         #: monotonic time at which the samples of the next publication were received [ns]; 0 without samples
         self.received_ns = 0
         #: while a series is processed, the stamp of the sample that changed the alarms [ns]
@@ -131,8 +131,8 @@ class Publishing:
         self.newest, (stamp_ns, marked, held, *_) = rows, summary(rows, 0)
         self.published += 1
         if marked:
-            self.held_frames += held
-            self.corrected_frames += int(rows["corrected"][0])
+            self.held_publications += held
+            self.corrected_publications += int(rows["corrected"][0])
         changed = list(self.alarms.feed(published))
         if self.received_ns and not self._front.follows_samples:
             self.age.add((time.time_ns() - stamp_ns) * 1e-9)

@@ -48,7 +48,7 @@ class Verdict(Enum):
     #: newer than the newest sample, but older than all stored states of a model that has moved ahead of the stamps
     LATE = "late"
     #: older than the time reached by the model, and inserted into the motion at its stamp
-    WORKED_IN = "worked_in"
+    INSERTED = "inserted"
     #: a value or its rate of change exceeds the `Limits`
     IMPLAUSIBLE = "implausible"
     #: the stamps have jumped too often, so a further jump does not reset the model
@@ -70,7 +70,7 @@ class Verdict(Enum):
     def __init__(self, name: str) -> None:
         #: whether the model must be reset before it uses the sample
         self.resets = name in ("jump_back", "jump_forward")
-        self.used = self.resets or name in ("accepted", "worked_in")
+        self.used = self.resets or name in ("accepted", "inserted")
 
 
 class Intake:
@@ -243,7 +243,7 @@ class Intake:
         if newest_ns - stamp_ns > self.jump_back_s * NS_PER_S:
             return Verdict.JUMP_BACK
         if history is not None and history.oldest_ns is not None and stamp_ns > history.oldest_ns:
-            return Verdict.DUPLICATE if stamp_ns in history else Verdict.WORKED_IN
+            return Verdict.DUPLICATE if stamp_ns in history else Verdict.INSERTED
         return Verdict.LATE if self._newest_ns is None or stamp_ns > newest_ns else Verdict.OUT_OF_ORDER
 
     def _goes_on_from_before(self, stamp_ns: int) -> bool:
