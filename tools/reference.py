@@ -32,12 +32,8 @@ def priors() -> str:
 
 
 def contact_laws() -> str:
-    """Return the contact laws of the package with name, equation and source."""
-    lines = ["| law | name | equation | source |", "|---|---|---|---|"]
-    for name, law in LAWS.items():
-        equation, _, publication = law.source.partition("; ")
-        lines.append(f"| `{name}` | {law.title} | {equation} | {publication} |")
-    return "\n".join(lines)
+    """Return the contact laws of the package with equation and source."""
+    return "\n".join(f"- `{name}`: {law.source}" for name, law in LAWS.items())
 
 
 TABLES: dict[str, Callable[[], str]] = {"topics": topics, "priors": priors, "contact_laws": contact_laws}

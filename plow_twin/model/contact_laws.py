@@ -63,7 +63,7 @@ class ContactLaw:
     title : str
         Usual name of the law.
     source : str
-        Equation of the law, and its publication after a semicolon.
+        Equation of the law, and its publication.
     number_of : callable, optional
         Function of the restitution e that returns the damping number D = lambda v0 [1]. Without it, a scene cannot
         give a restitution for this law.
