@@ -79,7 +79,8 @@ def kernel(
     entry : bool
         Whether the function can be called from Python, which adds a tenth to the compile time.
     """
-    options: dict[str, Any] = {"fastmath": set(FASTMATH)} if fast else {}
+    # without the option, numba would use the option of the caller for which the function is compiled first
+    options: dict[str, Any] = {"fastmath": set(FASTMATH) if fast else False}
     if inline == "source":
         options["inline"] = "always"
     else:

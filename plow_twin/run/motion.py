@@ -60,12 +60,12 @@ class Motion:
     def start(compiled: CompiledScene, q: Array, v: Array, outputs: bool = False) -> Motion:
         """Return a motion at the initial state with the output rows q and v, shape (n, 3) each.
 
-        `outputs` adds rows for the pairs and for a frame on springs.
+        `outputs` adds uninitialised rows for the pairs and for a frame on springs.
         """
-        eight = (len(q), PAIR_COUNT)
-        penetration, force = (np.zeros(eight), np.zeros(eight)) if outputs else (None, None)
-        frame = np.zeros((len(q), 6)) if outputs and compiled.scene.support is not None else None
-        state, totals, log = compiled.initial_state(), new_record(TOTALS), np.zeros(_FIRST_LOG, EVENT)
+        # malloc keeps freed memory for the next run as long as one block is more than half of it
+        penetration, force = np.empty((2, len(q), PAIR_COUNT)) if outputs else (None, None)
+        frame = np.empty((len(q), 6)) if outputs and compiled.scene.support is not None else None
+        state, totals, log = compiled.initial_state(), new_record(TOTALS), np.empty(_FIRST_LOG, EVENT)
         return Motion(state, totals, log, q, v, penetration, force, frame)
 
 
@@ -139,4 +139,4 @@ def run_fixed(
 
 
 def _grown(log: Log) -> Log:
-    return np.concatenate([log, np.zeros_like(log)])
+    return np.concatenate([log, np.empty_like(log)])

@@ -288,7 +288,7 @@ def _make_ready(compiled: CompiledScene, energy_balance: bool, method: Method, d
 
 
 def _start(compiled: CompiledScene, rows: int, energy_balance: bool) -> Motion:
-    motion = Motion.start(compiled, np.zeros((rows, 3)), np.zeros((rows, 3)), outputs=True)
+    motion = Motion.start(compiled, np.empty((rows, 3)), np.empty((rows, 3)), outputs=True)
     motion.sums = new_balance() if energy_balance else None
     return motion
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from plow_twin.kernel.compiler import kernel
-from plow_twin.kernel.simd import row, set_row
+from plow_twin.kernel.simd import below, choose, equal, exact_row, exact_splat, row, set_row, splat, square_root
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import pair_force
 from plow_twin.solve.kinematics import row_values, spin_of_axes
@@ -79,8 +79,26 @@ def pair_outputs(p, state, wear_depth, y, penetration, rate, force) -> None:
     )
     spin = spin_of_axes(p, om)
     set_row(rate, 0, row_values(p.penetration_rows, -om * s, om * c, y[VX] + spin * y[Y], y[VY] - spin * y[X]))
-    for pair in range(PAIR_COUNT):
-        force[pair] = 0.0
-        if state.mode[pair] == ON:
-            d, r = penetration[pair], rate[pair]
-            force[pair] = pair_force(p, state, pair, d, r)
+    acting = equal(state.mode, 0, ON)
+    if acting == 0:
+        set_row(force, 0, splat(0.0))
+    elif p.ramp == 0.0 and (p.exponent == 1.0 or p.exponent == 1.5):
+        set_row(force, 0, _forces(p, state, acting, exact_row(penetration, 0), exact_row(rate, 0)))
+    else:
+        for pair in range(PAIR_COUNT):
+            force[pair] = pair_force(p, state, pair, penetration[pair], rate[pair]) if acting >> pair & 1 else 0.0
+
+
+@kernel()
+def _forces(p, state, acting, penetration, rate):
+    """Return the forces of all pairs whose bit in `acting` is set, for the exponents 1 and 1.5 without a ramp.
+
+    They are the values of `pair_force`, whose general power would take most of the time of an output row.
+    """
+    zero = exact_splat(0.0)
+    acting &= below(zero, penetration)
+    elastic = penetration
+    if p.exponent == 1.5:
+        elastic = penetration * square_root(choose(acting, penetration, zero))
+    force = (elastic * p.stiffness) * (exact_row(state.damping_factor, 0) * rate + 1.0) + rate * p.viscous
+    return choose(acting & below(zero, force), force, zero)
