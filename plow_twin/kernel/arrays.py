@@ -6,16 +6,17 @@ compiles a twin, because it formats an error message.
 
 from __future__ import annotations
 
+import ctypes
 import math
 import operator
 from collections.abc import Callable
 from typing import Any, Final, cast
 
 from llvmlite import ir
-from numba.core import cgutils, types
+from numba.core import boxing, cgutils, pythonapi, types
 from numba.core.typing.arraydecl import GetItemBuffer, SetItemBuffer
 from numba.core.typing.templates import infer_global
-from numba.extending import intrinsic
+from numba.extending import NativeValue, intrinsic
 
 from plow_twin.kernel.compiler import kernel
 
@@ -86,6 +87,23 @@ def _copy_part(typingctx: Any, target: Any, source: Any, first: Any, last: Any) 
 
 
 copy_part = cast("Callable[[Any, Any, int, int], None]", intrinsic(_copy_part))
+
+
+def _unbox_record(kind: Any, record: Any, c: Any) -> Any:
+    """Return a record argument from Python as a pointer to its data, the first field of numpy's `PyVoidScalarObject`.
+
+    Numba requests the data as a buffer, for which numpy describes all fields as text.
+    """
+    fields = c.builder.bitcast(record, cgutils.voidptr_t.as_pointer())
+    data = c.builder.load(c.builder.gep(fields, [c.context.get_constant(types.intp, _WORDS_OF_HEAD)]))
+    return NativeValue(c.builder.bitcast(data, c.context.get_value_type(kind)))
+
+
+#: Size of Python's head of an object of variable size, in pointers.
+_WORDS_OF_HEAD: Final = tuple.__basicsize__ // ctypes.sizeof(ctypes.c_void_p)
+# numba's own registration, which has to come first, cannot be replaced by `unbox`
+assert boxing.unbox_record is not _unbox_record
+pythonapi._unboxers.functions[types.Record] = _unbox_record
 
 
 @kernel()

@@ -191,7 +191,18 @@ def lane(typingctx: Any, value: Any, index: Any) -> Any:
         position = context.cast(builder, arguments[1], signature.args[1], types.int32)
         return builder.extract_element(arguments[0], position)
 
-    return types.float64(lanes, index), codegen
+    return types.float64(value, index), codegen
+
+
+@_operation
+def with_lane(typingctx: Any, value: Any, index: Any, number: Any) -> Any:
+    """Return a vector with a number in lane `index`, and the lanes of `value` elsewhere."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        position = context.cast(builder, arguments[1], signature.args[1], types.int32)
+        return builder.insert_element(arguments[0], arguments[2], position)
+
+    return value(value, index, types.float64), codegen
 
 
 @_operation

@@ -264,7 +264,9 @@ def output_times(t_end: float, output_dt: float | None) -> Array:
     if output_dt is None:
         output_dt = t_end / _ROWS_BY_DEFAULT
     count = int(np.floor(t_end / output_dt * (1.0 + 1e-12)))
-    times: Array = np.minimum(np.arange(count + 1) * output_dt, t_end)
+    times: Array = np.arange(count + 1.0)
+    times *= output_dt
+    times[-1] = min(times[-1], t_end)
     return times if t_end - times[-1] <= 1e-9 * output_dt else np.append(times, t_end)
 
 

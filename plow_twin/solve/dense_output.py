@@ -5,10 +5,22 @@ from __future__ import annotations
 import math
 
 from plow_twin.kernel.compiler import kernel
-from plow_twin.kernel.simd import below, choose, equal, exact_row, exact_splat, row, set_row, splat, square_root
+from plow_twin.kernel.simd import (
+    below,
+    choose,
+    equal,
+    exact_row,
+    exact_splat,
+    fused,
+    lane,
+    row,
+    set_row,
+    square_root,
+    with_lane,
+)
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import pair_force
-from plow_twin.solve.kinematics import row_values, spin_of_axes
+from plow_twin.solve.kinematics import spin_of_axes
 from plow_twin.solve.method.flight import fly
 from plow_twin.solve.modes import any_penetrates
 from plow_twin.solve.state import COS, OMEGA, ON, SIN, VX, VY, X, Y
@@ -68,37 +80,44 @@ def wear_depth_at(state, w, sigma, out) -> None:
     set_row(out, 0, wear_depth)
 
 
-@kernel(fast=True)
+@kernel()
 def pair_outputs(p, state, wear_depth, y, penetration, rate, force) -> None:
-    """Write penetration, its rate and the force of the eight pairs, shape (8,) each, at body coordinates y."""
-    c, s, om = y[COS], y[SIN], y[OMEGA]
-    set_row(
-        penetration,
-        0,
-        row_values(p.penetration_rows, c, s, y[X], y[Y]) + (row(p.penetration_rows, 4) - row(wear_depth, 0)),
-    )
-    spin = spin_of_axes(p, om)
-    set_row(rate, 0, row_values(p.penetration_rows, -om * s, om * c, y[VX] + spin * y[Y], y[VY] - spin * y[X]))
-    acting = equal(state.mode, 0, ON)
-    if acting == 0:
-        set_row(force, 0, splat(0.0))
-    elif p.ramp == 0.0 and (p.exponent == 1.0 or p.exponent == 1.5):
-        set_row(force, 0, _forces(p, state, acting, exact_row(penetration, 0), exact_row(rate, 0)))
-    else:
-        for pair in range(PAIR_COUNT):
-            force[pair] = pair_force(p, state, pair, penetration[pair], rate[pair]) if acting >> pair & 1 else 0.0
+    """Write penetration, its rate and the force of the eight pairs, shape (8,) each, at body coordinates y.
+
+    All sums are rounded as written, so that the results are the same in each kernel that calls this one.
+    """
+    c, s, om, spin = y[COS], y[SIN], y[OMEGA], spin_of_axes(p, y[OMEGA])
+    depths = _with_rows(p, c, s, exact_splat(y[X]), exact_splat(y[Y]), exact_row(p.penetration_rows, 4))
+    set_row(penetration, 0, depths - exact_row(wear_depth, 0))
+    vx = fused(exact_splat(spin), exact_splat(y[Y]), exact_splat(y[VX]))
+    vy = fused(exact_splat(-spin), exact_splat(y[X]), exact_splat(y[VY]))
+    set_row(rate, 0, _with_rows(p, -om * s, om * c, vx, vy, exact_splat(0.0)))
+    set_row(force, 0, _forces(p, state, exact_row(penetration, 0), exact_row(rate, 0)))
 
 
 @kernel()
-def _forces(p, state, acting, penetration, rate):
-    """Return the forces of all pairs whose bit in `acting` is set, for the exponents 1 and 1.5 without a ramp.
+def _with_rows(p, c, s, x, y, start):
+    """Return `start` plus the products of the first four rows of `penetration_rows` with c, s, x and y."""
+    rows = p.penetration_rows
+    turned = fused(exact_row(rows, 1), exact_splat(s), fused(exact_row(rows, 0), exact_splat(c), start))
+    return fused(exact_row(rows, 3), y, fused(exact_row(rows, 2), x, turned))
 
-    They are the values of `pair_force`, whose general power would take most of the time of an output row.
-    """
+
+@kernel()
+def _forces(p, state, penetration, rate):
+    """Return the force of each pair. A general power takes most of the time of an output row, so 1.5 is special."""
     zero = exact_splat(0.0)
-    acting &= below(zero, penetration)
-    elastic = penetration
-    if p.exponent == 1.5:
-        elastic = penetration * square_root(choose(acting, penetration, zero))
-    force = (elastic * p.stiffness) * (exact_row(state.damping_factor, 0) * rate + 1.0) + rate * p.viscous
-    return choose(acting & below(zero, force), force, zero)
+    acting = equal(state.mode, 0, ON) & below(zero, penetration)
+    if acting == 0:
+        return zero
+    if p.ramp == 0.0 and (p.exponent == 1.0 or p.exponent == 1.5):
+        elastic = penetration
+        if p.exponent == 1.5:
+            elastic = penetration * square_root(choose(acting, penetration, zero))
+        force = (elastic * p.stiffness) * (exact_row(state.damping_factor, 0) * rate + 1.0) + rate * p.viscous
+        return choose(acting & below(zero, force), force, zero)
+    force = zero
+    for pair in range(PAIR_COUNT):
+        if acting >> pair & 1:
+            force = with_lane(force, pair, pair_force(p, state, pair, lane(penetration, pair), lane(rate, pair)))
+    return force
