@@ -96,7 +96,7 @@ def _unbox_record(kind: Any, record: Any, c: Any) -> Any:
     """
     fields = c.builder.bitcast(record, cgutils.voidptr_t.as_pointer())
     data = c.builder.load(c.builder.gep(fields, [c.context.get_constant(types.intp, _WORDS_OF_HEAD)]))
-    return NativeValue(c.builder.bitcast(data, c.context.get_value_type(kind)))
+    return NativeValue(c.builder.bitcast(data, c.context.get_value_type(kind)))  # type: ignore[no-untyped-call]
 
 
 #: Size of Python's head of an object of variable size, in pointers.

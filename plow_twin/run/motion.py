@@ -85,7 +85,7 @@ def run_events(
     size = _FIRST_SLICE if compiled.parts.implicit is None else _FIRST_SLICE_IMPLICIT
     while True:
         begin = _time.perf_counter()
-        allowed = budget if look is None else min(budget, int(motion.state.steps) + size)
+        allowed = budget if look is None else min(budget, int(motion.state["steps"]) + size)
         code = loop.integrate(
             compiled.params, compiled.parts, motion.state, work, motion.totals, motion.log, t_end, allowed,
             motion.first, times, motion.q, motion.v, motion.penetration, motion.force, motion.frame, motion.sums,

@@ -340,16 +340,17 @@ def _result(
 ) -> Result:
     scene, log, state = compiled.scene, motion.log, motion.state
     assert motion.force is not None and motion.penetration is not None
-    size = int(motion.totals.logged)
+    # an attribute of a record takes some ten times as long as an item
+    size = int(motion.totals["logged"])
     setting = {"tol": tol} if method == "events" else {"dt": dt}
     solver = {
-        "method": method, **setting, "steps": int(state.steps), "evaluations": int(state.evaluations),
-        "events": int(state.events) if method != "events" else size,
+        "method": method, **setting, "steps": int(state["steps"]), "evaluations": int(state["evaluations"]),
+        "events": int(state["events"]) if method != "events" else size,
     }  # fmt: skip
     return Result(
         t=times[:rows], q=motion.q[:rows], v=motion.v[:rows], force=motion.force[:rows],
         penetration=motion.penetration[:rows], events=log[:size].copy(), statistics=statistics_of(motion.totals, time),
-        contact_sets=contact_sets_of(scene, motion.totals), solver=solver, wear_depth=motion.state.wear_depth.copy(),
+        contact_sets=contact_sets_of(scene, motion.totals), solver=solver, wear_depth=state["wear_depth"].copy(),
         wall_s=wall_s, compile_s=compile_s,
         energy_balance=energy_balance_of(compiled, motion.state, motion.sums) if motion.sums is not None else None,
         frame=None if motion.frame is None else motion.frame[:rows],
@@ -359,7 +360,6 @@ def _result(
 def statistics_of(totals: Totals, duration: float) -> dict[str, dict[str, float]]:
     """Return the statistics of each pair over a motion of a given duration in s, as in `Result.statistics`."""
     table = {}
-    # access to a field of a record is slow
     sums = [totals[name].tolist() for name in ("peak", "impulse", "time_in_contact", "makes")]
     for name, peak, impulse, contact, makes in zip(PAIR_NAMES, *sums, strict=True):
         table[name] = {
@@ -380,7 +380,7 @@ def contact_sets_of(scene: Scene, totals: Totals) -> dict[str, dict[str, float]]
     senses = {}
     # the force of a pair turns a block and a cavity in opposite senses
     order = ("ccw", "cw") if scene.head.carries == "walls" else ("cw", "ccw")
-    for sense, times in sorted(zip(order, totals.set_time, strict=True), key=lambda item: item[0]):
+    for sense, times in sorted(zip(order, totals["set_time"], strict=True), key=lambda item: item[0]):
         total = times.sum()
         shares = {
             joint.join(sorted(labels[i] for i in range(4) if mask >> i & 1)): float(times[mask] / total)
