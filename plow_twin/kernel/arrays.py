@@ -12,8 +12,9 @@ import operator
 from collections.abc import Callable
 from typing import Any, Final, cast
 
+import numba.core.boxing  # noqa: F401
 from llvmlite import ir
-from numba.core import boxing, cgutils, pythonapi, types
+from numba.core import cgutils, pythonapi, types
 from numba.core.typing.arraydecl import GetItemBuffer, SetItemBuffer
 from numba.core.typing.templates import infer_global
 from numba.extending import NativeValue, intrinsic
@@ -101,8 +102,7 @@ def _unbox_record(kind: Any, record: Any, c: Any) -> Any:
 
 #: Size of Python's head of an object of variable size, in pointers.
 _WORDS_OF_HEAD: Final = tuple.__basicsize__ // ctypes.sizeof(ctypes.c_void_p)
-# numba's own registration, which has to come first, cannot be replaced by `unbox`
-assert boxing.unbox_record is not _unbox_record
+# `unbox` would refuse to replace numba's own function, which the import of `boxing` has registered
 pythonapi._unboxers.functions[types.Record] = _unbox_record
 
 
