@@ -587,11 +587,12 @@ class Ensemble:
     def state(self) -> tuple[list[bytes], Any]:
         """Return the whole state: arrays as bytes, and the random generator as JSON values."""
         self.settle()
-        times, path = np.array([time for time, _ in self._path]), np.stack([q for _, q in self._path])
+        times, path = np.array([time for time, _ in self._path]), [q.tobytes() for _, q in self._path]
         wide = (self._peak, self._impulse, self._v, self.worn, self._depth, self._load_off)
         learned = self.learned()
-        arrays = (self.good, self.square, *wide, np.array([self._drifted]), *learned, times, path)
-        return [*self.twins(), *(array.tobytes() for array in arrays)], self._rng.bit_generator.state
+        arrays = (self.good, self.square, *wide, np.array([self._drifted]), *learned, times)
+        blobs = [*self.twins(), *(array.tobytes() for array in arrays), b"".join(path)]
+        return blobs, self._rng.bit_generator.state
 
     def set_state(self, blobs: list[bytes], random: Any) -> None:
         """Restore a state that `state` has returned."""

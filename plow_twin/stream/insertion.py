@@ -22,11 +22,11 @@ from plow_twin.stream.outputs import Array, Integers
 if TYPE_CHECKING:
     from plow_twin.stream.session import Session
 
-#: Product of twins and samples in one part of the repeated motion, and number of new samples for each part.
-#: With 128 twins, a part has ten samples and takes 1.3 ms, and a new sample takes 0.3 ms. Three new samples and a part
-#: together take less than the three milliseconds that they have at 1 kHz.
+#: Product of twins and samples in one part of the repeated motion, and number of new samples for each part. With 128
+#: twins and poses at 100 Hz, a part has ten samples and takes 2 ms, a snapshot of the second set after every two parts
+#: 0.6 ms, and a new sample 0.4 ms. Five new samples with a part thus take less than the 5 ms that they have at 1 kHz.
 MEMBER_SAMPLES: Final = 1280
-STRIDE: Final = 3
+STRIDE: Final = 5
 #: Number of new samples until the second set of twins begins to repeat the motion: it is drawn in five parts before.
 #: Samples that are late meanwhile are inserted together.
 GATHERED: Final = 6
@@ -119,7 +119,8 @@ class Insertion:
             self._begun()
         elif (self.passed - GATHERED) // STRIDE > (before - GATHERED) // STRIDE:
             # the rest is divided equally among the remaining parts
-            self._repeat(self._second, -(-(len(self._stamps) + self.left) // (self.left // STRIDE + 1)))
+            count = -(-(len(self._stamps) + self.left) // (self.left // STRIDE + 1))
+            self._repeat(self._second, min(count, len(self._stamps)))
         else:
             self._second.catch_up()
 
@@ -143,7 +144,7 @@ class Insertion:
         self._stamps, self._wrench = stamps[order], wrench[order]
 
     def _repeat(self, second: Session, count: int) -> None:
-        """Repeat `count` samples, at most all that wait.
+        """Repeat `count` samples.
 
         The part may be shorter or longer by half, so that it ends where a snapshot is due. The snapshot is taken after
         the next new sample, which has more time.
