@@ -38,6 +38,8 @@ TRUTHS: dict[str, tuple[tuple[int, int], ...]] = {
     "stuck": ((54000, 4),),
     "noisier": ((54000, 4),),
     "hard_shape": ((50000, 6),),
+    **dict.fromkeys(("mirrored_theta", "mirrored_x", "mirrored_y", "swapped"), ((710000, 4),)),
+    **dict.fromkeys(("hard_mirrored_theta", "hard_mirrored_y", "hard_swapped"), ((710000, 4),)),
     "hard_kelvin_voigt": ((50000, 23), (54000, 10), (60000, 30)),
 }
 #: First seed and number of the truths of `plain` and `sensor` that were computed by the current version of the code.

@@ -59,6 +59,8 @@ class Group:
     noisier: float = 1.0
     #: Ratio of the measured to the true value of x, y and theta.
     sensor_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    #: Whether x and y are exchanged.
+    swapped: bool = False
     #: Wear coefficient of the truth [m^2/N]. The estimate assumes no wear.
     wear_m2_n: float = 0.0
     #: Sampling rate [Hz] of the load cells at all pairs; 0 without load cells.
@@ -119,6 +121,17 @@ GROUPS = {
         sensor_scale=(1.03, 1.03, 1.0),
         sensor="suspect",
     ),
+    "mirrored_theta": Group("theta with the wrong sign", sensor_scale=(1.0, 1.0, -1.0), sensor="suspect"),
+    "mirrored_x": Group("x with the wrong sign", sensor_scale=(-1.0, 1.0, 1.0), sensor="suspect"),
+    "mirrored_y": Group("y with the wrong sign", sensor_scale=(1.0, -1.0, 1.0), sensor="suspect"),
+    "swapped": Group("x and y swapped", swapped=True, sensor="suspect"),
+    "hard_mirrored_theta": Group(
+        "hard, theta with the wrong sign", stiffness=(1e9, 1e11), sensor_scale=(1.0, 1.0, -1.0), sensor="suspect"
+    ),
+    "hard_mirrored_y": Group(
+        "hard, y with the wrong sign", stiffness=(1e9, 1e11), sensor_scale=(1.0, -1.0, 1.0), sensor="suspect"
+    ),
+    "hard_swapped": Group("hard, x and y swapped", stiffness=(1e9, 1e11), swapped=True, sensor="suspect"),
     "noisier": Group("sensor 4 times noisier from a moment on", noisier=4.0, sensor="suspect"),
 }
 
@@ -183,7 +196,7 @@ def draw(group: Group, seed: int) -> Truth:
     bias = group.bias_m * rng.standard_normal(3) * np.array([1.0, 1.0, 3.0])
     motion, clearance, force = _motion(scene, group, np.maximum(t - delay, 0.0), end)
     q = motion * group.sensor_scale + bias
-    measured = _sensor(group, rng, t, q)
+    measured = _sensor(group, rng, t, q[:, [1, 0, 2]] if group.swapped else q)
     keep = _kept(group, rng, t, measured)
     knots = np.arange(0.0, end + group.load_step, group.load_step)
     wrench = np.stack([np.interp(knots, fine, column) for column in nominal_load.T], axis=1)

@@ -19,6 +19,7 @@ from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.gaps import Gaps, GapsFit, fit_gaps
 from plow_twin.estimate.lacking import with_harmonics
 from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses, filled
+from plow_twin.estimate.orientation import misfits_of_axes
 from plow_twin.estimate.pads import shown, with_differences
 from plow_twin.estimate.relinearised import with_other_law_numbers
 from plow_twin.estimate.result import Estimate, ForcesUsed, Interval, State
@@ -27,6 +28,7 @@ from plow_twin.estimate.search import LOW_PASS, behind_low_pass, candidate, refi
 from plow_twin.estimate.similar import Units
 from plow_twin.estimate.start import noise_level
 from plow_twin.estimate.summary import (
+    contradictory,
     damping_interval,
     fails,
     if_it_differs,
@@ -209,6 +211,9 @@ def _from_motion(
             return summarise(*near, verdict, forces), _next_guess(*near)
         forward = Forward(scene, measured_load)
     bias = bias_of_hard(unknowns, poses)
+    wrong = misfits_of_axes(forward.renewed(), unknowns, poses.moved(-bias))
+    if wrong:
+        return contradictory(unknowns, poses, tuple(wrong)), ()
     result, following = _searched(forward, unknowns, poses.moved(-bias), period, drift, forces)
     if following:
         numbers = np.array(following)
@@ -236,9 +241,13 @@ def _from_some_components(unknowns: Unknowns, load: Load, poses: Poses, short_of
     """Return the estimate from poses in which one or two components were never measured."""
     period = _period(load, poses)
     measured_load, _ = thinned(load, period)
+    forward = Forward(unknowns.scene, measured_load)
+    wrong = misfits_of_axes(forward.renewed(), unknowns, poses)
+    if wrong:
+        return contradictory(unknowns, poses, (*short_of, *wrong))
     share, time = tuning.UNMEASURED_LOAD
     drift = 2.0 * time * (share * load.wrench.std(axis=0) / np.asarray(inertias(unknowns.scene))) ** 2
-    found = fit_some_components(Forward(unknowns.scene, measured_load), unknowns, poses, period, drift)
+    found = fit_some_components(forward, unknowns, poses, period, drift)
     if found is not None:
         result = summarise(*found, judge(*found, period))
         if _known(result):

@@ -481,6 +481,11 @@ def without_fit(
     return nothing.having(nothing.clearances, (withdrawn, withdrawn), model="suspect", reasons=(reason,))
 
 
+def contradictory(unknowns: Unknowns, poses: Poses, reasons: tuple[str, ...]) -> Estimate:
+    """Return the prior as an estimate that is withdrawn because the poses contradict the load."""
+    return replace(without_fit(unknowns, poses), model="ok", sensor="suspect", reasons=reasons)
+
+
 def fails(fitted: Fit, verdict: Verdict) -> bool:
     """Return whether a fit fails a check or has not reached an optimum."""
     return bool(verdict.model or verdict.sensor) or not fitted.finished

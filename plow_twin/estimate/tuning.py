@@ -335,6 +335,22 @@ CURVED = 0.1
 #: of 10.0 and 10.8 s have 0.07
 NEW_MOTION = 0.2
 
+# Signs, order and units of the poses
+#: time over which motions are averaged before they are compared with the motions that the load causes [s]
+RESEMBLES = 0.3
+#: size of a negative correlation above which a sign is wrong [1]
+#: Basis: all kinds and groups of machines, seeds 700010 to 700012 and 700020: correlations of right signs are above
+#: -0.13; above -0.25 within single load periods of `chatter`, and above 0.2 in those of seven other kinds (710100)
+OPPOSED = 0.4
+#: correlation of x and y with each other's simulated motions above which they may be swapped, and excess of the sum of
+#: both correlations over that with their own motions [1, 1]
+#: Basis: as for `OPPOSED`, and `swapped`, `plain`, `middle`, `hard` 710000 to 710003: the excess is at least 0.4 for
+#: swapped axes with soft contacts, and at most 0.0 for right axes with correlations above 0.2
+SWAPPED = (0.5, 0.2)
+#: ratio of measured to simulated scatter above which, or below whose inverse, a unit is wrong [1]
+#: Basis: as for `OPPOSED`: ratios from 0.3 to 1.7, and up to 18 for a load of averages over 1 s without a correlation
+WRONG_UNIT = 6.0
+
 # Loads that do not explain the motion
 #: length of the test functions by which the equations are multiplied [s]
 #: Basis: kinds `load_10`, `averages_1hz`
