@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from estimate_support import GROUPS, KINDS, draw, known, mismatched
 
+from plow_twin.estimate import estimate as of_window
 from plow_twin.estimate import tuning
 from plow_twin.estimate.equation_error import EquationError
-from plow_twin.estimate.estimate import estimate
+from plow_twin.estimate.estimate import estimate, under_uncertain_load
 from plow_twin.estimate.measurements import Load, Poses, filled
 from plow_twin.estimate.result import Estimate, State
 from plow_twin.estimate.screening import thinned
 from plow_twin.estimate.start import range_of_motion
-from plow_twin.estimate.uncertain_load import compare_under_uncertain_load
+from plow_twin.estimate.summary import unobserved_because, without_fit
+from plow_twin.estimate.uncertain_load import Compared, compare_under_uncertain_load
 from plow_twin.estimate.unknowns import Unknowns
 
 
@@ -98,3 +101,21 @@ def test_poses_without_any_load_give_a_rough_clearance() -> None:
         assert result.reasons[0] == "load: the same value throughout, while the head moves"
         assert result.horizontal_state is result.vertical_state is State.ROUGH and _holds(result, truth.clearance)
         assert max(result.horizontal.deviation, result.vertical.deviation) < 4e-3
+
+
+def test_a_clearance_withheld_under_an_uncertain_load_has_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reason of the fit, which another method has replaced, is not repeated."""
+    truth, _ = known()[0]
+    unknowns, period = Unknowns.stated(truth.nominal, truth.load, truth.poses), truth.load.period()
+    failed = without_fit(unknowns, truth.poses)
+    failed = replace(failed, reasons=(*failed.reasons, unobserved_because(0, "deviation of the fit")))
+    pair, compared = (math.log(5e-3), 0.1), np.array([0.025, 0.03])
+    for deviation, touched, why in (
+        (7e-3, True, "deviation of 0.0053 m under an uncertain load, expected less than 0.004 m"),
+        (1e-3, False, "a wall is hardly touched"),
+    ):
+        result = Compared(compared, np.array([deviation, 1e-3]), np.array([touched, True]), pair, (0.0, 0.1), 0.5, 0.1)
+        monkeypatch.setattr(of_window, "compare_under_uncertain_load", lambda *_, found=result: (found, 0))
+        graded = under_uncertain_load(failed, unknowns, truth.load, truth.poses, period)
+        assert graded.states == (State.NOT_OBSERVABLE, State.ROUGH)
+        assert graded.reasons == (failed.reasons[0], f"horizontal clearance not observable: {why}")

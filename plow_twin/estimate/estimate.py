@@ -37,7 +37,9 @@ from plow_twin.estimate.summary import (
     state_of,
     summarise,
     summarise_bounced,
+    unobserved_because,
     without_fit,
+    without_unobserved,
 )
 from plow_twin.estimate.uncertain_load import compare_under_uncertain_load
 from plow_twin.estimate.unknowns import BIAS, DAMPING, GX, GY, SIZE, SOFTNESS, Unknowns, with_other_law
@@ -333,7 +335,8 @@ def under_uncertain_load(
     if compared is None or compared.distance > tuning.MOST_DISTANCE or compared.ln_depth[0] < math.log(tuning.FITTED):
         return replace(result, figures=figures)
     beside = None if fitted is None else if_it_differs(*fitted)
-    values, states = [], []
+    # the reasons of the fit do not hold for the values of the comparison
+    values, states, reasons = [], [], without_unobserved(result.reasons)
     for index in (GX, GY):
         prior = float(unknowns.nominal()[index]), float(unknowns.deviations()[index])
         mean, deviation = weighted_mean((float(compared.clearance[index]), float(compared.deviation[index])), prior)
@@ -341,7 +344,11 @@ def under_uncertain_load(
             by_fit = float(beside.shared[index]), math.sqrt(beside.covariance[index, index])
             if deviations_apart((mean, deviation), by_fit) < tuning.AGREES:
                 mean, deviation = weighted_mean_of_one((mean, deviation), by_fit)
-        observed = bool(compared.touched[index]) and deviation < tuning.OBSERVED_SHARE * prior[1]
+        most, touched = tuning.OBSERVED_SHARE * prior[1], bool(compared.touched[index])
+        observed = touched and deviation < most
+        if not observed:
+            wide = f"deviation of {deviation:.2g} m under an uncertain load, expected less than {most:.2g} m"
+            reasons.append(unobserved_because(index, wide if touched else "a wall is hardly touched"))
         values.append(Interval.normal(*((mean, deviation) if observed else prior)).above(0.0))
         states.append(state_of(False, observed, rough=True))
     exponent = unknowns.scene.contact.exponent
@@ -354,6 +361,7 @@ def under_uncertain_load(
         damping=damping_interval(unknowns, Interval.normal(*compared.ln_damping)),
         correlation=None,
         groups={},
+        reasons=tuple(reasons),
         figures=figures | {"distance": compared.distance, "load_error": compared.load_error},
     )
 

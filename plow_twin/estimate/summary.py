@@ -43,6 +43,8 @@ Array = NDArray[np.float64]
 MOST_OTHER_LAW = round(float(ndtri(0.99)), 2)
 #: 95 % quantile of the absolute value of a standard normal variable, by definition.
 _HALF_NORMAL_P95 = float(ndtri(0.975))
+#: Words in each message of `unobserved_because`.
+_UNOBSERVED = "clearance not observable:"
 #: Bounds on the logarithm of a contact's penetration in m.
 _LN_PENETRATIONS = (math.log(1e-9), math.log(0.12))
 
@@ -93,7 +95,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, forces: ContactForce
                 why = f"{predictable}, expected {tuning.PREDICTED:.0%} or more"
             elif seconds[index] <= tuning.TOUCHED:
                 why = f"a wall is touched for {seconds[index]:.2g} s, expected more than {tuning.TOUCHED:g} s"
-            reasons.append(_not_observable(index, why))
+            reasons.append(unobserved_because(index, why))
         apparent.append(Interval.normal(shared[index], deviation[index]))
         value = Interval.of_halves(published[index], *spread[:, index])
         if not observed:
@@ -326,8 +328,14 @@ def _unobserved(unknowns: Unknowns, deviation: Array, index: int, reach: float, 
     return Interval.normal(nominal, spread).above(reach - 3.0 * float(np.hypot(noise[index], 1e-4)))
 
 
-def _not_observable(index: int, why: str) -> str:
-    return f"{'horizontal' if index == GX else 'vertical'} clearance not observable: {why}"
+def unobserved_because(index: int, why: str) -> str:
+    """Return the message that the motion does not determine a clearance."""
+    return f"{'horizontal' if index == GX else 'vertical'} {_UNOBSERVED} {why}"
+
+
+def without_unobserved(reasons: tuple[str, ...]) -> list[str]:
+    """Return the reasons that are not from `unobserved_because`."""
+    return [reason for reason in reasons if _UNOBSERVED not in reason]
 
 
 def state_of(withdrawn: bool, observed: bool, rough: bool = False) -> State:
@@ -382,7 +390,7 @@ def summarise_bounced(
                 why = "a wall is never touched"
             elif bounced.follows.min() <= tuning.FOLLOWS:
                 why = f"the reach follows {bounced.follows.min():.0%} of a clearance, expected {tuning.FOLLOWS:.0%}"
-            reasons.append(_not_observable(index, why))
+            reasons.append(unobserved_because(index, why))
             value = _unobserved(unknowns, np.zeros(2), index, 0.0, bounced.noise)
         clearances.append(value.above(0.0))
         states.append(state_of(bool(sensor), observed, rough))
