@@ -28,6 +28,8 @@ _MOTIONS = 16
 _POSE, _LOAD = ("x", "y", "theta"), ("fx", "fy", "m")
 #: Half width of the range of plausible clearances in prior deviations, a bound on clearances from poses in wrong units.
 _PLAUSIBLE = 2.0
+#: Smallest scatter in m or rad of a simulated motion that moves, a guard against rounding errors of a locked component.
+_STILL = 1e-9
 
 
 def misfits_of_axes(forward: Forward, unknowns: Unknowns, poses: Poses) -> list[str]:
@@ -75,9 +77,11 @@ def _resemblance(simulated: Array, measured: Array) -> _Resemblance | None:
     scatters, scatter = simulated.std(axis=1), measured.std(axis=0)
     size = scatters * scatter
     product = np.einsum("kni,ni->ki", simulated, measured) / len(measured)
-    correlation = np.divide(product, size, out=np.zeros_like(size), where=size > 0.0)
+    correlation = np.divide(product, size, out=np.zeros_like(size), where=(scatters > _STILL) & (scatter > 0.0))
     usual = np.median(scatters, axis=0)
-    return _Resemblance(correlation, np.divide(scatter, usual, out=np.ones(3), where=(scatter > 0.0) & (usual > 0.0)))
+    return _Resemblance(
+        correlation, np.divide(scatter, usual, out=np.ones(3), where=(scatter > 0.0) & (usual > _STILL))
+    )
 
 
 def _motions(forward: Forward, unknowns: Unknowns, t: Array, span: Array, width: int) -> Array:
