@@ -13,11 +13,11 @@ from plow_twin.estimate.estimate import estimate
 from plow_twin.estimate.result import Estimate
 
 sys.path.insert(0, str(ROOT / "benchmark"))
-from estimate_mismatch import KINDS
+from estimate_mismatch import KINDS, Mismatch
 from estimate_mismatch import draw as mismatched
 from estimate_truths import GROUPS, Truth, draw
 
-__all__ = ["GROUPS", "KINDS", "Truth", "draw", "known", "mismatched"]
+__all__ = ["GROUPS", "KINDS", "Mismatch", "Truth", "draw", "known", "mismatched"]
 
 
 @cache

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimate_mismatch import Mismatch
-from estimate_support import GROUPS, KINDS, Truth, draw, known, mismatched
+from estimate_support import GROUPS, KINDS, Mismatch, Truth, draw, known, mismatched
 
 from plow_twin.estimate.estimate import estimate
 from plow_twin.estimate.forward import Forward
