@@ -132,25 +132,27 @@ def expand(lanes, w, limit, waves, second, viscous, hysteretic, power, fraction,
             if power is None:
                 calm = quiet
         # the highest orders are added last, so that the sum can start before they are available
-        px = py = pvx = pvy = pc = ps = torque = other = wc = ws = zero
+        px = py = pvx = pvy = pc = ps = wc = ws = torque_c = torque_s = torque_x = torque_y = zero
         for j in range(1, k):
-            turned = exact_row(series[OMEGA], j)
-            px = fused(turned, exact_row(series[X], k - j), px)
-            py = fused(turned, exact_row(series[Y], k - j), py)
-            pvx = fused(turned, exact_row(series[VX], k - j), pvx)
-            pvy = fused(turned, exact_row(series[VY], k - j), pvy)
-        for j in range(1, k):
-            turned = exact_row(series[OMEGA], j)
-            pc = fused(turned, exact_row(series[COS], k - j), pc)
-            ps = fused(turned, exact_row(series[SIN], k - j), ps)
-            torque = fused(exact_row(series[COS], j), exact_row(moment[DC], k - j), torque)
-            other = fused(exact_row(series[SIN], j), exact_row(moment[DS], k - j), other)
-            torque = fused(exact_row(series[X], j), exact_row(moment[DX], k - j), torque)
-            other = fused(exact_row(series[Y], j), exact_row(moment[DY], k - j), other)
+            # each coefficient is loaded once for all products
+            turned, cosine, sine = (
+                exact_row(series[OMEGA], j),
+                exact_row(series[COS], k - j),
+                exact_row(series[SIN], k - j),
+            )
+            pc, ps = fused(turned, cosine, pc), fused(turned, sine, ps)
+            torque_c = fused(exact_row(moment[DC], j), cosine, torque_c)
+            torque_s = fused(exact_row(moment[DS], j), sine, torque_s)
             if waves is not None:
                 load_coefficient = exact_row(load[0], j)
-                wc = fused(load_coefficient, exact_row(series[COS], k - j), wc)
-                ws = fused(load_coefficient, exact_row(series[SIN], k - j), ws)
+                wc, ws = fused(load_coefficient, cosine, wc), fused(load_coefficient, sine, ws)
+            along_x, along_y = exact_row(series[X], k - j), exact_row(series[Y], k - j)
+            px, py = fused(turned, along_x, px), fused(turned, along_y, py)
+            torque_x = fused(exact_row(moment[DX], j), along_x, torque_x)
+            torque_y = fused(exact_row(moment[DY], j), along_y, torque_y)
+            pvx = fused(turned, exact_row(series[VX], k - j), pvx)
+            pvy = fused(turned, exact_row(series[VY], k - j), pvy)
+        torque, other = torque_c + torque_x, torque_s + torque_y
         share = 0.0 if k == 0 else 1.0  # order 0 has only one product, which must not be added twice
         early = om0 * share
         px, py = fused(om, x0, fused(early, x, px)), fused(om, y0, fused(early, y, py))
