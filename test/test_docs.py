@@ -20,6 +20,7 @@ from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.mapping import read_map
 from plow_twin.scene_file import loads_scene
+from plow_twin.study.calibration.unknowns import parse_unknown
 from plow_twin.telemetry.access import Credentials
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -152,6 +153,17 @@ def test_drawn_pictures_agree_with_their_scripts() -> None:
 def test_the_tutorial_and_the_example_have_the_same_scene() -> None:
     (scene,) = blocks(ROOT / "docs" / "tutorial.md", "yaml")
     assert scene == (ROOT / "examples" / "first_scene" / "scene.yaml").read_text()
+
+
+def test_the_unknowns_of_the_how_to_are_numbers_of_the_tutorial_s_scene_within_their_ranges() -> None:
+    (text,) = blocks(ROOT / "docs" / "tutorial.md", "yaml")
+    scene = loads_scene(text)
+    (call,) = (call for _, call in shown_calls() if call.startswith("study calibrate mine.yaml"))
+    by_path = {path: parse_unknown(unknown, scene) for unknown, path in re.findall(r"--unknown (([^\s=]+)\S*)", call)}
+    stiffness, damping = (by_path[f"contact.{name}"] for name in ("stiffness", "damping"))
+    assert scene.contact.damping is not None
+    assert stiffness.low < scene.contact.stiffness < stiffness.high
+    assert damping.low < scene.contact.damping < damping.high
 
 
 def test_every_test_named_beside_a_promise_exists() -> None:
