@@ -342,6 +342,50 @@ def test_unusable_input_of_a_forecast_is_refused(tmp_path: Path, capsys: pytest.
     )
 
 
+def test_a_mistake_in_a_file_of_a_history_is_reported_in_the_units_of_the_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(1e-15, 1e-13)))
+    file, history = tmp_path / "scene.yaml", tmp_path / "history.csv"
+    file.write_text(dump_scene(scene))
+
+    def said(rows: str, code: int) -> str:
+        history.write_text("km,horizontal_mm,horizontal_sd_mm,vertical_mm,vertical_sd_mm\n" + rows)
+        limits = ["--limit-horizontal", "28", "--limit-vertical", "34", "--history", str(history)]
+        assert cli(["forecast", str(file), *limits]) == code
+        return " ".join(capsys.readouterr().err.split())
+
+    assert "horizontal_mm: got 0.0252, expected about the scene's clearance, 25.000 mm; is it in m?" in said(
+        "0,0.0252,1e-4,0.0302,1e-4\n100,0.0255,1e-4,0.0305,1e-4\n", 2
+    )
+    shown = said("200,25,0.1,30,0.1\n100,25.5,0.1,30.5,0.1\n", 1)
+    row = "data row 2: got km 100, horizontal_mm 25.5, horizontal_sd_mm 0.1, vertical_mm 30.5, vertical_sd_mm 0.1"
+    assert f"{row} after km 200, expected" in shown
+    # a growth that is too large shows the prior of the scene
+    shown = said("0,25,0.001,30,0.001\n0.001,27,0.001,32,0.001\n", 1)
+    assert "prior, 1e-15 to 1e-13 m^2/N, hardly allows, expected a wider wear.prior_m2_n" in shown
+
+
+def test_a_forecast_from_a_clearance_without_a_measurement_prints_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, estimate_file = tmp_path / "scene.yaml", tmp_path / "estimate.json"
+    file.write_text(dump_scene(replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))))
+    command = ["forecast", str(file), "-q", "--limit-horizontal", "28", "--limit-vertical", "34"]
+    shown = {}
+    for states in (("prior", "not_observable"), ("estimated", "rough")):
+        clearances = zip(("horizontal", "vertical"), (0.025, 0.030), states, strict=True)
+        facts = {
+            name: {"mean_m": mean, "p05_m": mean - 1e-3, "p95_m": mean + 1e-3, "state": state}
+            for name, mean, state in clearances
+        }
+        estimate_file.write_text(json.dumps(facts))
+        assert cli([*command, "--estimate", str(estimate_file)]) == 0
+        shown[states[0]] = capsys.readouterr().err
+    assert "estimate.json: horizontal: got the state prior, expected estimated or rough" in shown["prior"]
+    assert "vertical: got the state not_observable" in shown["prior"] and shown["estimated"] == ""
+
+
 def test_a_history_that_cannot_be_used_is_refused() -> None:
     with pytest.raises(LifeError, match="at least 2 rows"):
         History(np.zeros(1), np.zeros((1, 2)), np.ones((1, 2)))

@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
 
 
-#: Ratio of a limit to the clearance below which the limit was probably given in m instead of mm.
+#: Ratio of a length to the clearance below which the length was probably given in m instead of mm.
 _METRES: Final = 1e-2
+_HISTORY: Final = ("km", "horizontal_mm", "horizontal_sd_mm", "vertical_mm", "vertical_sd_mm")
 
 
 @click.command(
@@ -109,6 +110,8 @@ def forecast(
         plan = Plan(*limits, horizon, stop, face_length, seed=seed, scenarios=others)
     except LifeError as error:
         raise click.UsageError(str(error)) from error
+    if history is None and facts_now is not None:
+        _warn_of_assumed(estimated or Path(scene), facts_now)
     with busy("forecasting", quiet or as_json):
         wear_coefficient = None
         if history is None:
@@ -116,7 +119,7 @@ def forecast(
         else:
             if estimated is not None:
                 model = replace(model, contact=_now(model, facts_now)[0].contact)
-            wear_coefficient = coefficient(model, _history(history))
+            wear_coefficient = coefficient(model, _history(history, model))
             deviation = float(wear_coefficient.deviation[0]), float(wear_coefficient.deviation[1])
             model = with_clearances(
                 model,
@@ -186,16 +189,44 @@ def _estimate(path: Path) -> Any:
     return facts
 
 
-def _history(path: Path) -> History:
-    """Return the clearances in a CSV file."""
-    from plow_twin.estimate.coefficient import History
+def _history(path: Path, scene: Scene) -> History:
+    """Return the clearances in a CSV file, which are compared with the clearances of the scene."""
+    from plow_twin.estimate.coefficient import History, RowError
     from plow_twin.estimate.life import LifeError
     from plow_twin.record.sources import read_columns
 
-    table = read_columns(path, ("km", "horizontal_mm", "horizontal_sd_mm", "vertical_mm", "vertical_sd_mm"))
+    table = read_columns(path, _HISTORY)
     if not len(table):
         raise LifeError(f"{path}: got no row, expected at least 2")
-    return History(1e3 * (table[:, 0] - table[0, 0]), 1e-3 * table[:, [1, 3]], 1e-3 * table[:, [2, 4]])
+    try:
+        history = History(1e3 * (table[:, 0] - table[0, 0]), 1e-3 * table[:, [1, 3]], 1e-3 * table[:, [2, 4]])
+    except RowError as error:
+        got = ", ".join(f"{name} {value:.10g}" for name, value in zip(_HISTORY, table[error.row], strict=True))
+        before = f" after km {table[error.row - 1, 0]:.10g}" if error.row else ""
+        raise LifeError(
+            f"{path}: data row {error.row + 1}: got {got}{before}, expected finite numbers, clearances and deviations "
+            "above 0, and km that do not decrease"
+        ) from None
+    for column, new in ((1, scene.clearance.horizontal_m), (3, scene.clearance.vertical_m)):
+        least = float(table[:, column].min())
+        if 1e-3 * least <= _METRES * new:
+            expected = f"about the scene's clearance, {1e3 * new:.3f} mm"
+            raise click.UsageError(f"{path}: {_HISTORY[column]}: got {least:g}, expected {expected}; is it in m?")
+    return history
+
+
+def _warn_of_assumed(source: Path, facts: dict[str, Any]) -> None:
+    """Print a warning for each clearance of an estimate that no measurement has determined."""
+    from plow_twin.estimate.result import State
+
+    for name in ("horizontal", "vertical"):
+        clearance = facts.get(name)
+        state = clearance.get("state") if isinstance(clearance, dict) else None
+        if state in (State.PRIOR.value, State.NOT_OBSERVABLE.value):
+            say_error(
+                f"plow-twin: {source}: {name}: got the state {state}, expected estimated or rough: the forecast begins "
+                "with an assumed clearance"
+            )
 
 
 def _now(scene: Scene, facts: dict[str, Any] | None) -> tuple[Scene, tuple[float, float]]:

@@ -30,6 +30,17 @@ _POINTS, _REACH = 801, 4.0
 _FURTHER, _FURTHER_M = 2.0, 5e-4
 
 
+class RowError(LifeError):
+    """A row of a history cannot be used. The attribute `row` is its index."""
+
+    def __init__(self, row: int, got: str) -> None:
+        super().__init__(
+            f"history: row {row}: got {got}, expected finite numbers, clearances and deviations above 0, and a travel "
+            "that does not decrease"
+        )
+        self.row = row
+
+
 @dataclass(frozen=True, eq=False)
 class History:
     """Estimated clearances at several values of the travel.
@@ -44,7 +55,7 @@ class History:
     deviation: Array
 
     def __post_init__(self) -> None:
-        """Raise `LifeError` if the rows cannot be used."""
+        """Raise `LifeError` if there are too few rows, and `RowError` if a row cannot be used."""
         shape, count = self.clearance.shape, len(self.travel)
         if shape != (count, 2) or self.deviation.shape != (count, 2) or count < 2:
             raise LifeError(f"history: got {count} travels and clearances {shape}, expected at least 2 rows of both")
@@ -53,10 +64,7 @@ class History:
         possible = (np.isfinite(columns) & (columns > [-np.inf, 0.0, 0.0, 0.0, 0.0])).all(axis=1) & rises
         if not possible.all():
             row = int(np.argmin(possible))
-            raise LifeError(
-                f"history: row {row}: got {columns[row].tolist()}, expected finite numbers, clearances and deviations "
-                "above 0, and a travel that does not decrease"
-            )
+            raise RowError(row, str(columns[row].tolist()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,11 +139,10 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
         depths[index] = interpolated(np.array([now]), path.exposure, path.depth)
     share = np.exp(likely - likely.max())
     share /= share.sum()
-    ends = np.exp(grid[[0, -1]])
     if max(share[0], share[-1]) > tuning.LEAST_PROBABLE[1]:
         raise LifeError(
-            f"history: got a growth that the coefficient's prior, {ends[0]:.2g} to {ends[1]:.2g} m^2/N, hardly allows, "
-            "expected a wider wear.prior_m2_n"
+            "history: got a growth that the coefficient's prior, {:.3g} to {:.3g} m^2/N, hardly allows, expected a "
+            "wider wear.prior_m2_n".format(*wear.prior_m2_n)
         )
     _check_fit(history, _growth(path, math.exp(float(grid[share.argmax()])) * history.travel / wear.pad_area_m2))
     clearance = share @ means
