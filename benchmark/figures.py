@@ -186,8 +186,9 @@ def follow_table() -> str:
 
 def follow_sum() -> str:
     _, *rows = estimate_pages.narrowed(follow_table(), (0, 1, 2, 3, 4, 5, 7))
-    head = ["group", "truths", "forces, RMS", "largest force", "impulse", "coverage of these three", "share of a core"]
-    return table(head, rows)
+    errors = ("forces, RMS [%]", "largest force [%]", "impulse [%]")
+    lines = [[*row[:2], *(cell.replace(" %", "") for cell in row[2:5]), *row[5:]] for row in rows]
+    return table(["group", "truths", *errors, "coverage of these three", "share of a core"], lines)
 
 
 def follow_machines_table() -> str:
