@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,12 +13,12 @@ from commands import plow_twin
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plow_twin import Clearance, Contact, Frame, Head, Scene, SceneError
+from plow_twin import ArgumentError, Clearance, Contact, Frame, Head, Scene, SceneError
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row
 from plow_twin.model import contact
 from plow_twin.model.contact import power_term, power_terms, root_terms
-from plow_twin.model.contact_laws import DAMPING_NUMBER_CAP, LAWS, exact_damping_number
+from plow_twin.model.contact_laws import DAMPING_NUMBER_CAP, LAWS, ContactLaw, add_law, exact_damping_number
 from plow_twin.scene_file.presets import config_folder
 
 
@@ -124,6 +126,21 @@ def _raise(base, power, n, inverse, half_root) -> None:  # type: ignore[no-untyp
 def test_an_impossible_law_is_refused_by_name(contact: dict[str, object], words: str) -> None:
     with pytest.raises(SceneError, match=words):
         Scene(Head(1.0, 1.0), Frame(0.1, 0.1), Clearance(0.01, 0.01), Contact(**contact))  # type: ignore[arg-type]
+
+
+LAW = ContactLaw("x", "x")
+
+
+@pytest.mark.parametrize(("name", "law"), [("2nd", LAW), ("ré", LAW), ("class", LAW), ("x", abs)])
+def test_a_law_without_a_valid_name_or_type_is_refused(name: str, law: Any) -> None:
+    with pytest.raises(ArgumentError, match="contact law"):
+        add_law(name, law)
+
+
+@pytest.mark.parametrize("number_of", [lambda e: None, lambda e: [][1], lambda e: "1", lambda e: -1.0])
+def test_a_law_without_a_damping_number_is_named(number_of: Callable[[float], Any]) -> None:
+    with pytest.raises(ArgumentError, match=r"my law: D\(0\.5\): got .*expected a number >= 0"):
+        ContactLaw("my law", "mine", number_of).damping_number(0.5)
 
 
 def test_parts_of_the_wrong_kind_are_all_named_at_once() -> None:

@@ -23,7 +23,7 @@ from plow_twin import (
     simulate,
     simulate_many,
 )
-from plow_twin.errors import SceneError
+from plow_twin.errors import ArgumentError, SceneError
 from plow_twin.model import geometry
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.scene import variants
@@ -143,6 +143,12 @@ def test_a_member_that_fails_does_not_stop_the_others() -> None:
 def test_times_are_checked_as_in_simulate(t_end: float) -> None:
     with pytest.raises(ValueError, match="t_end: got"):
         simulate_many([preset("paper")], t_end)
+
+
+@pytest.mark.parametrize("scenes", [preset("paper"), ["mine.yaml"]])
+def test_scenes_of_a_wrong_type_are_named(scenes: Any) -> None:
+    with pytest.raises(ArgumentError, match=r"scenes?: got .*expected a"):
+        simulate_many(scenes, 1.0)
 
 
 #: Load that begins to push a head without weight between walls without clearance.

@@ -100,5 +100,7 @@ def test_leaving_the_model_s_range_is_a_named_error() -> None:
         Gravity(0.0),
         (Constant("f", (5e4, 0.0)),),
     )
-    with pytest.raises(SolverError, match=r"at t = 0\.0\d+ s: the head left the model's range"):
+    with pytest.raises(
+        SolverError, match=r"at t = 0\.0\d+ s: the head left the model's range: \w+ penetrated \d+\.\d mm deep"
+    ):
         simulate(scene, 1.0)

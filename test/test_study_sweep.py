@@ -73,6 +73,8 @@ def test_axes_of_parameters_and_statistics_have_readable_labels_with_units() -> 
         words, factor = parameter_words(path)
         assert not words.endswith(("_m", "_n", "_kg", "_rad")) and factor > 0.0, path
     assert parameter_words("clearance.horizontal_m") == ("horizontal clearance [mm]", 1e3)
+    assert parameter_words("wear.coefficient_m2_n") == ("wear coefficient [m²/N]", 1.0)
+    assert parameter_words("support.horizontal_damping_n_s_m") == ("support horizontal damping [N s/m]", 1.0)
     assert parameter_words("loads.fy.phase_rad") == ("load fy phase [rad]", 1.0)
     assert statistic_words("max.ccw.a") == ("largest force, counter-clockwise, corner a [kN]", 1e-3)
     assert statistic_words("contact_points.cw.2") == ("share of contact time, clockwise, force at 2 corners", 1.0)

@@ -12,6 +12,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from keyword import iskeyword
+from numbers import Real
 from types import MappingProxyType
 from typing import Final
 
@@ -123,12 +125,15 @@ class ContactLaw:
         if self.number_of is None:
             raise ArgumentError(f"law: got {self.title}, expected a law that takes a restitution")
         try:
-            number = self.number_of(restitution)
+            number: object = self.number_of(restitution)
         except ZeroDivisionError:
             return DAMPING_NUMBER_CAP
-        if not number >= 0.0:
+        except Exception as error:  # the law may be the user's
+            reason = f"{type(error).__name__}: {error}"
+            raise ArgumentError(f"{self.title}: D({restitution:g}): got {reason}, expected a number >= 0") from error
+        if not isinstance(number, Real) or not float(number) >= 0.0:
             raise ArgumentError(f"{self.title}: D({restitution:g}): got {number!r}, expected a number >= 0")
-        return min(number, DAMPING_NUMBER_CAP)
+        return min(float(number), DAMPING_NUMBER_CAP)
 
 
 _LAWS: Final[dict[str, ContactLaw]] = {
@@ -194,8 +199,11 @@ def add_law(name: str, law: ContactLaw) -> None:
     Raises
     ------
     ArgumentError
-        The name is already used, or contains a character other than letters, digits and _.
+        The name is already used, is a keyword of Python, or contains a character other than letters, digits and _; or
+        `law` is not a `ContactLaw`.
     """
-    if name in LAWS or not name.isidentifier():
+    if not isinstance(law, ContactLaw):
+        raise ArgumentError(f"contact law {name!r}: got {law!r}, expected a ContactLaw")
+    if name in LAWS or not (name.isidentifier() and name.isascii()) or iskeyword(name):
         raise ArgumentError(f"contact law: got {name!r}, expected a new name of letters, digits and _")
     _LAWS[name] = law

@@ -334,7 +334,8 @@ class Initial:
 class Wear:
     """Archard wear of the eight pads by the travel along the face: dh/dt = k_s F v / A.
 
-    With `sliding: total`, sqrt(v^2 + s'^2) replaces v, where s' is the in-plane speed of the corner over its pad.
+    With `sliding: total`, sqrt(v^2 + s'^2) replaces v, where s' is the in-plane speed of the corner over its pad. Below
+    v = 0.01 m/s, this wear is proportional to v.
     Running-in multiplies k_s by 1 + (r - 1) exp(-h / h0) with the wear depth h, r = `running_in_ratio` and h0 =
     `running_in_depth_m`.
 
@@ -711,6 +712,10 @@ LEAST_SPACING_S: Final = 1e-100
 
 def _check_table(key: str, table: Table) -> Iterator[Problem]:
     t, wrench = np.asarray(table.t), np.asarray(table.wrench)
+    for name, values in (("t", t), ("wrench", wrench)):
+        if values.dtype.kind not in "fiu":
+            yield Problem(f"{key}.{name}", values.tolist(), "numbers")
+            return
     if t.ndim != 1 or len(t) < 1:
         yield Problem(f"{key}.t", t.shape, "shape (n,) with n >= 1")
     elif wrench.shape != (len(t), 3):

@@ -165,8 +165,8 @@ def check_times(now: float, times: NDArray[np.float64]) -> None:
     if times.shape == (1,) and now <= times[0] < math.inf:
         return  # the general check takes 8 us
     if times.ndim != 1 or not np.isfinite(times).all():
-        raise ArgumentError(f"t: got {times!r}, expected finite times in s, shape (n,)")
+        raise ArgumentError(f"t: got {times.tolist()!r}, expected finite times in s, shape (n,)")
     if len(times) and (times[0] < now or (times[1:] < times[:-1]).any()):
         before = np.concatenate([[now], times[:-1]])
         index = int(np.flatnonzero(times < before)[0])
-        raise ArgumentError(f"t: got {times[index]!r} s, expected a time not before {before[index]!r} s")
+        raise ArgumentError(f"t: got {float(times[index])!r} s, expected a time not before {float(before[index])!r} s")

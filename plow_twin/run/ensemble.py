@@ -17,6 +17,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.errors import ArgumentError
 from plow_twin.kernel.linked import garbage_kept
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
@@ -122,6 +123,8 @@ def simulate_many(
         The time `max_wall_s` has expired, or the user pressed Ctrl-C. The attribute `result` of the error contains the
         finished members. Unfinished members have the status `BUDGET`.
     """
+    if not isinstance(scenes, Sequence):
+        raise ArgumentError(f"scenes: got {scenes!r}, expected a sequence of scenes")
     check_times(t_end, output_dt)
     check_limits(max_steps, max_wall_s)
     end = _time.perf_counter() + max_wall_s

@@ -23,6 +23,7 @@ from plow_twin.run.pace import MOST_SECONDS, check_limits
 from plow_twin.run.sensitivity import Sensitivity, sensitivity_of
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, options
 from plow_twin.solve.energy_balance import new_balance
+from plow_twin.solve.modes import beyond_range, range_of
 from plow_twin.solve.state import EVENT, OFF, Status, Totals, Work, new_work
 
 Method = Literal["events", "rk4", "euler"]
@@ -316,7 +317,16 @@ def _run(
     if code == Status.BUDGET and watch is not None:
         watch.look(motion)
     if code != Status.OK:
-        raise SolverError(f"at t = {motion.time:.9g} s: {Status(code).text}")
+        raise SolverError(f"at t = {motion.time:.9g} s: {failure(Status(code), compiled, motion)}")
+
+
+def failure(status: Status, compiled: CompiledScene, motion: Motion) -> str:
+    """Return the reason why a motion ended early, with the angle or penetration beyond the range of the model."""
+    if status is not Status.OUT_OF_RANGE:
+        return status.text
+    beyond = np.zeros(3)
+    range_of(compiled.params, motion.state, beyond)
+    return f"the head left the model's range: {beyond_range(beyond, float(compiled.params.half_cavity))}"
 
 
 def _spare_work() -> Work:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from plow_twin.errors import ArgumentError
 from plow_twin.kernel.compiler import for_arguments
 from plow_twin.model import geometry
-from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
+from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Initial, Scene, check_travel_speed
 from plow_twin.run.advance import Advance, AdvanceSeries, check_times
 from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, Pace, check_limits, clear_sums, raise_stopped
@@ -23,7 +23,7 @@ from plow_twin.solve import loop
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, options, wear_rate
 from plow_twin.solve.method.rest import AT_REST
 from plow_twin.solve.method.step_size import PARTING_ORDER
-from plow_twin.solve.modes import LARGEST_ANGLE, settle_moved
+from plow_twin.solve.modes import beyond_range, settle_moved
 from plow_twin.solve.samples import lay_out
 from plow_twin.solve.state import (
     BOUND,
@@ -397,14 +397,7 @@ class Twin:
         """
         if status != Status.OUT_OF_RANGE:
             return Status(status).text
-        angle, penetration, pair = self._work.beyond.tolist()
-        limit = float(self._compiled.params.half_cavity)
-        if abs(angle) <= LARGEST_ANGLE:
-            return (
-                f"{PAIR_NAMES[int(pair)]} penetrated {1e3 * penetration:.1f} mm deep; "
-                f"the model is valid up to half the cavity, {1e3 * limit:.1f} mm"
-            )
-        return f"the head turned to {math.degrees(angle):.1f} degrees; the model is valid up to 45"
+        return beyond_range(self._work.beyond, float(self._compiled.params.half_cavity))
 
     @property
     def frame(self) -> NDArray[np.float64] | None:

@@ -127,6 +127,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         The tolerance is out of range.
     """
     _check_tolerance(tol)
+    _check_scenes([scene])
     # `_LATELY` would keep a table in memory after the end of its scene
     tables = any(isinstance(load, Table) for load in scene.loads)
     return _compile_alike([scene], tol, sampled, _Shared() if tables else _LATELY)[0]
@@ -162,6 +163,7 @@ def compile_scenes(
         The tolerance is out of range.
     """
     _check_tolerance(tol)
+    _check_scenes(scenes)
     shared, params = _LATELY if sampled else _Shared(), new_records(params_type(kind), len(scenes))
     alike: dict[tuple[object, ...], list[int]] = {}
     for index, scene in enumerate(scenes):
@@ -176,6 +178,12 @@ def compile_scenes(
 
 def _is_number(value: object) -> bool:
     return isinstance(value, Real)
+
+
+def _check_scenes(scenes: Sequence[Scene]) -> None:
+    for scene in scenes:
+        if not isinstance(scene, Scene):
+            raise ArgumentError(f"scene: got {scene!r}, expected a Scene, for example from load_scene")
 
 
 def _check_tolerance(tol: float) -> None:

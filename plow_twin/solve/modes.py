@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plow_twin.kernel.by_field import by_field
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import below, row, splat
 from plow_twin.model.geometry import STATE_SIZE
-from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.grip import grasp, keep_grip, stretches, weigh_grips
 from plow_twin.solve.kinematics import named_angle, penetration_of, rate_of, row_value, row_values
@@ -263,6 +264,23 @@ def read_range(p, state, y, out) -> None:
             penetration = penetration_of(p, state, pair, y)
             if penetration > out[1]:
                 out[1], out[2] = penetration, pair
+
+
+@kernel(entry=True)
+def range_of(p, state, out) -> None:
+    """Write the values that `within_range` checks at the state, as `read_range` does."""
+    read_range(p, state, state.y, out)
+
+
+def beyond_range(beyond: NDArray[np.float64], half_cavity: float) -> str:
+    """Return a text about the angle or penetration from `read_range`, shape (3,), and the limit of the model."""
+    angle, penetration, pair = beyond.tolist()
+    if abs(angle) <= LARGEST_ANGLE:
+        return (
+            f"{PAIR_NAMES[int(pair)]} penetrated {1e3 * penetration:.1f} mm deep; "
+            f"the model is valid up to half the cavity, {1e3 * half_cavity:.1f} mm"
+        )
+    return f"the head turned to {math.degrees(angle):.1f} degrees; the model is valid up to 45"
 
 
 @kernel()

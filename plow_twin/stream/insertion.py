@@ -9,18 +9,15 @@ therefore replaces the twins at the same sample.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import Any, Final, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from plow_twin.solve.state import ROW
 from plow_twin.stream.driven import Following
-from plow_twin.stream.history import NO_SAMPLES, Samples
+from plow_twin.stream.history import NO_SAMPLES, History, Samples
 from plow_twin.stream.journal import Estimated, PartOfPose, Pose, Sample, Travel
-from plow_twin.stream.outputs import Array, Integers
-
-if TYPE_CHECKING:
-    from plow_twin.stream.session import Session
+from plow_twin.stream.outputs import Array, Integers, Outputs, Rows
 
 #: Product of twins and samples in one part of the repeated motion, and number of new samples for each part. With 128
 #: twins and poses at 100 Hz, a part has ten samples and takes 2 ms, a snapshot of the second set after every two parts
@@ -37,7 +34,29 @@ def samples_at_once(members: int) -> int:
     return max(STRIDE + 1, MEMBER_SAMPLES // members)
 
 
-class Insertion:
+class Repeating(Protocol):
+    """Session that repeats the motion."""
+
+    history: History
+    outputs: Outputs
+
+    def advance(self, stamps: Integers, wrench: Array, rows: Rows | None, /) -> Any:
+        """Advance to samples, as `Session.advance` does."""
+
+    def catch_up(self) -> None:
+        """Advance all twins to the time of the first one, as `Session.catch_up` does."""
+
+    def follow(self, stamp_ns: int, entry: Pose | PartOfPose | Estimated, known: float, /) -> None:
+        """Use a pose or an estimate, as `Session.follow` does."""
+
+    def schedule(self, travel: Travel, /) -> None:
+        """Let a travel speed wait for its stamp, as `Session.schedule` does."""
+
+
+Second = TypeVar("Second", bound=Repeating)
+
+
+class Insertion(Generic[Second]):
     """Late samples that wait, and a second session that repeats the motion with them.
 
     Parameters
@@ -57,7 +76,7 @@ class Insertion:
         passed their stamps; each with the number of samples to repeat, minus `passed`, when it arrived.
     """
 
-    def __init__(self, twin: Following, go_back: Callable[[Following, int], tuple[Session, int, Samples]]) -> None:
+    def __init__(self, twin: Following, go_back: Callable[[Following, int], tuple[Second, int, Samples]]) -> None:
         self._twin, self._go_back = twin, go_back
         self._at_once = samples_at_once(twin.members)
         self._late: list[Sample] = []
@@ -67,7 +86,7 @@ class Insertion:
         self._worked = self._end = 0
         #: number of samples to repeat, minus the number of new samples when they were counted
         self._behind = 0
-        self._second: Session | None = None
+        self._second: Second | None = None
         self._changed_ns: int | None = None
         #: samples that the second session has not applied
         self._stamps, self._wrench = NO_SAMPLES
@@ -124,13 +143,13 @@ class Insertion:
         else:
             self._second.catch_up()
 
-    def finish(self) -> Session:
+    def finish(self) -> Second:
         """Do all the rest of the work, and return the second session."""
         second = self._begun()
         self._repeat(second, len(self._stamps))
         return second
 
-    def _begun(self) -> Session:
+    def _begun(self) -> Second:
         if self._second is None:
             late = sorted(self._late, key=lambda sample: sample.stamp_ns)
             self._second, self._changed_ns, samples = self._go_back(self._twin, late[0].stamp_ns)
@@ -143,7 +162,7 @@ class Insertion:
         order = stamps.argsort(kind="stable")
         self._stamps, self._wrench = stamps[order], wrench[order]
 
-    def _repeat(self, second: Session, count: int) -> None:
+    def _repeat(self, second: Second, count: int) -> None:
         """Repeat `count` samples.
 
         The part may be shorter or longer by half, so that it ends where a snapshot is due. The snapshot is taken after

@@ -142,7 +142,7 @@ class Session:
         #: poses and estimates since the oldest snapshot
         self._measured: deque[_Measured] = deque()
         #: late samples that wait; None without such samples
-        self._insertion: Insertion | None = None
+        self._insertion: Insertion[Session] | None = None
         #: number of poses that were dropped, because they were too far ahead of the model or more than `MOST_MEASURED`
         self.poses_dropped = 0
         self._scene = twin.scene

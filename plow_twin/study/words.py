@@ -3,23 +3,13 @@
 from __future__ import annotations
 
 import re
+from dataclasses import fields
 from typing import Final
 
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.model.scene import PARTS, Constant, Harmonic, Table
 from plow_twin.study.statistics import unit_of
 
-#: Unit in pictures and its factor from SI, by the first suffix that a parameter's name has.
-_ENDS: Final = {
-    "_kg_m2": ("kg m²", 1.0),
-    "_kg": ("kg", 1.0),
-    "_rad_s": ("rad/s", 1.0),
-    "_rad": ("rad", 1.0),
-    "_m_s2": ("m/s²", 1.0),
-    "_m_s": ("m/s", 1.0),
-    "_n_m": ("kN m", 1e-3),
-    "_n": ("kN", 1e-3),
-    "_m": ("mm", 1e3),
-}
 _PARAMETERS: Final = {
     "clearance.horizontal_m": "horizontal clearance",
     "clearance.vertical_m": "vertical clearance",
@@ -38,7 +28,7 @@ _STATISTICS: Final = {
     "events": "changes of contact",
     "steps": "steps of the solver",
 }
-_SCALED: Final = {"N": ("kN", 1e-3), "N s": ("kN s", 1e-3), "m": ("mm", 1e3)}
+_SCALED: Final = {"N": ("kN", 1e-3), "N m": ("kN m", 1e-3), "N s": ("kN s", 1e-3), "m": ("mm", 1e3)}
 _SENSES: Final = {"ccw": "counter-clockwise", "cw": "clockwise"}
 
 
@@ -47,12 +37,22 @@ def parameter_words(path: str) -> tuple[str, float]:
     if path == "contact.stiffness":
         return "contact stiffness [MN/mⁿ]", 1e-6
     plain, index = re.fullmatch(r"(.*?)(\[\d+\])?", path).groups()  # type: ignore[union-attr]
-    end = next((end for end in _ENDS if plain.endswith(end)), "")
-    words = _PARAMETERS.get(plain) or plain.removesuffix(end).removeprefix("loads.").replace(".", " ").replace("_", " ")
-    if path.startswith("loads."):
-        words = f"load {words}"
-    unit, factor = _ENDS.get(end, ("", 1.0))
-    return f"{words}{index or ''}" + (f" [{unit}]" if unit else ""), factor
+    part, *_, name = plain.split(".")
+    si = _unit_of_field(part, name, int(index[1:-1]) if index else 0)
+    suffix = re.sub("[ /]", "_", si.replace("^", "").lower())
+    words = _PARAMETERS.get(plain) or plain.removesuffix(f"_{suffix}").removeprefix("loads.").replace(".", " ")
+    words = f"load {words}" if part == "loads" else words
+    unit, factor = _SCALED.get(si, (si.replace("^2", "²").replace("^3", "³"), 1.0))
+    return f"{words.replace('_', ' ')}{index or ''}" + (f" [{unit}]" if unit else ""), factor
+
+
+def _unit_of_field(part: str, name: str, index: int) -> str:
+    """Return the SI unit of an item of a field of a scene, or an empty text for a number without a unit."""
+    kinds = (Harmonic, Constant, Table) if part == "loads" else (PARTS[part],)
+    found = (spec.metadata.get("unit", "") for kind in kinds for spec in fields(kind) if spec.name == name)
+    units = next(found, "").split(", ")
+    unit = units[index] if len(units) > 1 else units[0]
+    return "" if unit == "1" else unit
 
 
 def statistic_words(path: str) -> tuple[str, float]:
