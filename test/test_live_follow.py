@@ -882,6 +882,42 @@ def test_a_runtime_reports_its_twins_and_follows_with_parameters_if_samples_wait
     assert {f"/{name}" for name in (*layout.FORCE_BOUNDS, *layout.POSE, *layout.MEASURED)} <= entities
 
 
+@pytest.mark.usefixtures("ten_at_once")
+@pytest.mark.parametrize("mode", ["on_sample", "fixed_rate"])
+def test_a_written_replay_with_late_samples_and_a_snapshot_has_the_recorded_motion(
+    truth: Truth, tmp_path: Path, mode: str
+) -> None:
+    scene = tmp_path / "believed.yaml"
+    scene.write_text(dump_scene(truth.nominal), encoding="utf-8")
+    values = {"scene": str(scene), "estimate": True, "follow_members": MEMBERS, "excitation_timeout": 3600.0}
+    settings = parameters.settings(values | {"publish_mode": mode, "record_path": str(tmp_path / "run")})
+    runtime = Runtime(Front(), settings, Preparation(settings).result(lambda: False))
+    runtime.start()
+    runtime.activate()
+    chance, order = np.random.default_rng(3), list[tuple[float, Sample | Pose]]()
+    for entry in _in_turn(truth, 0.0, 2.0):
+        assert isinstance(entry, Sample | Pose)
+        is_late = isinstance(entry, Sample) and entry.stamp_ns > T0 + 100_000_000 and chance.random() < 0.05
+        order.append((entry.stamp_ns + 1.2e9 * chance.random() * is_late, entry))
+    waiting = 0
+    for number, (_, entry) in enumerate(sorted(order, key=lambda item: item[0])):
+        if number == len(order) // 2:
+            runtime.driver.snapshot()
+        if isinstance(entry, Pose):
+            runtime.add_pose(entry.stamp_ns, (entry.pose[0], entry.pose[1], entry.pose[2]))
+            continue
+        list(runtime.step([(entry.stamp_ns, entry.wrench)]))
+        if mode == "fixed_rate" and number % 10 == 0:
+            runtime.publish_due()
+        waiting = max(waiting, runtime.driver.session.waiting)
+    assert runtime.close() == [] and waiting > 1
+    assert replay(tmp_path / "run", write=tmp_path / "written").exit_code == 0
+    for run in ("run", "written"):
+        report = replay(tmp_path / run)
+        assert (report.exit_code, report.first_divergence) == (0, None), run
+        assert report.snapshots_compared > 0 and report.compared["contact_forces"] > 20
+
+
 def test_forces_are_sent_before_the_other_twins_are_advanced(
     truth: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
