@@ -51,7 +51,8 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         _write("millimetres.csv", POSE, x=1e3, y=1e3)
         _write("milliseconds.csv", POSE, t=1e3)
         _write("degrees.csv", POSE, theta=180.0 / np.pi * 10.0)
-        for name, scale in {"kN": {"fx": 1e-3, "fy": 1e-3}, "mm": {"x": 1e3, "y": 1e3}, "bars": {}}.items():
+        scales = {"kN": {"fx": 1e-3, "fy": 1e-3}, "mm": {"x": 1e3, "y": 1e3}, "ms": {"t": 1e3}, "bars": {}}
+        for name, scale in scales.items():
             separator = "|" if name == "bars" else ","
             _write(f"{name}/load.csv", LOAD, separator=separator, **scale)
             _write(f"{name}/pose.csv", POSE, separator=separator, **scale)
@@ -59,7 +60,11 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for name in ("empty.csv", "taken/notes.txt"):
             Path(name).parent.mkdir(exist_ok=True)
             Path(name).write_text("")
+        Path("rowless").mkdir()
+        for name, names in (("load", LOAD), ("pose", POSE)):
+            Path("rowless", f"{name}.csv").write_text(",".join(names))
         Path("own.yaml").write_text("excitation: {topic: own}\nhead_pose: {topic: own}\n")
+        Path("kN.yaml").write_text("excitation: {topic: kilonewtons}\nhead_pose: {topic: kilonewtons}\n")
         Path("misspelt.yaml").write_text("excitations: {topic: own}\n")
         Path("begun.mcap").write_bytes(MAGIC[:3])
         Path("run.mcap").write_bytes(MAGIC + bytes(range(256)))
@@ -71,6 +76,18 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("arguments", "code", "message"),
     [
         (["estimate", "mm"], 2, "x: got 12, expected less than half the frame or the clearance, 0.165 m; they look"),
+        (
+            ["estimate", "kN"],
+            2,
+            "got 30, expected about 3.2e+04 N as in the scene; they look like kN: convert the file",
+        ),
+        (
+            ["estimate", "kilonewtons.csv", *MAP[2:], "--map", "kN.yaml"],
+            2,
+            "they look like kN: convert the file, or state the unit in a mapp",
+        ),
+        (["estimate", "ms"], 2, "t: got stamps 10 s apart, expected many samples in each period of such a smooth load"),
+        (["estimate", "rowless"], 1, "rowless: got no load and no measured pose, expected at least one row"),
         (["estimate", "bars"], 1, "t|fx|fy|m (expected commas, semicolons or tabs between them), expected t, fx, fy"),
         (["estimate", "headless.csv", *MAP], 1, "(no header row?)"),
         (["estimate", "empty.csv", "--scene", "paper"], 1, "empty.csv: got no load, expected at least one row"),
@@ -169,13 +186,29 @@ def test_rows_that_an_estimate_cannot_use_are_counted_in_its_losses(
     assert "twice: lost unreadable_rows: 1, unusable_rows: 1" in shown.err
 
 
-def test_a_load_that_seems_to_be_in_kilonewtons_is_reported_before_the_estimate(
-    desk: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_a_small_load_is_estimated_if_the_mapping_states_its_unit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(desk)
-    # the estimate fits the gains of the load, so a load in kN causes only a warning, but here no clearance is found
-    assert cli(["estimate", "kN", "--json"]) == 0
+    monkeypatch.chdir(tmp_path)
+    _write("small/load.csv", LOAD, fx=1e-3, fy=1e-3)
+    Path("small/pose.csv").write_text("t,x,y,theta\n1,0,0,0\n2,0,0,0\n")
+    Path("small/scene.yaml").write_text(scene_path("paper").read_text())
+    for unit, code in (("", 2), (", unit: {fx: N, fy: N}", 3)):
+        Path("map.yaml").write_text(f"excitation: {{topic: load{unit}}}\nhead_pose: {{topic: pose}}\n")
+        assert cli(["estimate", "small", "--map", "map.yaml"]) == code
+    assert "small: got 2 poses within the load's span" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("poses", ["none", "after the load"])
+def test_an_estimate_from_too_few_poses_checks_nothing_and_has_exit_code_3(
+    poses: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    _write("few/load.csv", LOAD)
+    late = ROWS[:, [0, 4, 5, 6]] + [1000.0, 0.0, 0.0, 0.0]
+    np.savetxt("few/pose.csv", late[: 0 if poses == "none" else None], "%.9g", ",", header=",".join(POSE), comments="")
+    Path("few/scene.yaml").write_text(scene_path("paper").read_text())
+    assert cli(["estimate", "few"]) == 3
     shown = capsys.readouterr()
-    assert "fx, fy: got 30, expected about 3.2e+04 N as in the scene; they look like kN: convert the file" in shown.err
-    found = json.loads(shown.out)
-    assert {found[name]["state"] for name in ("horizontal", "vertical")} <= {"withdrawn", "not_observable"}
+    assert "model and sensor not checked" in shown.out
+    assert "few: got 0 poses within the load's span, 0 s to 19.99 s, expected at least 20" in shown.err

@@ -50,7 +50,7 @@ def test_without_a_load_intervals_of_rough_clearances_contain_the_truth(tmp_path
     (tmp_path / "load.csv").unlink()
     completed = plow_twin("estimate", tmp_path, "--json")
     facts = json.loads(completed.stdout)
-    assert facts["model"] == "suspect" and facts["reasons"][0].startswith("load: ")
+    assert facts["model"] == "suspect" and facts["reasons"][0].startswith("load: not measured (no load.csv")
     for name, true in zip(("horizontal", "vertical"), truth.clearance, strict=True):
         value = facts[name]
         assert value["state"] == "rough" and value["p05_m"] < true < value["p95_m"] < value["p05_m"] + 5e-3

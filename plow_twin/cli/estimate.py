@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 
 @click.command(
     short_help="Estimate clearances and contact from measured motion.",
-    epilog="Exit codes: 0 done, even if an estimate is withdrawn; 1 failed; 2 wrong usage or scene; 3 done with "
-    "counted loss.",
+    epilog="Exit codes: 0 done, even if an estimate is withdrawn; 1 failed; 2 wrong usage, scene or units; 3 done with "
+    "counted loss, or too few data.",
 )
 @click.argument("source", metavar="INPUT", type=EXISTING)
 @click.option("--scene", type=PLACE, help="Nominal scene, a file or a preset; by default the scene of INPUT.")
@@ -160,7 +160,9 @@ def estimate(
         return FAILED
     if more["losses"]:
         say_error(f"plow-twin: {source}: lost {counts(more['losses'])}")
-    return DONE_WITH_LOSS if result.lost or more["losses"] else DONE
+    if result.unchecked:
+        say_error(f"plow-twin: {source}: {'; '.join(result.reasons)}")
+    return DONE_WITH_LOSS if result.lost or more["losses"] or result.unchecked else DONE
 
 
 @dataclass(frozen=True)
@@ -189,7 +191,7 @@ def _measured(source: Path, scene: Path | None, mapping: Path | None, folder: bo
     from plow_twin.record.measured import read_measured, read_recording
 
     measured = read_measured(source, scene) if folder else read_recording(source, scene, mapping)
-    _check_units(source, measured)
+    _check_units(source, measured, mapping, folder)
     load, lost_load = _load_of(measured)
     poses, lost_poses = Poses.of(measured.poses[:, 0], measured.poses[:, 1:], measured.pose_deviation)
     gaps, lost_gaps = Gaps.of(measured.gaps[:, 0], measured.gaps[:, 1:], measured.gaps_deviation)
@@ -244,16 +246,30 @@ def _followed(data: _Recorded, members: int, dt: float | None) -> tuple[list[str
 _REMEDY: Final = "convert the file, or state the unit in a mapping (--map)"
 
 
-def _check_units(source: Path, measured: Measured) -> None:
-    """Raise a `UnitError` for impossible poses, and print a warning about a load that seems to be in another unit."""
-    from plow_twin.record.unit_check import unit_doubts
+def _check_units(source: Path, measured: Measured, mapping: Path | None, folder: bool) -> None:
+    """Raise a `UnitError` for numbers that seem to be in another unit than the mapping states, by default in SI units.
+
+    Loads in a run of plow_twin only cause a warning, because their units cannot be stated afterwards.
+    """
+    from plow_twin.record.mapping import read_map
+    from plow_twin.record.reader import own_run
+    from plow_twin.record.sources import open_source
+    from plow_twin.record.unit_check import unit_doubts, unstated
 
     values = {("excitation", name): measured.load[:, 1 + place] for place, name in enumerate(("fx", "fy", "m"))}
     values |= {("head_pose", name): measured.poses[:, 1 + place] for place, name in enumerate(("x", "y", "theta"))}
-    for doubt in unit_doubts(values, measured.load[:, 0], measured.scene):
-        if doubt.is_impossible:
-            raise UnitError(f"{source}: {doubt}: {_REMEDY}")
-        say_error(f"plow-twin: {source}: {doubt}: {doubt.advice or _REMEDY}")
+    doubts = unit_doubts(values, measured.load[:, 0], measured.scene)
+    if doubts and not folder and own_run(source) is not None:
+        for doubt in doubts:
+            if not doubt.is_impossible:
+                say_error(f"plow-twin: {source}: {doubt}")
+        refused = [doubt for doubt in doubts if doubt.is_impossible]
+    else:
+        roles = read_map(mapping, open_source(source).topics()) if doubts and not folder else {}
+        possible = [doubt for doubt in doubts if not doubt.is_impossible]
+        refused = [doubt for doubt in doubts if doubt.is_impossible] + unstated(possible, roles)
+    if refused:
+        raise UnitError(f"{source}: " + "; ".join(f"{doubt}: {doubt.advice or _REMEDY}" for doubt in refused))
 
 
 def _repeated(source: Path) -> _Task | None:
@@ -353,7 +369,7 @@ def show_estimate(result: Estimate, scene: Scene) -> None:
         view.add_row(label, *numbers, state)
     console = output_console()
     console.print(view)
-    console.print(f"model {result.model}, sensor {result.sensor}", highlight=False)
+    console.print(result.trust, highlight=False)
     if result.forces_measured is not None:
         measured = result.forces_measured.as_dict()
         why = measured["unused"] and f": {measured['unused']}"

@@ -180,7 +180,7 @@ def _from_motion(
     if len(poses.t) < FEWEST_POSES:
         few = (
             f"got {len(poses.t)} poses within the load's span, {span[0]:g} s to {span[1]:g} s, expected at least "
-            f"{FEWEST_POSES}"
+            f"{FEWEST_POSES}: model and sensor are not checked"
         )
         return replace(prior_of(unknowns, span), reasons=(few,)), ()
     short_of = shortages(poses)
@@ -230,7 +230,10 @@ def _without_load(unknowns: Unknowns, load: Load, poses: Poses) -> Estimate:
     The range of motion is the clearance plus the penetrations at two opposite walls, which are estimated from the
     equations of motion for walls that yield.
     """
-    nothing = without_fit(unknowns, poses, "load: the same value throughout, while the head moves")
+    reason = "the same value throughout, while the head moves"
+    if load.missing:
+        reason = "not measured (no load.csv, or no sample), expected the load that moves the head"
+    nothing = without_fit(unknowns, poses, f"load: {reason}")
     bias = bias_of_hard(unknowns, poses)
     poses = poses.moved(-bias)
     if bounces(unknowns, poses):

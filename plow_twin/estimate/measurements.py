@@ -188,6 +188,11 @@ class Load:
         return Load(np.array([start, end]), np.zeros((2, 3)))
 
     @property
+    def missing(self) -> bool:
+        """Whether the load is that of `unmeasured`."""
+        return len(self.t) == 2 and not self.wrench.any()
+
+    @property
     def constant(self) -> bool:
         """Whether all samples are equal, as without a measurement or behind a failed sensor."""
         return not np.ptp(self.wrench, axis=0).any()

@@ -278,7 +278,7 @@ class Estimate:
             cells = [shown.label, *(format(number, shown.digits) for number in (value.mean, value.p05, value.p95))]
             cells.append(states[shown.name].value.replace("_", " ") if shown.name in states else "")
             rows.append("".join(f"<td>{escape(cell)}</td>" for cell in cells))
-        title = f"window from {self.t_start:.2f} s to {self.t_end:.2f} s; model {self.model}, sensor {self.sensor}"
+        title = f"window from {self.t_start:.2f} s to {self.t_end:.2f} s; {self.trust}"
         heads = "".join(f"<th>{name}</th>" for name in ("", "mean", "5 %", "95 %", ""))
         body = "".join(f"<tr>{row}</tr>" for row in rows)
         reasons = "".join(f"<p>{escape(reason)}</p>" for reason in self.reasons)
@@ -293,6 +293,16 @@ class Estimate:
     def states(self) -> tuple[State, State]:
         """States of the horizontal and the vertical clearance."""
         return self.horizontal_state, self.vertical_state
+
+    @property
+    def unchecked(self) -> bool:
+        """Whether the measurements were too few to check the model and the sensor."""
+        return self.states == (State.PRIOR, State.PRIOR)
+
+    @property
+    def trust(self) -> str:
+        """Text with the results of the checks of the model and the sensor."""
+        return "model and sensor not checked" if self.unchecked else f"model {self.model}, sensor {self.sensor}"
 
     def having(self, clearances: Sequence[Interval], states: Sequence[State], **others: Any) -> Estimate:
         """Return the estimate with other clearances, states of clearances, and fields `others`."""

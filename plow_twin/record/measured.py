@@ -116,7 +116,8 @@ class Measured:
 def read_measured(folder: Path, scene: Path | None = None) -> Measured:
     """Return the measurements in a folder of tables. If the file `scene` is given, it replaces scene.yaml.
 
-    Raise `RecordingError` if a file or a column is missing, and `SceneError` if the scene is invalid.
+    Raise `RecordingError` if a file or a column is missing or all tables are empty, and `SceneError` if the scene is
+    invalid.
     """
     lost, load = Counter[str](), np.zeros((0, 4))
     if (file := _table(folder, LOAD_FILE)).is_file():
@@ -129,6 +130,8 @@ def read_measured(folder: Path, scene: Path | None = None) -> Measured:
     poses = np.zeros((0, 4))
     if (file := _table(folder, POSE_FILE)).is_file() or not len(gaps):
         poses = _read(file, lost, _POSE_COLUMNS)
+    if not (len(load) or len(poses) or len(gaps)):
+        raise RecordingError(f"{folder}: got no load and no measured pose, expected at least one row")
     model = load_scene(scene_path(str(scene)) if scene else folder / SCENE_FILE)
     first = next((table[0, 0] for table in (load, poses, gaps) if len(table)), 0.0)
     if first >= EPOCH_S:

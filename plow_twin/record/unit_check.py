@@ -148,14 +148,14 @@ def check_units(messages: Iterable[Arrived], roles: Mapping[str, Role], scene: S
                 stamps.append(reading[0] * 1e-9)
             for name, value in reading[1].items():
                 values.setdefault((role, name), []).append(value)
-    load = roles.get("excitation")
-    doubts = [
-        doubt
-        for doubt in unit_doubts(values, stamps, scene)
-        if doubt.advice or not (load and load.stamp_unit_is_stated if doubt.names == ("t",) else _stated(doubt, roles))
-    ]
+    doubts = unstated(unit_doubts(values, stamps, scene), roles)
     if doubts:
         raise UnitError(f"{source}: " + "; ".join(f"{doubt}: {doubt.remedy}" for doubt in doubts))
+
+
+def unstated(doubts: Iterable[UnitDoubt], roles: Mapping[str, Role]) -> list[UnitDoubt]:
+    """Return the doubts about quantities for which `roles` state no unit, scale or limits, and doubts with `advice`."""
+    return [doubt for doubt in doubts if doubt.advice or not _stated(doubt, roles)]
 
 
 def check_poses(t: Array, q: Array, scene: Scene, source: object) -> None:
@@ -172,7 +172,11 @@ def check_poses(t: Array, q: Array, scene: Scene, source: object) -> None:
 
 
 def _stated(doubt: UnitDoubt, roles: Mapping[str, Role]) -> bool:
-    role = roles[doubt.role]
+    role = roles.get(doubt.role)
+    if role is None:
+        return False
+    if doubt.names == ("t",):
+        return role.stamp_unit_is_stated
     return set(doubt.names) <= {*role.factor, *role.scale, *role.limits}
 
 

@@ -25,7 +25,7 @@ def estimate_picture(
         for name, row in estimated_rows(result, labels).items()
     ]
     motion = result.motion or Motion(poses.t, poses.q, np.full_like(poses.q, np.nan))
-    trust = f"window from {result.t_start:.2f} s to {result.t_end:.2f} s; model {result.model}, sensor {result.sensor}"
+    trust = f"window from {result.t_start:.2f} s to {result.t_end:.2f} s; {result.trust}"
     notes = (trust, *result.reasons)
     return FittedPicture(title, motion, rows, "prior", "90 % interval of the prior", result.noise, notes)
 
