@@ -59,10 +59,12 @@ from plow_twin.record.times import time_ns
 from plow_twin.record.unused import unused_messages
 from plow_twin.record.writer import RunWriter
 from plow_twin.scene_file import load_scene
+from plow_twin.scene_file.presets import scene_path
 from plow_twin.solve.state import Status
 from plow_twin.stream.intake import Verdict
 from plow_twin.stream.journal import Gaps, Mark, Parameter, PartOfPose, Pose, Unused
 from plow_twin.stream.limits import pose_limits, value_limits
+from plow_twin.study.analysis.analyse import analyse
 from plow_twin.view.run_curves import RunCurves
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -1024,6 +1026,32 @@ def test_a_sample_that_is_late_by_less_than_rollback_span_is_used(
     assert run_cli(["live", str(path), "--json"]) == 0
     counted = json.loads(capsys.readouterr().out)["input"]
     assert (counted["samples_used"], counted["rolled_back"]) == ("2300", "1")
+
+
+@pytest.mark.parametrize("name", ["timestamp", "Time", "time_s", "Stamp", "Zeit [ms]", "t_us"])
+def test_live_and_analyse_recognise_the_same_column_of_times(name: str, tmp_path: Path) -> None:
+    scale = {"Zeit [ms]": 1e3, "t_us": 1e6}.get(name, 1.0)
+    rows = [f"{fx},{fy},{m},{scale * t:.0f}" for t, fx, fy, m in map(_row, range(0, 300_000, 1000))]
+    (path := tmp_path / "load.csv").write_text(f"fx,fy,m,{name}\n" + "\n".join(rows) + "\n")
+    counted = _run(path, record_path=str(tmp_path / "run"))["input"][2]
+    assert (counted["samples_in"], counted["samples_used"]) == ("300", "300")
+    for recording, scene in ((tmp_path / "run", None), (path, scene_path("paper"))):
+        assert analyse(recording, scene=scene).predictions[0].loads.duration_s == pytest.approx(299.0)
+
+
+@pytest.mark.parametrize("command", [["live"], ["analyse"], ["live", "--follow", "--seconds", "5"]])
+@pytest.mark.parametrize("header", ["clock,fx,fy,m", "time_s,fx,fy,m,time_ms"])
+def test_a_file_without_one_column_of_times_is_refused(
+    command: list[str], header: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (path := tmp_path / "load.csv").write_text(header + "\n" + "0,1,2,3,4\n"[: 2 * header.count(",") + 1] + "\n")
+    assert run_cli([*command, str(path), "--scene", "paper"]) == 1
+    expected = "expected one column with a name such as t, time, timestamp or stamp, also with a unit such as time_ms"
+    assert f"load: time: got the columns {header.replace(',', ', ')}, {expected}" in capsys.readouterr().err
+    (mapping := tmp_path / "map.yaml").write_text("excitation: {topic: load, stamp: log}")
+    if command == ["live"]:
+        assert run_cli(["live", str(path), "--scene", "paper", "--map", str(mapping)]) == 1
+        assert "excitation.stamp: got 'log', expected a column" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("setting", "reported"), [("follow=full", True), ("follow=parameters", False)])

@@ -235,16 +235,16 @@ def test_a_partial_recording_beside_a_run_is_read_to_its_end_and_its_loss_counte
 
 
 def test_a_stamp_unit_without_a_stamp_column_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "load.csv").write_text("zeit,fx,fy,m\n" + "".join(f"{t},0,0,0\n" for t in range(100)))
+    (tmp_path / "load.csv").write_text("clock,fx,fy,m\n" + "".join(f"{t},0,0,0\n" for t in range(100)))
     mapping = tmp_path / "map.yaml"
     for stamp, message in (
-        ("", "with the name of its column: the columns zeit, fx, fy, m have none of"),
+        ("", "with the name of its column: the columns clock, fx, fy, m have none of"),
         ("stamp: log, ", "no stamp_unit with stamp: log"),
     ):
         mapping.write_text(f"excitation: {{topic: load, {stamp}stamp_unit: ms}}")
         with pytest.raises(RecordingError, match=f"excitation.stamp_unit: got 'ms', expected .*{message}"):
             analyse(tmp_path, scene=PAPER, mapping=mapping)
-    mapping.write_text("excitation: {topic: load, stamp: zeit, stamp_unit: ms}")
+    mapping.write_text("excitation: {topic: load, stamp: clock, stamp_unit: ms}")
     assert analyse(tmp_path, scene=PAPER, mapping=mapping).predictions[0].loads.duration_s == pytest.approx(0.099)
     (bag := tmp_path / "bag").mkdir()
     kind = "geometry_msgs/msg/WrenchStamped"

@@ -301,6 +301,9 @@ def roles_of(
         raise BridgeError(
             f"excitation: got no load by names or mapping in {complaints}, expected the columns fx, fy, m{setup}"
         )
+    for name, role in roles.items() if bridge.ends else ():
+        if role.stamp == "log":
+            raise BridgeError(f"{name}.stamp: got 'log', expected a column: a row of a file has no time of receipt")
     return with_units(roles, units)
 
 

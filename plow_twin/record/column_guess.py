@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError, UnitError
 from plow_twin.model.scene import Scene
+from plow_twin.record.column_names import TIME_NAMES, plain_name, unit_of
 from plow_twin.record.map_file import QUANTITIES, ROLES, UNITS
 from plow_twin.record.sources import columns_of
 from plow_twin.record.times import NUMBER, STAMP_UNITS, time_ns
@@ -24,7 +25,7 @@ from plow_twin.scene_file.yaml_text import dump_yaml
 
 Array = NDArray[np.float64]
 
-#: Pattern of the column names of each quantity, by role and quantity. It is matched with the result of `_plain`.
+#: Pattern of the column names of each quantity, by role and quantity. It is matched with the result of `plain_name`.
 _NAMES: Final = {
     ("excitation", "fx"): r"fx|(force|load|kraft|last)x|x(force|load|kraft)|fhor(izontal)?|horizontalforce",
     ("excitation", "fy"): r"fy|(force|load|kraft|last)y|y(force|load|kraft)|fver(tical)?|verticalforce",
@@ -34,10 +35,6 @@ _NAMES: Final = {
     ("head_pose", "theta"): r"theta|angle|winkel|phi|rot(ation)?|tilt",
     ("travel", "speed"): r"speed|v|velocity|geschwindigkeit|ploughspeed",
 }
-_TIME: Final = r"t|time|timestamp|stamp|zeit|zeitstempel|date|datetime|datum"
-_UNIT: Final = re.compile(
-    r"(.+?)\s*(?:[\[(]\s*([^\])]+?)\s*[\])]|[ _](kN ?m|N ?m|kN|N|mm|cm|m|mrad|rad|deg|ms|us|ns|s))"
-)
 #: Smallest time that is read as a date, for each unit of time. The same date in 2001 is written in each unit.
 _DATES: Final = (("ns", 1e18), ("us", 1e15), ("ms", 1e12), ("s", 1e9))
 #: Largest number of table cells that are examined. The more columns a file has, the fewer rows are examined.
@@ -117,7 +114,7 @@ def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: M
         if key[1] in columns:
             guess.columns[key], guess.because[key[1]] = columns[key[1]], "as stated"
             continue
-        alike = [name for name in guess.names if name != guess.time and re.fullmatch(pattern, _plain(name))]
+        alike = [name for name in guess.names if name != guess.time and re.fullmatch(pattern, plain_name(name))]
         if len(alike) == 1:
             guess.columns[key], guess.because[key[1]] = alike[0], "by its name"
         elif alike:
@@ -168,7 +165,7 @@ def _read(path: Path) -> tuple[Guess, list[list[str]]]:
 def _find_time(
     guess: Guess, rows: Sequence[Sequence[str]], numbers: Mapping[str, Array], given: str, unit: str
 ) -> None:
-    alike = [name for name in guess.names if re.fullmatch(_TIME, _plain(name))]
+    alike = [name for name in guess.names if re.fullmatch(TIME_NAMES, plain_name(name))]
     rising = [name for name, values in numbers.items() if len(values) > 2 and (np.diff(values) > 0.0).all()]
     choices = [given] if given else alike or rising
     if len(choices) != 1:
@@ -190,7 +187,7 @@ def _find_time(
         if not all(_ZONE.search(row[index].strip()) for row in rows):
             guess.because["t"] += "; dates without a zone are UTC"
         return
-    header = _unit_of(guess.time)
+    header = unit_of(guess.time)
     newest = float(np.nanmax(np.abs(column)))
     dates = next((name for name, least in _DATES if newest > least), "")
     guess.time_unit = unit or (header if header in STAMP_UNITS else "") or dates or "s"
@@ -201,7 +198,7 @@ def _find_time(
 
 def _find_units(guess: Guess, numbers: Mapping[str, Array], scene: Scene, units: Mapping[str, str]) -> None:
     for key, column in guess.columns.items():
-        unit = units.get(key[1]) or _unit_of(column)
+        unit = units.get(key[1]) or unit_of(column)
         units_of_quantity = UNITS[QUANTITIES[key]]
         if units.get(key[1]) and unit not in units_of_quantity:
             raise UnitError(f"unit of {key[1]}: got {unit!r}, expected one of {', '.join(units_of_quantity)}")
@@ -240,14 +237,3 @@ def _find_units(guess: Guess, numbers: Mapping[str, Array], scene: Scene, units:
 def _number(cell: str) -> float:
     cell = cell.strip()
     return float(cell) if NUMBER.fullmatch(cell) else np.nan
-
-
-def _unit_of(name: str) -> str:
-    match = _UNIT.fullmatch(name)
-    unit = (match[2] or match[3]) if match else ""
-    return {"Nm": "N m", "kNm": "kN m", "°": "deg", "µm": "um", "sec": "s"}.get(unit, unit)
-
-
-def _plain(name: str) -> str:
-    match = _UNIT.fullmatch(name)
-    return re.sub(r"[^a-z0-9]", "", (match[1] if match else name).lower())

@@ -9,7 +9,7 @@ from __future__ import annotations
 import fnmatch
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -17,9 +17,10 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.errors import UnitError
+from plow_twin.errors import RecordingError, UnitError
 from plow_twin.model.geometry import angle_of
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.record.column_names import TIME_EXPECTED, time_column, unit_of
 from plow_twin.record.map_file import (
     LOAD_MODEL,
     OPCUA,
@@ -351,6 +352,7 @@ def _role(path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str, 
     _check_columns(path, role, read_role)
     if "stamp_unit" in entry:
         _check_stamp_unit(path, role, read_role)
+    read_role = _with_time_column(read_role, lambda got, expected: map_error(path, f"{role}.stamp", str(got), expected))
     if kind == OPCUA:
         _check_nodes(path, role, read_role)
     elif not isinstance(kind, Columns) and kind != "json" and read_role.stamp not in ("header", "log"):
@@ -414,12 +416,31 @@ def _check_columns(path: Path, name: str, role: Role) -> None:
             raise map_error(path, f"{name}.{key}", column, f"one of the {columns}")
 
 
+def _with_time_column(role: Role, error: Callable[[Columns, str], Exception]) -> Role:
+    """Return the role with the column of the time, unless the mapping states the stamp.
+
+    The unit in the name of the column applies unless the mapping states a unit. If no column is recognised, messages
+    get the time of receipt, and a table from a file, whose rows have none, raises the error.
+    """
+    columns = role.message_type
+    if role.stamp != "header" or not isinstance(columns, Columns):
+        return role
+    stamp = time_column(columns.names)
+    if stamp is None:
+        if columns.are_received:
+            return role
+        raise error(columns, f"one column with a name such as {TIME_EXPECTED}, or stamp: COLUMN in a mapping")
+    in_name = unit_of(stamp)
+    unit = in_name if in_name in STAMP_UNITS and not role.stamp_unit_is_stated else role.stamp_unit
+    return replace(role, stamp=stamp, stamp_unit=unit)
+
+
 def _check_stamp_unit(path: Path, name: str, role: Role) -> None:
     kind, reason = role.message_type, ""
     if role.stamp == "log":
         reason = "no stamp_unit with stamp: log"
-    elif role.stamp == "header" and isinstance(kind, Columns) and not set(TIMES) & set(kind.names):
-        reason = f"also a stamp with the name of its column: the {kind} have none of {', '.join(TIMES)}"
+    elif role.stamp == "header" and isinstance(kind, Columns) and time_column(kind.names) is None:
+        reason = f"also a stamp with the name of its column: the {kind} have none of {TIME_EXPECTED}"
     elif role.stamp == "header" and not isinstance(kind, Columns) and kind != "json":
         reason = f"no stamp_unit: {kind} has stamps in ns"
     if reason:
@@ -465,6 +486,10 @@ def _guess(role: str, topics: Mapping[str, TopicType]) -> Role | None:
     # the roles `forces` and `gaps` are found by name only, because their message type is common
     lonely = list(fitting) if len(fitting) == 1 and role in ("excitation", "head_pose", "travel") else []
     lonely = [topic for topic in lonely if topic.rpartition("/")[2] not in ("head_state", "contact_forces")]
-    for topic in (*ending, *lonely):
-        return Role(topic, topics[topic], fitting[topic])
-    return None
+    found = [*ending, *lonely]
+    if not found:
+        return None
+    return _with_time_column(
+        Role(found[0], topics[found[0]], fitting[found[0]]),
+        lambda got, expected: RecordingError(f"{found[0]}: time: got the {got}, expected {expected}"),
+    )

@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.chunks import MAGIC, Channel, ChunkReader, is_mcap
+from plow_twin.record.column_names import time_column
 from plow_twin.record.merging import StampOf, merged
 from plow_twin.record.metadata_yaml import missing_files
 from plow_twin.record.reader import packed, part_number, run_parts
-from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, time_ns
+from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, time_ns
 from plow_twin.scene_file.csv_rows import csv_rows, open_csv, tables
 from plow_twin.scene_file.parquet_lines import is_parquet
 
@@ -56,6 +57,8 @@ class Columns:
     """
 
     names: tuple[str, ...]
+    #: whether the lines arrive one by one, so that a line without a time can get the time of receipt
+    are_received: bool = False
 
     def __str__(self) -> str:
         """Return the names for a message, with a hint if the header row or the separators seem to be missing."""
@@ -387,7 +390,7 @@ class CsvSource:
     def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf[Arrived] | None = None) -> Iterator[Arrived]:
         """Return an iterator over the rows of the wanted files in the order of their stamps.
 
-        Without `stamp_ns`, the stamp is read from the column `t`, the column `time`, or the first column.
+        Without `stamp_ns`, the stamp is read from the column that `time_column` returns.
         """
         streams = [self._rows(part) for part in self.parts if wanted(part.stem)]
         if len(streams) == 1:
@@ -399,7 +402,8 @@ class CsvSource:
             with open_csv(part) as stream:
                 rows = csv_rows(stream)
                 names = tuple(name.strip() for name in next(rows, (0, []))[1])
-                place = next((names.index(name) for name in TIMES if name in names), 0)
+                column = time_column(names)
+                place = len(names) if column is None else names.index(column)
                 for _, cells in rows:
                     time = _row_time_ns(cells[place]) if place < len(cells) else NO_TIME
                     yield Arrived(part.stem, time, dict(zip(names, cells, strict=False)))

@@ -6,6 +6,7 @@ import csv
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any, Final, Protocol, runtime_checkable
 
 from plow_twin.errors import PlowTwinError
@@ -130,8 +131,8 @@ class Rows:
         return self.columns is not None and not self._json
 
     def header(self, source: str) -> Columns:
-        """Return the result of `columns_of` for the columns."""
-        return columns_of(source, self.columns or ())
+        """Return the result of `columns_of` for the columns of lines that arrive one by one."""
+        return replace(columns_of(source, self.columns or ()), are_received=True)
 
     def of_another_file(self) -> Rows:
         """Return a parser for the next file, which has the columns of this file if it has no header."""
