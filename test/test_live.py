@@ -1028,6 +1028,23 @@ def test_a_sample_that_is_late_by_less_than_rollback_span_is_used(
     assert (counted["samples_used"], counted["rolled_back"]) == ("2300", "1")
 
 
+@pytest.mark.parametrize(
+    ("step_s", "code", "unused"),
+    [(2.005, 0, "with earlier samples (43) or dropped (0 duplicate, 0"), (2.0, 3, "(3) or dropped (40 duplicate, 0")],
+)
+def test_a_step_back_of_the_clock_within_jump_back_is_named(
+    step_s: float, code: int, unused: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    times = [0.01 * index - (step_s if index >= 240 else 0.0) for index in range(280)]
+    rows = [f"{t:.3f},{','.join(map(repr, _row(10 * index)[1:]))}" for index, t in enumerate(times)]
+    rows[100], rows[103] = rows[103], rows[100]  # two samples that arrive in another order are no step
+    (path := tmp_path / "load.csv").write_text("t,fx,fy,m\n" + "\n".join(rows) + "\n")
+    assert run_cli(["live", str(path), "--scene", "paper", "--quiet"]) == code
+    shown = capsys.readouterr().err
+    assert f"the stamps stepped back (1) by up to {step_s - 0.01:.4g} s" in shown and unused in shown
+    assert "too few digits" not in shown
+
+
 @pytest.mark.parametrize("name", ["timestamp", "Time", "time_s", "Stamp", "Zeit [ms]", "t_us"])
 def test_live_and_analyse_recognise_the_same_column_of_times(name: str, tmp_path: Path) -> None:
     scale = {"Zeit [ms]": 1e3, "t_us": 1e6}.get(name, 1.0)

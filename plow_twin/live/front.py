@@ -184,7 +184,16 @@ class BridgeFront:
         many = _MANY * max(1, sum(counts.values()))
         if self._feeder.unfit:
             found.append(f"{counts[Verdict.MALFORMED]} malformed; the first: {self._feeder.unfit}")
-        if counts[Verdict.DUPLICATE] > many:
+        # late samples of a network can also be in order, whereas the rows of a file are in the order of the measurement
+        steps = self.runtime.driver.intake.steps_back if self._bridge.ends else 0
+        if steps:
+            largest_s = self.runtime.driver.intake.largest_step_back_ns * 1e-9
+            found.append(
+                f"the stamps stepped back ({steps}) by up to {largest_s:.4g} s, so the samples after a step are mixed "
+                f"with earlier samples ({counts[Verdict.INSERTED]}) or dropped ({counts[Verdict.DUPLICATE]} duplicate, "
+                f"{counts[Verdict.OUT_OF_ORDER]} out of order): was a clock set? Expected rising stamps"
+            )
+        if counts[Verdict.DUPLICATE] > many and not steps:
             found.append(
                 f"{counts[Verdict.DUPLICATE]} samples have the stamp or number of another sample: "
                 "do the times have too few digits?"

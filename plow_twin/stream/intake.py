@@ -21,6 +21,11 @@ NS_PER_S = 1_000_000_000
 _END_NS = 2**31 * NS_PER_S
 
 
+#: Least number of successive late samples, in the order of their stamps, that show a step of the sender's clock. Late
+#: samples of a network are single samples or a few, and a step of the clock by d seconds makes d times the rate late.
+_STEP_BACK = 10
+
+
 class KnownStamps(Protocol):
     """Stamps of earlier samples, among which a late sample can be inserted."""
 
@@ -113,6 +118,11 @@ class Intake:
         self._before_jump_ns: int | None = None
         #: whether the last sample returned to the stamps before a jump, so that the stamps since the jump were wrong
         self.returned = False
+        #: number of steps back of the stamps by at most `jump_back_s`, and the largest step [ns]
+        self.steps_back = self.largest_step_back_ns = 0
+        #: number of successive late samples in the order of their stamps, the last of their stamps, and the step before
+        #: the first of these samples [ns]
+        self._late_in_order = self._late_ns = self._step_ns = 0
         #: number of missing samples before the last jump
         self._missing_before = 0
         self._first_ns = 0
@@ -152,6 +162,7 @@ class Intake:
         wrong stamp could exclude all correct stamps.
         """
         verdict = self._judge(stamp_ns, values, reached_ns, history)
+        self._follow_late(stamp_ns, verdict)
         self.returned = verdict.resets and self._goes_on_from_before(stamp_ns)
         if verdict.resets and not (may_reset or self.returned):
             verdict = Verdict.UNSTEADY
@@ -201,6 +212,7 @@ class Intake:
     def accept(self, stamp_ns: int, values: Sequence[float], count: int = 1) -> None:
         """Count `count` samples for which `goes_on` is True; stamp and values are of the last of these samples."""
         self.returned = False
+        self._late_in_order = 0
         self.counts[Verdict.ACCEPTED] += count
         self._since_first += count
         self._newest_ns, self._newest_values = stamp_ns, values
@@ -214,6 +226,19 @@ class Intake:
         """Forget the newest stamp, so that the next sample is treated as the first sample. The counts do not change."""
         self._missing_before = self.missing
         self._newest_ns = None
+
+    def _follow_late(self, stamp_ns: int, verdict: Verdict) -> None:
+        newest_ns = self._newest_ns
+        if newest_ns is None or verdict not in (Verdict.DUPLICATE, Verdict.INSERTED, Verdict.OUT_OF_ORDER):
+            self._late_in_order = 0
+            return
+        if not self._late_in_order or stamp_ns <= self._late_ns:
+            self._late_in_order, self._step_ns = 0, newest_ns - stamp_ns
+        self._late_in_order += 1
+        self._late_ns = stamp_ns
+        if self._late_in_order == _STEP_BACK:
+            self.steps_back += 1
+            self.largest_step_back_ns = max(self.largest_step_back_ns, self._step_ns)
 
     def _judge(
         self, stamp_ns: int, values: Sequence[float], reached_ns: int | None, history: KnownStamps | None
