@@ -46,6 +46,11 @@ def test_a_spreadsheet_s_file_becomes_a_mapping_with_which_the_twin_runs(
     assert cli(["setup", str(file), "--out", str(out)]) == 0
     output = capsys.readouterr().out
     assert "semicolon, decimal commas, a row each 0.001 s" in output and "plow-twin live" in output
+    assert "SI" not in output
+    roles = yaml.safe_load((out / "map.yaml").read_text())
+    assert roles["excitation"]["unit"] == {"fx": "kN", "fy": "kN", "m": "kN m"} and roles["head_pose"]["unit"] == {
+        "x": "mm"
+    }
     assert (out / "setup.png").stat().st_size > 10_000
     assert cli(["info", str(file), "--map", str(out / "map.yaml"), "--json"]) == 0
     read = json.loads(capsys.readouterr().out)["roles"]
@@ -78,6 +83,8 @@ def test_units_follow_from_names_or_magnitudes(
 ) -> None:
     guess = guess_columns(_file(tmp_path / "own.csv", header, step=step, size=size), PAPER, {}, {})
     assert guess.units | {"t": guess.time_unit} == units and not guess.open
+    in_si = {"fx": "N", "fy": "N", "m": "N m"}
+    assert guess.mapping()["excitation"]["unit"] == {name: units.get(name, unit) for name, unit in in_si.items()}
     largest = {name: float(abs(found).max()) for (_, name), found in guess.values.items()}
     phase = math.sin(2e-3 * 599)
     assert largest == pytest.approx(

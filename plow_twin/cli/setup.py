@@ -101,6 +101,7 @@ _STUB = """\
 def _show(guess: Guess) -> None:
     import numpy as np
 
+    from plow_twin.record.map_file import QUANTITIES, UNITS
     from plow_twin.scene_file.parquet_lines import is_parquet
 
     names = {",": "comma", ";": "semicolon", "\t": "tab"}
@@ -109,10 +110,11 @@ def _show(guess: Guess) -> None:
     spacing = float(np.nanmedian(np.diff(guess.stamps_s))) if len(guess.stamps_s) > 1 else float("nan")
     rate = f", a row each {spacing:.4g} s"
     click.echo(f"{guess.path}: {form}{rate}")
-    shown = table("Columns", "number", "column", "unit", "largest [SI]", "found")
+    shown = table("Columns", "number", "column", "unit", "largest", "found")
     unit = guess.time_unit or "date"
     shown.add_row("t", guess.time, unit, "", guess.because["t"])
     for (role, name), column in guess.columns.items():
         largest = float(np.nanmax(np.abs(guess.values[role, name]), initial=0.0))
-        shown.add_row(name, column, guess.units.get(name, "SI"), f"{largest:.4g}", guess.because[name])
+        si = next(iter(UNITS[QUANTITIES[role, name]]))
+        shown.add_row(name, column, guess.unit(role, name), f"{largest:.4g} {si}", guess.because[name])
     output_console().print(shown)

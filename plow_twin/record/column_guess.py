@@ -66,14 +66,17 @@ class Guess:
     #: values of the columns in SI, by role and quantity
     values: dict[tuple[str, str], Array] = field(default_factory=dict)
 
+    def unit(self, role: str, name: str) -> str:
+        """Return the unit of a quantity in the file, which may be the SI unit."""
+        return self.units.get(name) or next(iter(UNITS[QUANTITIES[role, name]]))
+
     def mapping(self) -> dict[str, Any]:
         """Return the content of a mapping file."""
         roles: dict[str, Any] = {}
         for (role, name), column in self.columns.items():
             entry = roles.setdefault(role, {"topic": self.path.stem, "fields": {}})
             entry["fields"][name] = column
-            if name in self.units:
-                entry.setdefault("unit", {})[name] = self.units[name]
+            entry.setdefault("unit", {})[name] = self.unit(role, name)
         for entry in roles.values():
             entry["stamp"] = self.time
             if self.time_unit:
