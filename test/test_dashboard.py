@@ -428,12 +428,14 @@ def test_a_recording_is_shown_during_and_after_the_run_and_accepts_no_requests(t
             _feed(process, 600)
             _stopped(process)
             see(lambda: any("recording: complete" in event["text"] for event in received.get("events", ())))
+            _, peaks = read_recording(tmp_path / "run")["contact_peaks"].numpy()
+            largest = pytest.approx(peaks[:, 16:].max(), rel=1e-6)
+            # a busy server may send the last seconds after the event
+            see(lambda: max(max(row[1:9]) for row in seconds.values()) == largest)
             shown.send_signal(signal.SIGINT)
             assert shown.wait(20) == 0
-    _, peaks = read_recording(tmp_path / "run")["contact_peaks"].numpy()
     assert received["facts"]["can_ask"] is False and received["input"][2]["samples_used"] == str(COUNT)
     assert received["alarms"][2]["force_place"] and received["motion"]["clearance"]["vertical"] == pytest.approx(0.03)
-    assert max(max(row[1:9]) for row in seconds.values()) == pytest.approx(peaks[:, 16:].max(), rel=1e-6)
 
 
 def test_a_recording_s_inputs_are_counted_by_name(tmp_path: Path) -> None:
