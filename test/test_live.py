@@ -814,6 +814,15 @@ print(os.sched_getaffinity(0) == {one})
     assert [line.partition(" ")[0].rstrip(":") for line in lines] == ["priority", "lock_memory", "cpu_affinity", "True"]
 
 
+def test_a_stop_during_the_imports_is_a_normal_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stopped(*_: object) -> int:
+        os.kill(os.getpid(), signal.SIGTERM)
+        raise AssertionError("the signal was ignored")
+
+    monkeypatch.setattr("plow_twin.cli.live._live", stopped)
+    assert run_cli(["live", "-"]) == 0
+
+
 def test_the_priority_is_for_the_computing_thread_alone() -> None:
     code = """
 import os, sys

@@ -98,10 +98,15 @@ def live(source: str, **options: Any) -> int:
     SOURCE is a CSV or Parquet file, a folder of CSV or Parquet files, - (standard input), mqtt[s]://HOST:PORT or
     opc.tcp://HOST:PORT.
     """
-    from plow_twin.live.stop import StopSignals
+    from plow_twin.live.stop import StopRequested, StopSignals
 
     with StopSignals() as stop:
-        return _live(source, stop, options)
+        try:
+            return _live(source, stop, options)
+        except StopRequested:
+            from plow_twin.live.solver_start import leave
+
+            return leave(DONE)
 
 
 def _live(source: str, stop: StopSignals, options: dict[str, Any]) -> int:
@@ -112,51 +117,45 @@ def _live(source: str, stop: StopSignals, options: dict[str, Any]) -> int:
     from plow_twin.live.realtime import apply_realtime, raise_priority
     from plow_twin.live.services import Services
     from plow_twin.live.solver_start import Preparation, leave
-    from plow_twin.live.stop import StopRequested
     from plow_twin.live.timer import Timer
     from plow_twin.telemetry.live import open_output
 
     as_json, quiet, lines = (bool(options[name]) for name in ("as_json", "quiet", "lines"))
     report = Report(lines=lines, quiet=quiet, stamp_ns=lambda: front.runtime.stamp_ns)
-    try:
-        settings = _settings(options)
-        access = access_if_shown(options)
-        outputs = outputs_of(options)
-        bridge = _bridge(source, options, settings.expected_rate)
-        for refused in (*apply_realtime(settings), *raise_priority(settings)):
-            say_error(f"plow-twin: refused by the system: {refused}")
-        with busy("preparing the solver", quiet or not error_console().is_terminal):
-            prepared = Preparation(settings).result(lambda: stop.stopped)
+    settings = _settings(options)
+    access = access_if_shown(options)
+    outputs = outputs_of(options)
+    bridge = _bridge(source, options, settings.expected_rate)
+    for refused in (*apply_realtime(settings), *raise_priority(settings)):
+        say_error(f"plow-twin: refused by the system: {refused}")
+    with busy("preparing the solver", quiet or not error_console().is_terminal):
+        prepared = Preparation(settings).result(lambda: stop.stopped)
 
-        with report, closing(bridge), ExitStack() as opened:
-            control = opened.enter_context(Control(options["control"])) if options["control"] else None
-            front = BridgeFront(
-                bridge, options["mapping"], settings, prepared, report.say, report.error, options["units"]
-            )
-            _say_what_differs(front, settings)
-            if options["metrics"]:
-                from plow_twin.live.metrics import Metrics
+    with report, closing(bridge), ExitStack() as opened:
+        control = opened.enter_context(Control(options["control"])) if options["control"] else None
+        front = BridgeFront(bridge, options["mapping"], settings, prepared, report.say, report.error, options["units"])
+        _say_what_differs(front, settings)
+        if options["metrics"]:
+            from plow_twin.live.metrics import Metrics
 
-                front.attach(opened.enter_context(Metrics(options["metrics"], front.parts())))
-            if control is not None:
-                control.services = Services(front.runtime, front.changed)
-                front.timers.append(Timer(TURN_S, control.turn))
-            screen = None
-            if access is not None:
-                screen = opened.enter_context(open_screen(front, access, source))
-                say_where(screen, access)
-            for output in outputs:
-                opened.enter_context(open_output(front, output, options["out_rate"], source))
-            if isinstance(bridge, Files) and bridge.ends:
-                _say_pace(settings, quiet)
-                update = opened.enter_context(progress_bar("reading", quiet or lines))
-                front.timers.append(Timer(_PROGRESS_S, lambda: update(bridge.share)))
-            stop.interrupt = False
-            lost = front.run(lambda: stop.stopped, options["seconds"] or float("inf"))
-            if screen is not None and bridge.finished and not stop.stopped:
-                stay(screen, lambda: stop.stopped)
-    except StopRequested:
-        return leave(DONE)
+            front.attach(opened.enter_context(Metrics(options["metrics"], front.parts())))
+        if control is not None:
+            control.services = Services(front.runtime, front.changed)
+            front.timers.append(Timer(TURN_S, control.turn))
+        screen = None
+        if access is not None:
+            screen = opened.enter_context(open_screen(front, access, source))
+            say_where(screen, access)
+        for output in outputs:
+            opened.enter_context(open_output(front, output, options["out_rate"], source))
+        if isinstance(bridge, Files) and bridge.ends:
+            _say_pace(settings, quiet)
+            update = opened.enter_context(progress_bar("reading", quiet or lines))
+            front.timers.append(Timer(_PROGRESS_S, lambda: update(bridge.share)))
+        stop.interrupt = False
+        lost = front.run(lambda: stop.stopped, options["seconds"] or float("inf"))
+        if screen is not None and bridge.finished and not stop.stopped:
+            stay(screen, lambda: stop.stopped)
     parts = front.parts()
     facts = {name: values for name, (_, _, values) in parts.items()}
     closed = report.close_lines()
