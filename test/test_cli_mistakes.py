@@ -50,6 +50,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         Path("decimal.csv").write_text(re.sub(r"-?[0-9.]+(e-?[0-9]+)?", "1,5", text))
         _write("millimetres.csv", POSE, x=1e3, y=1e3)
         _write("milliseconds.csv", POSE, t=1e3)
+        _write("planar.csv", POSE[:3])
         _write("degrees.csv", POSE, theta=180.0 / np.pi * 10.0)
         scales = {"kN": {"fx": 1e-3, "fy": 1e-3}, "mm": {"x": 1e3, "y": 1e3}, "ms": {"t": 1e3}, "bars": {}}
         for name, scale in scales.items():
@@ -57,6 +58,9 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
             _write(f"{name}/load.csv", LOAD, separator=separator, **scale)
             _write(f"{name}/pose.csv", POSE, separator=separator, **scale)
             Path(name, "scene.yaml").write_text(scene_path("paper").read_text())
+        _write("planar/pose.csv", POSE[:3])
+        _write("planar/load.csv", LOAD)
+        Path("planar/scene.yaml").write_text(scene_path("paper").read_text())
         for name in ("empty.csv", "taken/notes.txt"):
             Path(name).parent.mkdir(exist_ok=True)
             Path(name).write_text("")
@@ -88,6 +92,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ),
         (["estimate", "ms"], 2, "t: got stamps 10 s apart, expected many samples in each period of such a smooth load"),
         (["estimate", "rowless"], 1, "rowless: got no load and no measured pose, expected at least one row"),
+        (["estimate", "planar"], 1, "t, x, y, theta (the cells of a coordinate that was not measured are empty)"),
         (["estimate", "bars"], 1, "t|fx|fy|m (expected commas, semicolons or tabs between them), expected t, fx, fy"),
         (["estimate", "headless.csv", *MAP], 1, "(no header row?)"),
         (["estimate", "empty.csv", "--scene", "paper"], 1, "empty.csv: got no load, expected at least one row"),
@@ -124,6 +129,12 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ),
         ([*CALIBRATE, "milliseconds.csv"], 2, "t: got stamps 10 s apart"),
         ([*CALIBRATE, "degrees.csv"], 2, "theta: got 5.73, expected less than 0.785 rad; they look like deg"),
+        ([*CALIBRATE, "planar.csv"], 2, "(plow-twin estimate uses poses with unmeasured coordinates, as empty cells)"),
+        (
+            ["study", "sweep", "paper", "--x", "qq=1:2:3", "--statistic", "max.ccw.a", "--t-end", "1", "--out", "new"],
+            2,
+            "got 'qq'; nearest: initial.q[2], initial.q[1], initial.q[0] (plow-twin info",
+        ),
         ([*CALIBRATE, "headless.csv"], 2, "(no header row?)"),
         ([*CALIBRATE, "bars.csv"], 2, "(expected commas, semicolons or tabs between them)"),
         ([*CALIBRATE, "empty.csv"], 2, "columns (none: is it empty?)"),

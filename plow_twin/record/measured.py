@@ -291,7 +291,8 @@ def _read(path: Path, lost: Counter[str], columns: tuple[str, ...], some: tuple[
         names[names.index("time")] = "t"
     missing = [name for name in columns if name not in names]
     if missing:
-        raise RecordingError(f"{path}: got the {header}, expected {', '.join(columns)}")
+        empty = " (the cells of a coordinate that was not measured are empty)" if "x" in columns else ""
+        raise RecordingError(f"{path}: got the {header}, expected {', '.join(columns)}{empty}")
     if some and not set(some) & set(names):
         raise RecordingError(f"{path}: got the {header}, expected t and some of {', '.join(some)}")
     places = [names.index(name) if name in names else len(names) for name in (*columns, *some)]

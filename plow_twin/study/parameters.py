@@ -33,6 +33,8 @@ _CORNERS_CCW: Final = ("bottom_right", "top_right", "top_left", "bottom_left")
 _DERIVED: Final = ("sign", "arm_sign", "scale")
 #: Initial friction of a study that varies the friction of a scene without friction.
 _NO_FRICTION: Final = Friction(0.0)
+#: Length to which a text is cut before the search for similar paths, which is slow for long texts [characters].
+_LONGEST: Final = 100
 _INDEX: Final = re.compile(r"(.+)\[(\d+)\]")
 
 
@@ -74,7 +76,8 @@ def check_path(scene: Scene, path: str) -> str:
     """Return the path if the scene has it; otherwise raise a `StudyError` with the nearest paths."""
     paths = parameter_paths(scene)
     if path not in paths:
-        raise StudyError(f"parameter: got {path!r}, expected one of {', '.join(paths)}{nearest_of(path, paths)}")
+        near = ", ".join(get_close_matches(path[:_LONGEST], paths, n=3, cutoff=0.0))
+        raise StudyError(f"parameter: got {path!r:.200}; nearest: {near} (plow-twin info SCENE shows all numbers)")
     return path
 
 

@@ -15,7 +15,7 @@ from plow_twin.errors import ExcessError, RecordingError
 from plow_twin.model.scene import Table
 from plow_twin.record.reader import RunReader
 from plow_twin.record.recording import read_recording
-from plow_twin.record.sources import Columns, read_columns
+from plow_twin.record.sources import Columns, read_columns, read_table
 from plow_twin.record.times import EPOCH_S
 from plow_twin.run.ensemble import Ensemble
 from plow_twin.stream.journal import Loss, Reset, Restore, SetModel, SetWear
@@ -108,6 +108,11 @@ def load_poses(path: Path) -> PoseRecording:
 
 
 def _read_csv(path: Path) -> PoseRecording:
+    columns, _ = read_table(path)
+    present = set(COLUMNS) & set(columns.names)
+    if "t" in present and 2 <= len(present) < len(COLUMNS):
+        expected = f"{', '.join(COLUMNS)} (plow-twin estimate uses poses with unmeasured coordinates, as empty cells)"
+        raise StudyError(f"{path}: got the {columns}, expected {expected}")
     table = read_columns(path, COLUMNS)
     return PoseRecording(table[:, 0], table[:, 1:], str(path))
 
