@@ -256,6 +256,14 @@ def test_a_stamp_unit_without_a_stamp_column_is_refused(tmp_path: Path) -> None:
         analyse(bag / "run", scene=PAPER, mapping=mapping)
 
 
+def test_a_smaller_unit_of_dates_is_named(tmp_path: Path) -> None:
+    rows = "".join(f"{BASE_NS + 10**6 * row},0,0,0\n" for row in range(100))
+    (load := tmp_path / "load.csv").write_text(f"timestamp,fx,fy,m\n{rows}")
+    with pytest.raises(RecordingError, match=r"'timestamp' in s \(the numbers look like ns: stamp_unit: ns\)"):
+        analyse(load, scene=PAPER)
+    assert analyse(load, scene=PAPER, units={"t": "ns"}).predictions[0].loads.duration_s == pytest.approx(0.099)
+
+
 def test_the_travel_determines_the_passes_of_the_face(tmp_path: Path) -> None:
     with (tmp_path / "load.csv").open("w") as stream:
         stream.write("t,fx,fy,m\n")

@@ -141,9 +141,10 @@ class Role:
         stamp = self.stamp
         if stamp == "header" and isinstance(content, Mapping):
             stamp = next((name for name in TIMES if name in content), stamp)
-        if not with_value:
-            return f"{self.topic} has no time at {stamp!r}"
         likely = likely_unit(_at(content, stamp)) if isinstance(content, Mapping) else None
+        if not with_value:
+            hint = f" in s (the numbers look like {likely}: stamp_unit: {likely})" if likely else ""
+            return f"{self.topic} has no time at {stamp!r}{hint}"
         expected = (
             f"seconds; they look like {likely}: state the unit: --unit t={likely}"
             if likely
