@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from scenes import preset
 from plow_twin import Friction, Harmonic, Initial, simulate
 from plow_twin.estimate.estimate import estimate
 from plow_twin.estimate.forces import draw_scenes
+from plow_twin.estimate.reason import FORCE, LENGTH, Reason
 from plow_twin.estimate.similar import Units
 
 
@@ -32,6 +34,23 @@ def test_a_machine_of_another_size_is_estimated_like_the_paper_s_machine() -> No
     assert [8.0 * twin.clearance.vertical_m for twin in twins] == pytest.approx(
         [twin.clearance.vertical_m for twin in alike]
     )
+
+
+def test_the_reasons_for_a_machine_of_another_size_are_in_si_units() -> None:
+    desk, truth = Units(8.0, 1024.0, 4.0), known()[0][0]
+    load, poses = desk.load(truth.load), desk.poses(truth.poses)
+    begin, scene = float(poses.t[0]), desk.scene(truth.nominal)
+    (few,) = estimate(scene, load, poses.between(begin, begin + 0.01)).reasons
+    assert f"the load's span, {load.t[0]:g} s to {load.t[-1]:g} s" in few
+    step = round(0.1 / float(np.median(np.diff(poses.t))))
+    (rare,) = estimate(scene, load, replace(poses, t=poses.t[::step], q=poses.q[::step])).reasons
+    assert rare == "poses: got 10.0 a second, expected at least 32.0"
+
+
+def test_a_reason_is_converted_to_si_and_copied_with_its_quantities() -> None:
+    shifted = Reason("by {:.2g} m, {:.2g} N", (0.5, LENGTH), (3.0, FORCE)).after("{cell}: ")
+    assert shifted == "{cell}: by 0.5 m, 3 N"
+    assert pickle.loads(pickle.dumps(shifted)).in_si(8.0, 1024.0, 4.0) == "{cell}: by 4 m, 1.5e+03 N"
 
 
 @pytest.mark.parametrize("friction", [Friction(0.2, 0.02), Friction(0.3, stick_stiffness_n_m=5e7)])

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from plow_twin.estimate import tuning
 from plow_twin.estimate.bouncing import Bounced
 from plow_twin.estimate.gaps import GapsFit
+from plow_twin.estimate.reason import LENGTH, Reason
 from plow_twin.estimate.result import Estimate, Interval, State
 
 Array = NDArray[np.float64]
@@ -37,7 +38,11 @@ def with_gaps(result: Estimate, by_gaps: GapsFit) -> Estimate:
         apart = deviations_apart((value.mean, moved), (mean, deviation))
         if state.known and apart > tuning.OUTLYING:
             found.append(
-                f"gaps: {name} {mean:.5f} m by the gaps, {value.mean:.5f} m by the motion, {apart:.1f} deviations apart"
+                Reason(
+                    f"gaps: {name} {{:.5f}} m by the gaps, {{:.5f}} m by the motion, {apart:.1f} deviations apart",
+                    (mean, LENGTH),
+                    (value.mean, LENGTH),
+                )
             )
         if state.known:
             mean, deviation = weighted_mean((mean, deviation), (value.mean, moved))

@@ -16,6 +16,7 @@ from plow_twin.errors import PlowTwinError
 from plow_twin.estimate import tuning
 from plow_twin.estimate.fit import TURNS, Fit, Problem, depth_of
 from plow_twin.estimate.measurements import FEWEST_IN_CONTACT, FEWEST_POSES, usable_rows
+from plow_twin.estimate.reason import FORCE, Reason
 from plow_twin.estimate.unknowns import BIAS, DELAY
 from plow_twin.model.contact import free_force
 from plow_twin.model.geometry import body_states, penetration_rows
@@ -163,7 +164,7 @@ def cells_of(forces_of_fit: ForcesOfFit, solution: Fit, forces: ContactForces) -
             offset[i] = np.median(flight)
             noise[i] = 1.4826 * np.median(np.abs(flight - offset[i]))
     measured = forces.force - offset
-    found_out, pairs = [], []
+    found_out, pairs = list[str](), list[int]()
     largest = float(np.nanmax(fitted.force))
     # the resolution of a cell limits its noise
     noise = np.maximum(noise, 1e-4 * largest)
@@ -173,7 +174,7 @@ def cells_of(forces_of_fit: ForcesOfFit, solution: Fit, forces: ContactForces) -
             continue
         reason = _contradiction(measured[finite], fitted.force[finite], i, largest, float(noise[i]))
         if reason:
-            found_out.append(f"contact forces: {name}: {reason}")
+            found_out.append(reason.after(f"contact forces: {name}: "))
         elif (fitted.force[finite, i] > 0.0).sum() >= FEWEST_IN_CONTACT:
             pairs.append(i)
     if not (found_out or pairs):
@@ -181,8 +182,8 @@ def cells_of(forces_of_fit: ForcesOfFit, solution: Fit, forces: ContactForces) -
     return Cells(np.array(pairs, np.int64), measured, offset, noise, delay), found_out
 
 
-def _contradiction(measured: Array, fitted: Array, pair: int, largest: float, noise: float) -> str:
-    """Return why a cell contradicts the motion, or an empty text.
+def _contradiction(measured: Array, fitted: Array, pair: int, largest: float, noise: float) -> Reason | None:
+    """Return why a cell contradicts the motion, or None.
 
     `measured` and `fitted` contain the measured forces and the forces of the fitted motion in N, shape (n, 8) each.
     """
@@ -190,29 +191,31 @@ def _contradiction(measured: Array, fitted: Array, pair: int, largest: float, no
     if (own > 0.0).sum() < FEWEST_IN_CONTACT:
         most = float(np.abs(measured[:, pair]).max())
         silent = most <= tuning.CELL_SHARE * largest + 6 * noise
-        return "" if silent else f"{most:.3g} N where the motion gives no contact"
+        return None if silent else Reason("{:.3g} N where the motion gives no contact", (most, FORCE))
     value = measured[:, pair]
     ends = np.flatnonzero(np.append(np.diff(value) != 0.0, True))
     for first, end in zip(np.append(0, ends[:-1] + 1), ends + 1, strict=True):
         if end - first >= tuning.STUCK[0] and np.ptp(own[first:end]) > max(tuning.CELL_SHARE * own.max(), 6.0 * noise):
-            return (
-                f"the same value {end - first} times in a row, while the motion's force changes by "
-                f"{np.ptp(own[first:end]):.3g} N"
+            return Reason(
+                f"the same value {end - first} times in a row, while the motion's force changes by {{:.3g}} N",
+                (float(np.ptp(own[first:end])), FORCE),
             )
     if own.max() < 6.0 * noise:
-        return ""
+        return None
     like = np.array([correlation(value, fitted[:, other]) for other in range(PAIR_COUNT)])
     if like[pair] < tuning.LEAST_CORRELATION:
         best = int(np.argmax(like))
         other = f", {like[best]:.2f} with {PAIR_NAMES[best]}" if like[best] > tuning.LEAST_CORRELATION else ""
-        return (
+        return Reason(
             f"correlation of {like[pair]:.2f} with the motion's force{other}, expected at least "
             f"{tuning.LEAST_CORRELATION:g}"
         )
     gain = float(value @ own / (own @ own))
     if abs(gain - 1.0) > tuning.MOST_GAIN:
-        return f"{gain:.3g} times the motion's force, expected {1.0 - tuning.MOST_GAIN:g} to {1.0 + tuning.MOST_GAIN:g}"
-    return ""
+        return Reason(
+            f"{gain:.3g} times the motion's force, expected {1.0 - tuning.MOST_GAIN:g} to {1.0 + tuning.MOST_GAIN:g}"
+        )
+    return None
 
 
 def _delay(forces: ContactForces, fitted: FittedForces) -> float:

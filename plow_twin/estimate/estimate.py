@@ -21,6 +21,7 @@ from plow_twin.estimate.lacking import with_harmonics
 from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses, filled
 from plow_twin.estimate.orientation import misfits_of_axes
 from plow_twin.estimate.pads import shown, with_differences
+from plow_twin.estimate.reason import LENGTH, TIME, Reason
 from plow_twin.estimate.relinearised import with_other_law_numbers
 from plow_twin.estimate.result import Estimate, ForcesUsed, Interval, State
 from plow_twin.estimate.screening import is_dead, is_idle, rests, shortages, thinned, well_measured
@@ -135,7 +136,11 @@ def _estimate(
         if _unexplained(result) and load.interval() > tuning.COARSEST:
             smooth = load.smooth(0.1 * tuning.COARSEST)
             other, following = _from_motion(scene, smooth, poses, (), forces)
-            reason = f"load: a sample every {load.interval():.2g} s, expected {tuning.COARSEST:g} s; taken as averages"
+            reason = Reason(
+                "load: a sample every {:.2g} s, expected {:g} s; taken as averages",
+                (load.interval(), TIME),
+                (tuning.COARSEST, TIME),
+            )
             result = replace(other, reasons=(reason, *other.reasons)) if _known(other) else result
     except (np.linalg.LinAlgError, OverflowError) as error:
         result, following = without_fit(Unknowns(scene), poses, f"the fit cannot be computed: {error}"), ()
@@ -178,9 +183,11 @@ def _from_motion(
     span = float(load.t[0]), float(load.t[-1])
     unknowns = Unknowns.stated(scene, load, poses)
     if len(poses.t) < FEWEST_POSES:
-        few = (
-            f"got {len(poses.t)} poses within the load's span, {span[0]:g} s to {span[1]:g} s, expected at least "
-            f"{FEWEST_POSES}: model and sensor are not checked"
+        few = Reason(
+            f"got {len(poses.t)} poses within the load's span, {{:g}} s to {{:g}} s, expected at least "
+            f"{FEWEST_POSES}: model and sensor are not checked",
+            (span[0], TIME),
+            (span[1], TIME),
         )
         return replace(prior_of(unknowns, span), reasons=(few,)), ()
     short_of = shortages(poses)
@@ -350,8 +357,12 @@ def under_uncertain_load(
         most, touched = tuning.OBSERVED_SHARE * prior[1], bool(compared.touched[index])
         observed = touched and deviation < most
         if not observed:
-            wide = f"deviation of {deviation:.2g} m under an uncertain load, expected less than {most:.2g} m"
-            reasons.append(unobserved_because(index, wide if touched else "a wall is hardly touched"))
+            wide = Reason(
+                "deviation of {:.2g} m under an uncertain load, expected less than {:.2g} m",
+                (deviation, LENGTH),
+                (most, LENGTH),
+            )
+            reasons.append(unobserved_because(index, wide if touched else Reason("a wall is hardly touched")))
         values.append(Interval.normal(*((mean, deviation) if observed else prior)).above(0.0))
         states.append(state_of(False, observed, rough=True))
     exponent = unknowns.scene.contact.exponent

@@ -12,6 +12,7 @@ from dataclasses import replace
 from plow_twin.estimate import tuning
 from plow_twin.estimate.discrepancy import CREEP, EXPONENT, FRICTION, Graded, least_change, moved_scene
 from plow_twin.estimate.fit import Fit, Problem, fit
+from plow_twin.estimate.reason import NUMBER, SPEED, Reason
 from plow_twin.estimate.summary import if_it_differs
 from plow_twin.estimate.unknowns import SOFTNESS, Unknowns
 from plow_twin.estimate.verdict import Verdict, judge
@@ -70,13 +71,14 @@ def _changed(unknowns: Unknowns, changes: dict[str, float], depth: float) -> Unk
     return replace(unknowns, scene=scene, nominal_scene=nominal, changes=changes)
 
 
-def _named(unknowns: Unknowns) -> str:
+def _named(unknowns: Unknowns) -> Reason:
     """Return a text with the numbers of the nominal and of the changed scene."""
-    texts = []
+    forms, numbers = [], []
     for path in unknowns.changes:
-        value, nominal = (_value(scene, path) for scene in (unknowns.scene, unknowns.nominal_scene))
-        texts.append(f"{path}: {value:.3g} explains the motion, the scene has {nominal:.3g}")
-    return ", ".join(texts)
+        forms.append(f"{path}: {{:.3g}} explains the motion, the scene has {{:.3g}}")
+        dimension = SPEED if path == CREEP else NUMBER
+        numbers += [(_value(scene, path), dimension) for scene in (unknowns.scene, unknowns.nominal_scene)]
+    return Reason(", ".join(forms), *numbers)
 
 
 def _value(scene: Scene | None, path: str) -> float:

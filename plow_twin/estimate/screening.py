@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from plow_twin.estimate import tuning
 from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses, filled, useless_deviation
+from plow_twin.estimate.reason import FREQUENCY, LENGTH, NUMBER, Reason
 from plow_twin.estimate.start import noise_level
 from plow_twin.estimate.verdict import COMPONENTS
 from plow_twin.model import geometry
@@ -20,8 +21,10 @@ Array = NDArray[np.float64]
 def shortages(poses: Poses) -> tuple[str, ...]:
     """Return messages about components that were hardly measured, or about poses that are too rare."""
     useless = tuple(
-        f"{name}: stated deviation {deviation:g}, expected at most {most:g}"
-        for name, deviation, most in zip(COMPONENTS, poses.deviation, useless_deviation(), strict=True)
+        Reason(f"{name}: stated deviation {{:g}}, expected at most {{:g}}", (deviation, dimension), (most, dimension))
+        for name, deviation, most, dimension in zip(
+            COMPONENTS, poses.deviation, useless_deviation(), (LENGTH, LENGTH, NUMBER), strict=True
+        )
         if deviation > most
     )
     if useless:
@@ -37,8 +40,9 @@ def shortages(poses: Poses) -> tuple[str, ...]:
     # a flight within a gap is not measured
     apart = max(poses.interval(), poses.gap())
     if apart > tuning.SPARSEST:
-        reasons = (f"poses: got {1.0 / apart:.1f} a second, expected at least {1.0 / tuning.SPARSEST:.1f}",)
-    return reasons
+        rates = (1.0 / apart, FREQUENCY), (1.0 / tuning.SPARSEST, FREQUENCY)
+        return (Reason("poses: got {:.1f} a second, expected at least {:.1f}", *rates),)
+    return ()
 
 
 def well_measured(poses: Poses) -> Poses | None:

@@ -14,6 +14,7 @@ from plow_twin.estimate import tuning
 from plow_twin.estimate.gaps import Gaps
 from plow_twin.estimate.measurements import Deviation, Load, Poses
 from plow_twin.estimate.priors import KINDS
+from plow_twin.estimate.reason import Reason
 from plow_twin.estimate.result import Estimate
 from plow_twin.estimate.unknowns import QUANTITIES
 from plow_twin.model import geometry
@@ -136,10 +137,6 @@ class Units:
                 return length / self.force
             return length if name.startswith(("frame.", "corner_", "turn_", "lever_")) else 1.0
 
-        scale = (
-            f"the reasons are in units of {length:g} m, {self.mass:g} kg, {time:g} s, because the machine does not "
-            "have the paper's size",
-        )
         return replace(
             estimate,
             t_start=estimate.t_start * time,
@@ -152,7 +149,10 @@ class Units:
             },
             groups={name: (value.times(length), state) for name, (value, state) in estimate.groups.items()},
             forces_measured=estimate.forces_measured and estimate.forces_measured.in_units(self.force, self.time),
-            reasons=estimate.reasons + scale if estimate.reasons else (),
+            reasons=tuple(
+                reason.in_si(length, mass, time) if isinstance(reason, Reason) else reason
+                for reason in estimate.reasons
+            ),
             load_harmonics=estimate.load_harmonics and estimate.load_harmonics.in_units(self.force, length, time),
             apparent=apparent and (apparent[0].times(length), apparent[1].times(length)),
             motion=estimate.motion and estimate.motion.in_units(length, time),

@@ -18,6 +18,7 @@ from plow_twin.estimate.fit import WALLS, Fit, Problem, eliminated, scatter_rati
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.pads import by_group, of_differences
 from plow_twin.estimate.priors import UNSTATED
+from plow_twin.estimate.reason import LENGTH, TIME, Reason
 from plow_twin.estimate.result import NORMAL_P95, Estimate, ForcesUsed, Interval, Motion, State
 from plow_twin.estimate.start import range_of_motion, reaches
 from plow_twin.estimate.unknowns import (
@@ -89,12 +90,16 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, forces: ContactForce
         observed = tested and seconds[index] > tuning.TOUCHED and shared[index] > LEAST_CLEARANCE
         observed &= deviation[index] < most and (finished or rough)
         if not observed and (finished or rough) and (rough or not suspect):
-            why = f"deviation of {deviation[index]:.2g} m, expected less than {most:g} m"
+            why = _wide(float(deviation[index]), most)
             if not tested:
                 predictable = f"{share[index]:.0%} of {COMPONENTS[index]} is predicted"
-                why = f"{predictable}, expected {tuning.PREDICTED:.0%} or more"
+                why = Reason(f"{predictable}, expected {tuning.PREDICTED:.0%} or more")
             elif seconds[index] <= tuning.TOUCHED:
-                why = f"a wall is touched for {seconds[index]:.2g} s, expected more than {tuning.TOUCHED:g} s"
+                why = Reason(
+                    "a wall is touched for {:.2g} s, expected more than {:g} s",
+                    (float(seconds[index]), TIME),
+                    (tuning.TOUCHED, TIME),
+                )
             reasons.append(unobserved_because(index, why))
         apparent.append(Interval.normal(shared[index], deviation[index]))
         value = Interval.of_halves(published[index], *spread[:, index])
@@ -328,9 +333,13 @@ def _unobserved(unknowns: Unknowns, deviation: Array, index: int, reach: float, 
     return Interval.normal(nominal, spread).above(reach - 3.0 * float(np.hypot(noise[index], 1e-4)))
 
 
-def unobserved_because(index: int, why: str) -> str:
+def _wide(deviation: float, most: float) -> Reason:
+    return Reason("deviation of {:.2g} m, expected less than {:g} m", (deviation, LENGTH), (most, LENGTH))
+
+
+def unobserved_because(index: int, why: Reason) -> Reason:
     """Return the message that the motion does not determine a clearance."""
-    return f"{'horizontal' if index == GX else 'vertical'} {_UNOBSERVED} {why}"
+    return why.after(f"{'horizontal' if index == GX else 'vertical'} {_UNOBSERVED} ")
 
 
 def without_unobserved(reasons: tuple[str, ...]) -> list[str]:
@@ -385,11 +394,12 @@ def summarise_bounced(
         # walls that are not touched make the other clearance uncertain too
         observed &= not rough or bool(bounced.follows.min() > tuning.FOLLOWS)
         if not observed:
-            why = f"deviation of {deviation:.2g} m, expected less than {2.0 * tuning.OBSERVED:g} m"
+            why = _wide(deviation, 2.0 * tuning.OBSERVED)
             if touched[index] <= 0.0:
-                why = "a wall is never touched"
+                why = Reason("a wall is never touched")
             elif bounced.follows.min() <= tuning.FOLLOWS:
-                why = f"the reach follows {bounced.follows.min():.0%} of a clearance, expected {tuning.FOLLOWS:.0%}"
+                follows = f"the reach follows {bounced.follows.min():.0%} of a clearance"
+                why = Reason(f"{follows}, expected {tuning.FOLLOWS:.0%}")
             reasons.append(unobserved_because(index, why))
             value = _unobserved(unknowns, np.zeros(2), index, 0.0, bounced.noise)
         clearances.append(value.above(0.0))

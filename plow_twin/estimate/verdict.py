@@ -16,6 +16,7 @@ from plow_twin.estimate import tuning
 from plow_twin.estimate.arrow import OWN
 from plow_twin.estimate.fit import NO_PRIOR, Fit, Problem, joint_step, pieces
 from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER, FEWEST_POSES, Poses
+from plow_twin.estimate.reason import LENGTH, NUMBER, Reason
 from plow_twin.estimate.start import noise_level
 from plow_twin.estimate.unknowns import BIAS, DAMPING, GAIN, GX, GY, SIZE, SOFTNESS, with_other_law
 from plow_twin.model import geometry
@@ -258,10 +259,12 @@ def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
     moved = np.hypot(shift[:2], geometry.half_diagonal(problem.unknowns.scene) * shift[2])
     changed = np.zeros(2)
     if bias >= clearance and moved.max() > 0.5 * tuning.OBSERVED:
-        verdict.sensor.append(f"shifted within the window by {shift[0]:.2g} m, {shift[1]:.2g} m, {shift[2]:.2g} rad")
+        by = zip(shift.tolist(), (LENGTH, LENGTH, NUMBER), strict=True)
+        verdict.sensor.append(Reason("shifted within the window by {:.2g} m, {:.2g} m, {:.2g} rad", *by))
         changed = moved
     elif clearance > bias and np.abs(growth).max() > 0.5 * tuning.OBSERVED:
-        verdict.model.append(f"machine changed within the window: clearances by {growth[0]:.2g} m, {growth[1]:.2g} m")
+        by = zip(growth.tolist(), (LENGTH, LENGTH), strict=True)
+        verdict.model.append(Reason("machine changed within the window: clearances by {:.2g} m, {:.2g} m", *by))
         changed = np.abs(growth)
     # unlike a wrong load or law, a real change explains a large share of the residuals
     if changed.any() and share > tuning.CHANGE_SHARE and _load_suffices(problem, fit):
