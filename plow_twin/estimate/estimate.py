@@ -301,6 +301,8 @@ def _searched(
         return summarise_bounced(unknowns, poses, bounced, spent + forward.work, first), ()
     if found is None:
         return under_uncertain_load(without_fit(unknowns, poses), unknowns, forward.load, poses, period), ()
+    if bounced is None:
+        found = _nearer_the_prior(found, forward, unknowns, poses, period, first.noise, drift)
     verdict, plain = judge(*found, period), found
     behind = behind_low_pass(*searched) if searched and fails(found[1], verdict) and not verdict.broken else None
     if behind is not None:
@@ -319,6 +321,30 @@ def _searched(
         result = under_uncertain_load(result, unknowns, forward.load, poses, period, found)
     following = () if verdict.model or verdict.sensor or verdict.added else _next_guess(*found)
     return result if bounced is None else with_bounced(result, bounced, spent), following
+
+
+def _nearer_the_prior(
+    found: tuple[Problem, Fit],
+    forward: Forward,
+    unknowns: Unknowns,
+    poses: Poses,
+    period: float,
+    noise: Array,
+    drift: Array | None,
+) -> tuple[Problem, Fit]:
+    """Return a fit from a starting point with prior clearances, if it is better than a fit far from the prior.
+
+    The search compares few clearances that are far from the prior. If a wall is never touched, a fit may explain the
+    noise of the poses by touches of a wall that is far too near.
+    """
+    nominal, deviations = unknowns.nominal(), unknowns.deviations()
+    far = [axis for axis in (GX, GY) if abs(found[1].shared[axis] - nominal[axis]) > tuning.FAR * deviations[axis]]
+    if not far:
+        return found
+    start = found[1].shared.copy()
+    start[far], start[BIAS] = nominal[far], nominal[BIAS]
+    other = refine(forward.renewed(), unknowns, poses, period, start, noise, drift)
+    return other if other is not None and other[1].loss < found[1].loss else found
 
 
 def _period(load: Load, poses: Poses) -> float:

@@ -351,6 +351,9 @@ SWAPPED = (0.5, 0.2)
 #: Basis: as for `OPPOSED`: ratios from 0.3 to 1.7, and up to 18 for a load of averages over 1 s without a correlation
 WRONG_UNIT = 6.0
 
+#: distance of a clearance from its prior mean beyond which a second fit begins at the prior mean [deviations]
+#: Basis: stress test of `test_estimate_motion.py` with theta locked: 3.4 from a wrong fit; 10 mm of wear: 1.3
+FAR = 3.0
 # Loads that do not explain the motion
 #: length of the test functions by which the equations are multiplied [s]
 #: Basis: kinds `load_10`, `averages_1hz`
