@@ -7,6 +7,7 @@ from typing import Any, Final
 #: Powers of length, mass and time in the unit of a quantity.
 Dimension = tuple[int, int, int]
 
+#: Dimensions of the quantities, by definition.
 LENGTH: Final[Dimension] = (1, 0, 0)
 TIME: Final[Dimension] = (0, 0, 1)
 FREQUENCY: Final[Dimension] = (0, 0, -1)
