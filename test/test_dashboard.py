@@ -32,7 +32,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from plow_twin import dashboard
 from plow_twin.dashboard.access import PageAccess
-from plow_twin.dashboard.feed import Feed
+from plow_twin.dashboard.feed import Feed, Motion
 from plow_twin.dashboard.history import SPAN_S, History
 from plow_twin.dashboard.link import Link, pair
 from plow_twin.dashboard.run import RunFeed
@@ -109,6 +109,17 @@ def test_the_history_has_each_second_of_an_hour_once_and_is_cleared_when_stamps_
     for points in ([1.0] * 8 + [4.0] * 8, [2.0] * 8 + [3.0] * 8):
         history.add({**motion, "t": 50.5, "peak": [1.0] * 8, "points": points}, 10**6 + 1)
     assert history.since(0)[0][22:] == [2.0] * 8 + [4.0] * 8
+
+
+def test_a_second_keeps_its_peak_if_an_earlier_second_arrives_later() -> None:
+    history, motion = History(), Motion()
+    for version, (t, peak) in enumerate([(10, 1.0), (11, 2.0), (10, 5.0), (12, 3.0)], 1):
+        motion.stamp_ns, motion.peak = t * 10**9, np.full(8, peak)
+        assert not history.add(motion.update(), version)
+    assert [row[:2] for row in history.since(0)] == [[10, 5.0], [11, 2.0], [12, 3.0]]
+    assert [row[0] for row in history.since(2)] == [10, 11, 12] and [row[0] for row in history.since(3)] == [12]
+    motion.stamp_ns = 9 * 10**9
+    assert history.add(motion.update(), 5) and [row[0] for row in history.since(0)] == [9]
 
 
 def test_the_screen_shows_the_intervals_of_a_following_twin() -> None:

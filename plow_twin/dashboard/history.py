@@ -10,6 +10,11 @@ SPAN_S: Final = 3600
 _CLEARANCES: Final = tuple(f"{name}{point}" for name in ("horizontal", "vertical") for point in ("", "/p05", "/p95"))
 
 
+#: Largest number of seconds by which an update may be older than the newest second. In a recording, the messages of a
+#: second may follow the samples of the next second. A clock that steps back by more than `jump_back` resets the motion.
+_BEHIND_S: Final = 2
+
+
 class History:
     """The seconds of the last hour. A page can request the seconds that have changed since its last update.
 
@@ -22,9 +27,9 @@ class History:
         self._versions: deque[int] = deque()
 
     def add(self, motion: dict[str, Any], version: int) -> bool:
-        """Add the motion of an update. If the stamps have stepped back, clear the history and return True."""
+        """Add the motion of an update. If the stamps step back by seconds, clear the history and return True."""
         second = int(motion["t"])
-        stepped_back = bool(self._seconds) and second < self._seconds[-1][0]
+        stepped_back = bool(self._seconds) and second < self._seconds[-1][0] - _BEHIND_S
         if stepped_back:
             self._seconds.clear()
             self._versions.clear()
@@ -38,12 +43,16 @@ class History:
             int(motion["was_held"]),
             *motion.get("points", ()),
         ]
-        if self._seconds and self._seconds[-1][0] == second:
-            row = _joined(self._seconds.pop(), row)
+        later = list[list[Any]]()
+        while self._seconds and self._seconds[-1][0] >= second:
+            later.append(self._seconds.pop())
             self._versions.pop()
-        self._seconds.append(row)
-        self._versions.append(version)
-        while self._seconds[0][0] <= second - SPAN_S:
+        if later and later[-1][0] == second:
+            row = _joined(later.pop(), row)
+        # a page replaces all seconds from the changed one on
+        self._seconds += [row, *reversed(later)]
+        self._versions += [version] * (1 + len(later))
+        while self._seconds[0][0] <= self._seconds[-1][0] - SPAN_S:
             self._seconds.popleft()
             self._versions.popleft()
         return stepped_back
