@@ -90,7 +90,7 @@ setup(
         # the only libraries of the model and the solver
         "numpy>=1.26",
         "scipy>=1.11",
-        # bounded, because kernel/linked.py and kernel/compiler.py use internals of numba
+        # bounded, because kernel/arrays.py, kernel/linked.py and kernel/compiler.py use internals of numba
         "numba>=0.59,<0.69",
         # scene files and the command line
         "click>=8.1",

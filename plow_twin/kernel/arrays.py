@@ -93,7 +93,8 @@ copy_part = cast("Callable[[Any, Any, int, int], None]", intrinsic(_copy_part))
 def _unbox_record(kind: Any, record: Any, c: Any) -> Any:
     """Return a record argument from Python as a pointer to its data, the first field of numpy's `PyVoidScalarObject`.
 
-    Numba requests the data as a buffer, for which numpy describes all fields as text.
+    Numba requests the data as a buffer, for which numpy describes all fields as text. This takes 20 us a call of
+    `integrate`.
     """
     fields = c.builder.bitcast(record, cgutils.voidptr_t.as_pointer())
     data = c.builder.load(c.builder.gep(fields, [c.context.get_constant(types.intp, _WORDS_OF_HEAD)]))
