@@ -88,7 +88,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (
             ["estimate", "kilonewtons.csv", *MAP[2:], "--map", "kN.yaml"],
             2,
-            "they look like kN: convert the file, or state the unit in a mapp",
+            "they look like kN: convert the file, or state the unit in a",
         ),
         (["estimate", "ms"], 2, "t: got stamps 10 s apart, expected many samples in each period of such a smooth load"),
         (["estimate", "rowless"], 1, "rowless: got no load and no measured pose, expected at least one row"),
