@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -51,7 +51,7 @@ FIRST_PERIOD, LEAST_SHARE = 4, 0.01
 _FINE = 1e-4
 
 
-def run_one(name: str, seed: int, members: int, groups: Mapping[str, Group] = GROUPS) -> dict[str, Any]:
+def run_one(name: str, seed: int, members: int, groups: Mapping[str, Group]) -> dict[str, Any]:
     try:
         truth = draw(groups[name], seed)
     except SolverError as error:  # the head has passed through a wall, which is impossible in a real machine
@@ -177,17 +177,28 @@ def as_markdown(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-@click.command()
-@click.option("--group", "groups", multiple=True, type=click.Choice(list(GROUPS)))
-@click.option("--truths", default=12, show_default=True)
-@click.option("--seed", default=72000, show_default=True, help="First seed.")
-@click.option("--members", default=MEMBERS, show_default=True)
-@click.option("--out", type=click.Path(path_type=Path), default=RESULTS, show_default=True)
-@click.option("--table", "alone", is_flag=True, help="Only print the table of the stored results.")
-def main(groups: tuple[str, ...], truths: int, seed: int, members: int, out: Path, alone: bool) -> None:
-    warm_up(draw(Group("start", periods=1.0), 0).nominal)
-    cases = ((name, seed + i) for i in range(0 if alone else truths) for name in groups or tuple(GROUPS))
-    click.echo(as_markdown(completed(out, ("group", "seed"), cases, partial(run_one, members=members))))
+def command(
+    own: dict[str, Group], results: Path, count: int, first: int, markdown: Callable[[Sequence[dict[str, Any]]], str]
+) -> click.Command:
+    """Return the command that judges truths of the groups `own`, by default `count` from the seed `first` on."""
+
+    @click.command()
+    @click.option("--group", "groups", multiple=True, type=click.Choice(list(own)))
+    @click.option("--truths", default=count, show_default=True)
+    @click.option("--seed", default=first, show_default=True, help="First seed.")
+    @click.option("--members", default=MEMBERS, show_default=True)
+    @click.option("--out", type=click.Path(path_type=Path), default=results, show_default=True)
+    @click.option("--table", "alone", is_flag=True, help="Only print the table of the stored results.")
+    def judge(groups: tuple[str, ...], truths: int, seed: int, members: int, out: Path, alone: bool) -> None:
+        if not alone:
+            warm_up(draw(Group("start", periods=1.0), 0).nominal)
+        cases = ((name, seed + i) for i in range(0 if alone else truths) for name in groups or tuple(own))
+        click.echo(markdown(completed(out, ("group", "seed"), cases, partial(run_one, members=members, groups=own))))
+
+    return judge
+
+
+main = command(GROUPS, RESULTS, 12, 72000, as_markdown)
 
 
 if __name__ == "__main__":

@@ -10,18 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import click
 import follow
-from estimate import completed
-from estimate_truths import Group, draw
+from estimate_truths import Group
 
 from plow_twin import Contact, Friction, Gravity, Harmonic, Scene, Wear
-from plow_twin.estimate.estimate import warm_up
-from plow_twin.estimate.follow import MEMBERS
 from plow_twin.model.contact_laws import LAWS, ContactLaw, add_law
 
 RESULTS = Path(__file__).resolve().parent / "results" / "follow_machines.jsonl"
@@ -145,19 +140,7 @@ def as_markdown(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join([*lines, "", f"Coverage of the clearances: 1.00{exceptions}."])
 
 
-@click.command()
-@click.option("--group", "groups", multiple=True, type=click.Choice(list(GROUPS)))
-@click.option("--truths", default=1, show_default=True)
-@click.option("--seed", default=74000, show_default=True, help="First seed.")
-@click.option("--members", default=MEMBERS, show_default=True)
-@click.option("--out", type=click.Path(path_type=Path), default=RESULTS, show_default=True)
-@click.option("--table", "alone", is_flag=True, help="Only print the table of the stored results.")
-def main(groups: tuple[str, ...], truths: int, seed: int, members: int, out: Path, alone: bool) -> None:
-    if not alone:
-        warm_up(draw(Group("start", periods=1.0), 0).nominal)
-    cases = ((name, seed + i) for i in range(0 if alone else truths) for name in groups or tuple(GROUPS))
-    rows = completed(out, ("group", "seed"), cases, partial(follow.run_one, members=members, groups=GROUPS))
-    click.echo(as_markdown(rows))
+main = follow.command(GROUPS, RESULTS, 1, 74000, as_markdown)
 
 
 if __name__ == "__main__":

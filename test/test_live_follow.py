@@ -817,19 +817,24 @@ class Front:
         return lambda *_: ""
 
 
+def _started(truth: Truth, folder: Path, mode: str, front: Front) -> tuple[Path, Runtime]:
+    """Return the nominal scene's file and an active runtime, which records in `run`."""
+    scene = folder / "believed.yaml"
+    scene.write_text(dump_scene(truth.nominal), encoding="utf-8")
+    values = {"scene": str(scene), "estimate": True, "follow_members": MEMBERS, "excitation_timeout": 3600.0}
+    settings = parameters.settings(values | {"publish_mode": mode, "record_path": str(folder / "run")})
+    runtime = Runtime(front, settings, Preparation(settings).result(lambda: False))
+    runtime.start()
+    runtime.activate()
+    return scene, runtime
+
+
 @pytest.mark.parametrize("mode", ["on_sample", "fixed_rate"])
 def test_a_runtime_reports_its_twins_and_follows_with_parameters_if_samples_wait(
     truth: Truth, tmp_path: Path, mode: str
 ) -> None:
-    scene = tmp_path / "believed.yaml"
-    scene.write_text(dump_scene(truth.nominal), encoding="utf-8")
-    values = {"scene": str(scene), "estimate": True, "follow_members": MEMBERS, "excitation_timeout": 3600.0}
-    settings = parameters.settings(values | {"publish_mode": mode, "record_path": str(tmp_path / "run")})
     front = Front()
-    prepared = Preparation(settings).result(lambda: False)
-    runtime = Runtime(front, settings, prepared)
-    runtime.start()
-    runtime.activate()
+    scene, runtime = _started(truth, tmp_path, mode, front)
 
     def play(begin: float, end: float) -> None:
         for entry in _in_turn(truth, begin, end):
@@ -887,13 +892,7 @@ def test_a_runtime_reports_its_twins_and_follows_with_parameters_if_samples_wait
 def test_a_written_replay_with_late_samples_and_a_snapshot_has_the_recorded_motion(
     truth: Truth, tmp_path: Path, mode: str
 ) -> None:
-    scene = tmp_path / "believed.yaml"
-    scene.write_text(dump_scene(truth.nominal), encoding="utf-8")
-    values = {"scene": str(scene), "estimate": True, "follow_members": MEMBERS, "excitation_timeout": 3600.0}
-    settings = parameters.settings(values | {"publish_mode": mode, "record_path": str(tmp_path / "run")})
-    runtime = Runtime(Front(), settings, Preparation(settings).result(lambda: False))
-    runtime.start()
-    runtime.activate()
+    _, runtime = _started(truth, tmp_path, mode, Front())
     chance, order = np.random.default_rng(3), list[tuple[float, Sample | Pose]]()
     for entry in _in_turn(truth, 0.0, 2.0):
         assert isinstance(entry, Sample | Pose)

@@ -6,13 +6,11 @@ from collections import deque
 from typing import Any, Final
 
 SPAN_S: Final = 3600
-#: Names of the clearances of each second, in the order in which the page reads them.
-_CLEARANCES: Final = tuple(f"{name}{point}" for name in ("horizontal", "vertical") for point in ("", "/p05", "/p95"))
-
-
 #: Largest number of seconds by which an update may be older than the newest second. In a recording, the messages of a
 #: second may follow the samples of the next second. A clock that steps back by more than `jump_back` resets the motion.
 _BEHIND_S: Final = 2
+#: Names of the clearances of each second, in the order in which the page reads them.
+_CLEARANCES: Final = tuple(f"{name}{point}" for name in ("horizontal", "vertical") for point in ("", "/p05", "/p95"))
 
 
 class History:
